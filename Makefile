@@ -1,0 +1,49 @@
+# Works on a machine with Python 3.11 and nothing else installed. `make PYTHON=python3.12 venv` picks
+# another interpreter.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+DEMO := demo/cable-shape
+
+.PHONY: help venv demo test lint format bench clean
+
+help:
+	@echo "make demo    five demonstrations of cable-shape and their video, under demo/"
+	@echo "make test    the tests, on every core"
+	@echo "make lint    ruff and mypy"
+	@echo "make format  let ruff rewrite what it can"
+	@echo "make bench   time the simulator"
+	@echo "make clean   remove demo/ and caches (the environment stays: remove $(VENV) by hand)"
+
+venv: $(STAMP)
+
+# Installs again only when what is to be installed has changed.
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: $(STAMP)
+	$(BIN)/warp-deform demo cable-shape -n 5 --seed 0 --out $(DEMO) --video $(DEMO).mp4
+	@echo "episodes: $(DEMO)/    video: $(DEMO).mp4"
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -n auto tests
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)
+	$(BIN)/warp-deform bench
+
+clean:
+	rm -rf demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find warp_deform learning hardware tests -name __pycache__ -type d -prune -exec rm -rf {} +

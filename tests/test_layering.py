@@ -1,0 +1,140 @@
+"""The direction of imports, read from every file: hardware -> warp_deform <- learning.
+
+One named exception: hardware may load `learning.policy` inside a function. The command's table
+names verbs as "module:function" strings, which stand outside this rule because nothing is imported
+until a verb is called.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from warp_deform.cli import VERBS
+
+ROOT = Path(__file__).resolve().parent.parent
+MAY_IMPORT = {
+    "warp_deform": {"warp_deform"},
+    "learning": {"learning", "warp_deform"},
+    "hardware": {"hardware", "warp_deform"},
+}
+OURS = {*MAY_IMPORT, "tests", "examples", "benchmarks"}
+LAZY_EXCEPTION = ("hardware", "learning.policy")
+OPTIONAL = {
+    "pybullet", "pybullet_data", "ray", "viser", "rerun", "tensorboard", "h5py", "panda_py",
+    "franky", "frankapy", "pyrealsense2",
+}  # fmt: skip
+COMPUTED_IMPORTS = {"warp_deform/__init__.py", "warp_deform/cli.py"}
+FILES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
+
+
+class Import(NamedTuple):
+    module: str
+    line: int
+    lazy: bool
+
+
+def imports(source: str, module: str, *, is_package: bool) -> list[Import]:
+    """Every import of `source`, relative ones resolved against its own dotted name `module`."""
+    package = module.split(".") if is_package else module.split(".")[:-1]
+
+    def visit(node: ast.AST, lazy: bool) -> Iterator[Import]:
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            lazy = True
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            lazy = True
+        if isinstance(node, ast.Import):
+            yield from (Import(alias.name, node.lineno, lazy) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            assert not node.level or base, (
+                f"{module}:{node.lineno}: import climbs out of the package"
+            )
+            origin = ".".join([*base, *([node.module] if node.module else [])])
+            # `from learning import policy` names a module as much as `import learning.policy` does.
+            yield from (Import(f"{origin}.{name.name}", node.lineno, lazy) for name in node.names)
+        for child in ast.iter_child_nodes(node):
+            yield from visit(child, lazy)
+
+    return list(visit(ast.parse(source), False))
+
+
+def violations(source: str, module: str, *, is_package: bool = False) -> list[str]:
+    own = module.split(".")[0]
+    found = []
+    for item in imports(source, module, is_package=is_package):
+        top = item.module.split(".")[0]
+        excused = (
+            item.lazy and own == LAZY_EXCEPTION[0] and item.module.startswith(LAZY_EXCEPTION[1])
+        )
+        if top in OURS - MAY_IMPORT[own] and not excused:
+            found.append(f"{module}:{item.line} imports {item.module}")
+        if top in OPTIONAL and not item.lazy:
+            found.append(f"{module}:{item.line} imports optional {item.module} at the top")
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_point_one_way(path: Path) -> None:
+    dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    source = path.read_text()
+    assert violations(source, dotted, is_package=path.name == "__init__.py") == []
+    if str(path.relative_to(ROOT)) not in COMPUTED_IMPORTS:
+        assert not {"import_module", "__import__"} & {
+            getattr(node.func, "attr", getattr(node.func, "id", None))
+            for node in ast.walk(ast.parse(source))
+            if isinstance(node, ast.Call)
+        }, "a module name computed at run time hides from this test"
+    assert "sys.path." not in source
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("warp_deform.env", "import learning"),
+        ("warp_deform.env", "def f():\n    from learning.policy import load"),
+        ("warp_deform.env", "from hardware import safety"),
+        ("learning.policy", "import hardware.safety"),
+        ("hardware.episode", "from learning.policy import load"),
+        ("hardware.episode", "def f():\n    import learning.training"),
+        ("hardware.backends.panda", "import panda_py"),
+        ("warp_deform.env", "import tests.test_cli"),
+    ],
+)
+def test_a_wrong_import_is_found(module: str, source: str) -> None:
+    assert len(violations(source, module)) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("warp_deform.tasks.task", "from ..objects import cable"),
+        ("learning.policy", "from warp_deform.episodes import Episode"),
+        ("hardware.episode", "def f():\n    from learning.policy import load"),
+        ("hardware.backends.panda", "def connect():\n    import panda_py"),
+    ],
+)
+def test_a_right_import_passes(module: str, source: str) -> None:
+    assert violations(source, module) == []
+
+
+def test_an_import_cannot_climb_out() -> None:
+    with pytest.raises(AssertionError, match="climbs out"):
+        imports("from ...learning import policy", "warp_deform.tasks.task", is_package=False)
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_a_verb_names_a_function_that_exists(name: str) -> None:
+    module, function = VERBS[name].target.split(":")
+    base = ROOT.joinpath(*module.split("."))
+    path = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+    defined = [
+        node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)
+    ]
+    verb = next(node for node in defined if node.name == function)
+    assert len(verb.args.args) == 1
+    assert verb.args.args[0].annotation is not None

@@ -1,0 +1,196 @@
+"""The `warp-deform` command: a table of verbs, each imported only when it is called.
+
+A verb is a function `verb(options) -> Outcome`. Its parameter is a frozen dataclass, a
+`CommandOptions`, whose fields tyro turns into flags and whose docstrings into help; a union of such
+classes makes sub-verbs. The verb computes, this module prints: the outcome alone goes to stdout,
+progress and whatever libraries say go to stderr.
+
+Exit codes: 0 done, 1 the run failed, 2 bad input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import difflib
+import importlib
+import io
+import json
+import os
+import sys
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from . import __version__
+from .errors import InputError, WarpDeformError
+
+__all__ = ["VERBS", "CommandOptions", "Outcome", "Verb", "main"]
+
+
+class Verb(NamedTuple):
+    """Where a verb's function stands, "module:function", and what it does in a few words."""
+
+    target: str
+    summary: str
+
+
+VERBS: dict[str, Verb] = {
+    "list": Verb("warp_deform.commands:list_tasks", "the tasks and their Gymnasium ids"),
+    "demo": Verb("warp_deform.commands:demo", "collect demonstrations of a task"),
+    "goals": Verb("warp_deform.commands:goals", "make a task's set of goals"),
+    "replay": Verb("warp_deform.commands:replay", "simulate recorded episodes again and compare"),
+    "inspect": Verb("warp_deform.commands:inspect", "statistics and contact sheets of a dataset"),
+    "bench": Verb("warp_deform.commands:bench", "time the simulator, alone or beside a peer"),
+    "doctor": Verb("warp_deform.commands:doctor", "versions, devices, caches and what is missing"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandOptions:
+    """Options that every verb has."""
+
+    json: bool = False
+    """Print one JSON object, and nothing else, on stdout."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a verb found out: `data` is its JSON object, `text` says the same to people.
+
+    `failure`, one line, means that the run did not do what was asked: it goes to stderr and the
+    exit code is 1.
+    """
+
+    data: Mapping[str, Any]
+    text: str
+    failure: str | None = None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with the arguments `argv` (default: the process's); returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(arguments)
+    except InputError as error:
+        return _complain(error, code=2)
+    except WarpDeformError as error:
+        return _complain(error, code=1)
+    except KeyboardInterrupt:
+        return _complain("interrupted; episodes already written are complete", code=130)
+    except BrokenPipeError:
+        # The reader went away (`| head`): nothing is left to tell it, also not at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        return _complain(error, code=1)
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_usage())
+        return 0
+    name, *rest = arguments
+    if name in ("-V", "--version"):
+        print(f"warp-deform {__version__}")
+        return 0
+    if name not in VERBS:
+        near = difflib.get_close_matches(name, VERBS, n=1, cutoff=0.5)
+        hint = f"did you mean `{near[0]}`?" if near else f"use one of: {', '.join(VERBS)}"
+        raise InputError(f"unknown verb {name!r}; {hint}")
+    verb = _load(VERBS[name].target)
+    options = _parse(f"warp-deform {name}", verb, rest)
+    if options is None:
+        return 0
+    with _stdout_to_stderr():
+        outcome = verb(options)
+    print(
+        json.dumps(outcome.data, allow_nan=False, default=_plain) if options.json else outcome.text
+    )
+    sys.stdout.flush()
+    return 0 if outcome.failure is None else _complain(outcome.failure, code=1)
+
+
+def _usage() -> str:
+    width = max(map(len, VERBS))
+    return "\n".join(
+        [
+            "usage: warp-deform VERB [OPTIONS]     (warp-deform VERB --help explains one verb)",
+            "",
+            *(f"  {name:<{width}}  {verb.summary}" for name, verb in VERBS.items()),
+            "",
+            "  -h, --help     show this text",
+            "  -V, --version  show the version",
+        ]
+    )
+
+
+def _load(target: str) -> Callable[[Any], Outcome]:
+    module, function = target.split(":")
+    loaded: Callable[[Any], Outcome] = getattr(importlib.import_module(module), function)
+    return loaded
+
+
+def _parse(
+    prog: str, verb: Callable[[Any], Outcome], arguments: list[str]
+) -> CommandOptions | None:
+    """The verb's options from its arguments, or None when help was asked for and printed.
+
+    Raises:
+        InputError: the arguments do not fit the options; tyro's own text, on one line.
+    """
+    import tyro
+
+    hints = typing.get_type_hints(verb, include_extras=True)
+    kind = next(hint for name, hint in hints.items() if name != "return")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            options: CommandOptions = tyro.cli(
+                kind, prog=prog, args=arguments, config=(tyro.conf.FlagCreatePairsOff,)
+            )
+    except SystemExit as leaving:
+        if not leaving.code:
+            return None
+        raise InputError(f"{_essence(said.getvalue())}; see `{prog} --help`") from None
+    return options
+
+
+def _essence(boxed: str) -> str:
+    """What tyro's box of several paragraphs says, on one line: what is wrong and what was meant."""
+    lines = [line.strip("│ ") for line in boxed.splitlines() if not line.startswith(("╭", "╰"))]
+    wrong, *others = "\n".join(lines).split("─\n")
+    meant = [part for part in others if part.startswith("Perhaps you meant")]
+    return " ".join(" ".join([wrong, *meant]).replace("─", " ").split()).rstrip(".")
+
+
+@contextlib.contextmanager
+def _stdout_to_stderr() -> Iterator[None]:
+    """Send what Python and native libraries print on stdout to stderr for a while."""
+    sys.stdout.flush()
+    stdout = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        # C's stdout has a buffer of its own: PyBullet's greeting would come out after the report.
+        ctypes.CDLL(None).fflush(None)
+        os.dup2(stdout, 1)
+        os.close(stdout)
+
+
+def _plain(value: object) -> object:
+    """JSON's form of a path or of a NumPy scalar or array."""
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"cannot write {type(value).__name__} as JSON")
+
+
+def _complain(error: object, *, code: int) -> int:
+    print(f"warp-deform: {' '.join(str(error).split())}", file=sys.stderr)
+    return code

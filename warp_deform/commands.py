@@ -1,0 +1,288 @@
+"""The verbs of the `warp-deform` command that need the simulator alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from .cli import CommandOptions, Outcome
+from .errors import InputError
+from .quiet import quiet_warp
+from .registration import env_id
+from .tasks.registry import TASKS
+from .tasks.registry import task as find_task
+
+__all__ = [
+    "BenchOptions",
+    "DemoOptions",
+    "DoctorOptions",
+    "GoalsOptions",
+    "InspectOptions",
+    "ListOptions",
+    "ReplayOptions",
+    "bench",
+    "demo",
+    "doctor",
+    "goals",
+    "inspect",
+    "list_tasks",
+    "replay",
+]
+
+_Task = Annotated[Positional[str], arg(metavar="TASK")]
+_Folder = Annotated[Positional[Path], arg(metavar="DIR")]
+_Count = Annotated[int, arg(aliases=["-n"], metavar="N")]
+_File = Annotated[Path | None, arg(metavar="FILE")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListOptions(CommandOptions):
+    """List the tasks: Gymnasium id, whether a goal image is given, actions allowed, objects."""
+
+
+def list_tasks(options: ListOptions) -> Outcome:
+    """The benchmark's tasks, in the paper's order."""
+    tasks: list[dict[str, Any]] = [
+        {
+            "name": name,
+            "env_id": env_id(name),
+            "goal_conditioned": task.goal_conditioned,
+            "max_actions": task.max_actions,
+            "objects": list(task.objects),
+        }
+        for name, task in TASKS.items()
+    ]
+    rows = [("task", "Gymnasium id", "goal", "actions", "objects")]
+    for task in tasks:
+        goal = "image" if task["goal_conditioned"] else "-"
+        rows.append(
+            (
+                task["name"],
+                task["env_id"],
+                goal,
+                str(task["max_actions"]),
+                ", ".join(task["objects"]),
+            )
+        )
+    return Outcome(data={"tasks": tasks}, text=_table(rows))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(CommandOptions):
+    """Collect successful demonstrations of a task; attempts that fail are counted, not kept."""
+
+    task: _Task
+    """Name of the task, see `warp-deform list`."""
+    episodes: _Count = 10
+    """Successes to keep: the first N in the order of their seeds."""
+    seed: int = 0
+    """First seed. Training 0.., test 10,000.., validation 50,000.., goals 100,000.. ."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder for the episodes; complete ones that are there already are kept."""
+    demonstrator: Literal["scripted", "visible", "mpc", "planner"] = "scripted"
+    """Who acts: scripted sees the simulator's state, visible only what a camera sees."""
+    workers: Annotated[int | None, arg(metavar="W")] = None
+    """Processes; one per core when left out. The result does not depend on it."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Address of a Ray cluster to work on (needs the extra `ray`)."""
+    video: _File = None
+    """MP4 of the kept episodes."""
+    robot: Literal["ur5", "panda"] = "ur5"
+    """The arm."""
+
+
+def demo(options: DemoOptions) -> Outcome:
+    """Collect demonstrations into a folder."""
+    find_task(options.task)
+    _check_positive("-n", options.episodes)
+    _check_positive("--workers", options.workers)
+    from .collect import CollectConfig, collect
+
+    quiet_warp()
+    report = asdict(
+        collect(
+            CollectConfig(
+                task=options.task,
+                episodes=options.episodes,
+                seed=options.seed,
+                out=options.out,
+                demonstrator=options.demonstrator,
+                workers=options.workers,
+                ray=options.ray,
+                video=options.video,
+                robot=options.robot,
+            )
+        )
+    )
+    failure = None
+    if report["successes"] < options.episodes:
+        failure = (
+            f"{report['successes']} of {options.episodes} demonstrations succeeded in "
+            f"{report['attempts']} attempts; ask for fewer or try another --seed"
+        )
+    return Outcome(data=report, text=_lines(report), failure=failure)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalsOptions(CommandOptions):
+    """Make the goals that a goal-conditioned task is evaluated on."""
+
+    task: _Task
+    """Name of a goal-conditioned task."""
+    count: Annotated[int, arg(name="goals", aliases=["-n"], metavar="N")] = 20
+    """Goals to make; the paper evaluates on 20."""
+    seed: int = 100_000
+    """First seed; goals have seeds of their own."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder for the goals."""
+    kind: Literal["demonstrated", "constructed"] = "demonstrated"
+    """Last states of demonstrations (the paper), or objects placed at the goal and settled."""
+
+
+def goals(options: GoalsOptions) -> Outcome:
+    """Make a set of goals."""
+    find_task(options.task)
+    _check_positive("-n", options.count)
+    from .goals import make_goals
+
+    quiet_warp()
+    report = make_goals(
+        options.task, options.out, count=options.count, seed=options.seed, kind=options.kind
+    )
+    return Outcome(data=report, text=_lines(report))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions(CommandOptions):
+    """Simulate recorded episodes again and compare every step's state hash."""
+
+    folder: _Folder
+    """Folder of episodes."""
+    verify: bool = False
+    """Fail (exit code 1) unless every state is the recorded one, bit for bit."""
+    tolerance: Annotated[float | None, arg(metavar="M")] = None
+    """Compare positions within this distance [m] instead of bits, for another kind of processor."""
+    workers: Annotated[int | None, arg(metavar="W")] = None
+    """Processes; one per core when left out."""
+
+
+def replay(options: ReplayOptions) -> Outcome:
+    """Simulate a folder's episodes again."""
+    _check_folder(options.folder)
+    from .replay import verify
+
+    quiet_warp()
+    report = verify(options.folder, tolerance=options.tolerance, workers=options.workers)
+    failure = None
+    if options.verify and report["mismatches"]:
+        failure = (
+            f"{report['mismatches']} of {report['steps']} steps differ from the recording; on "
+            "another kind of processor or version, compare with --tolerance 0.001"
+        )
+    return Outcome(data=report, text=_lines(report), failure=failure)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectOptions(CommandOptions):
+    """Statistics of a folder of episodes, and a PNG for each with its steps."""
+
+    folder: _Folder
+    """Folder of episodes."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for the contact sheets; `DIR/sheets` when left out."""
+    sheets: Annotated[int, arg(metavar="N")] = 20
+    """Contact sheets at most; 0 for statistics alone."""
+
+
+def inspect(options: InspectOptions) -> Outcome:
+    """Look into a folder of episodes."""
+    _check_folder(options.folder)
+    if options.sheets < 0:
+        raise InputError(f"--sheets is {options.sheets}; it must be 0 or more")
+    from .episodes import EpisodeReader
+    from .inspection import contact_sheet, statistics
+
+    report = statistics(options.folder)
+    reader = EpisodeReader(options.folder)
+    out = options.out or options.folder / "sheets"
+    paths = [
+        out / reader.path(seed).with_suffix(".png").name for seed in reader.seeds[: options.sheets]
+    ]
+    if paths:
+        out.mkdir(parents=True, exist_ok=True)
+    for seed, path in zip(reader.seeds, paths, strict=False):
+        contact_sheet(reader.read(seed), path)
+    shown = f"{len(paths)} of {len(reader)} episodes, in {out}"
+    return Outcome(
+        data={**report, "sheets": paths},
+        text=_lines({**report, "sheets": shown}),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions(CommandOptions):
+    """Time one simulated second of a scene; compiling is timed apart."""
+
+    scene: Literal["cable", "ring", "cloth", "bag"] = "cable"
+    """What is simulated, at the tasks' resolution and with self-contact."""
+    peer: Literal["pybullet", "newton-vbd"] | None = None
+    """Another simulator to time on the same scene."""
+
+
+def bench(options: BenchOptions) -> Outcome:
+    """Time the simulator."""
+    from .bench import run
+
+    quiet_warp()
+    report = run(options.scene, peer=options.peer)
+    return Outcome(data=report, text=_lines(report))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorOptions(CommandOptions):
+    """Show versions, devices, caches, optional parts, and what keeps this machine from working."""
+
+
+def doctor(options: DoctorOptions) -> Outcome:
+    """Examine this machine and installation."""
+    from .doctor import render, report
+
+    quiet_warp()
+    found = report()
+    count = len(found["problems"])
+    failure = None if found["healthy"] else f"{count} problem{'s' * (count > 1)} found, see above"
+    return Outcome(data=found, text=render(found), failure=failure)
+
+
+def _check_positive(flag: str, value: int | None) -> None:
+    if value is not None and value < 1:
+        raise InputError(f"{flag} is {value}; it must be 1 or more")
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        raise InputError(f"no folder {str(folder)!r}; `warp-deform demo` makes one")
+
+
+def _lines(data: Mapping[str, Any]) -> str:
+    """One `key  value` line an entry."""
+    return _table([(key.replace("_", " "), _number(value)) for key, value in data.items()])
+
+
+def _number(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_number(inner)}" for key, inner in value.items())
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _table(rows: Sequence[tuple[str, ...]]) -> str:
+    """Rows of cells, in columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    )

@@ -1,0 +1,74 @@
+"""Newton custom attributes: what this package's objects mean beyond particles and springs.
+
+They live in the namespace ``warp_deform`` of a `newton.ModelBuilder`, so `replicate` copies them
+with the worlds and any Newton tool can read them from the finished model.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import newton
+
+__all__ = ["NAMESPACE", "SpringMode", "attribute", "register_attributes"]
+
+NAMESPACE = "warp_deform"
+
+
+class SpringMode(IntEnum):
+    """When a spring acts on the distance between its two particles."""
+
+    EQUAL = 0  # always: the distance is the rest length
+    AT_LEAST = 1  # only when shorter than the rest length (fold limits)
+    AT_MOST = 2  # only when longer than the rest length (tension-only diagonals)
+
+
+def attribute(name: str) -> str:
+    """Key of one of our attributes in the ``custom_attributes`` argument of Newton's builders."""
+    return f"{NAMESPACE}:{name}"
+
+
+def register_attributes(builder: newton.ModelBuilder) -> None:
+    """Declare our custom attributes on `builder`; calling it again changes nothing.
+
+    ========================  =========  ===================================================
+    attribute                 frequency  meaning
+    ========================  =========  ===================================================
+    spring_mode               spring     a `SpringMode`
+    spring_limit              spring     strain limit: largest length / rest length; 0 = none
+    particle_object           particle   which object of its world a particle belongs to
+    particle_rest             particle   position in the object's undeformed shape [m]
+    particle_exclusion        particle   no self-contact closer than this in the rest shape [m]
+    ========================  =========  ===================================================
+    """
+    # Newton takes seconds to import, and the tasks can be listed without it.
+    import newton
+    import warp as wp
+
+    frequency = newton.Model.AttributeFrequency
+    for name, where, dtype, default in (
+        ("spring_mode", frequency.SPRING, wp.int32, int(SpringMode.EQUAL)),
+        ("spring_limit", frequency.SPRING, wp.float32, 0.0),
+        ("particle_object", frequency.PARTICLE, wp.int32, 0),
+        ("particle_rest", frequency.PARTICLE, wp.vec3, wp.vec3(0.0, 0.0, 0.0)),
+        ("particle_exclusion", frequency.PARTICLE, wp.float32, 0.0),
+    ):
+        builder.add_custom_attribute(
+            newton.ModelBuilder.CustomAttribute(
+                name=name,
+                frequency=where,
+                dtype=dtype,
+                default=default,
+                assignment=newton.Model.AttributeAssignment.MODEL,
+                namespace=NAMESPACE,
+            )
+        )
+
+
+def next_object(builder: newton.ModelBuilder) -> int:
+    """Number for a new object of this world: one more than the largest in use."""
+    values = builder.custom_attributes[attribute("particle_object")].values
+    used = values.values() if isinstance(values, dict) else values
+    return 1 + max((int(v) for v in used or () if v is not None), default=-1)

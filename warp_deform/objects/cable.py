@@ -1,0 +1,183 @@
+"""Cables: chains and rings of beads joined by links.
+
+Source: Seita et al., ICRA 2021 (beads, spacing, masses, colours). The original joins cubes with
+point-to-point joints; here beads are spheres joined by stiff distance constraints, and folding is
+limited by a one-sided minimum distance between a bead and its second neighbour.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import InputError
+from .attributes import SpringMode, attribute, next_object, register_attributes
+from .colors import BLUE, WHITE, YELLOW, Color
+
+if TYPE_CHECKING:
+    import newton
+
+__all__ = ["Cable", "CableConfig", "RingConfig", "add_cable", "cable_line", "cable_ring"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CableConfig:
+    """A chain of beads; the defaults are the paper's open cable of 24 beads."""
+
+    beads: int = 24
+    closed: bool = False
+    """Whether the last bead is linked to the first."""
+    spacing: float = 2 * 0.005 * math.sqrt(2)
+    """Distance between the centres of neighbours [m]."""
+    radius: float = 0.005
+    """Contact radius of a bead [m]."""
+    visual_radius: float = 0.0075
+    """Radius that is drawn and that a descending tip meets [m]."""
+    mass: float = 0.1
+    """Mass of a bead [kg]."""
+    link_stiffness: float = 1e6
+    """Stiffness of a link [N/m]; high enough that a link stretches by 1 % at most when dragged."""
+    fold_limit: float = 1.1
+    """Smallest distance between second neighbours, in spacings. Chosen so that the scripted ring
+    demonstrator needs as many actions as in the paper."""
+    fold_stiffness: float = 1e4
+    """Stiffness of the fold limit [N/m]; at 1e3 it stores enough energy to make beads hop."""
+    exclusion: float = 2.5
+    """Beads closer along the chain than this many spacings do not collide."""
+    color: Color = BLUE
+    first_color: Color = WHITE
+    last_color: Color = YELLOW
+
+    def __post_init__(self) -> None:
+        if self.beads < 3:
+            raise InputError(f"a cable needs at least 3 beads, got {self.beads}")
+        for name in ("spacing", "radius", "visual_radius", "mass", "link_stiffness"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"CableConfig.{name} must be positive, got {getattr(self, name)}")
+        if self.fold_limit < 0 or self.fold_limit >= 2:
+            raise InputError(f"CableConfig.fold_limit must be in [0, 2), got {self.fold_limit}")
+
+    @property
+    def length(self) -> float:
+        """Length of the straight cable as the paper counts it, beads times spacing [m]."""
+        return self.beads * self.spacing
+
+    def colors(self) -> tuple[Color, ...]:
+        """Colour of every bead; only an open cable marks its ends."""
+        body = [self.color] * self.beads
+        if not self.closed:
+            body[0], body[-1] = self.first_color, self.last_color
+        return tuple(body)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RingConfig(CableConfig):
+    """The paper's closed cable: 32 beads on a circle of radius 0.075 m, all blue."""
+
+    beads: int = 32
+    closed: bool = True
+    ring_radius: float = 0.075
+    """Radius of the circle of bead centres at rest [m]."""
+    spacing: float = 2 * 0.075 * math.sin(math.pi / 32)
+
+
+@dataclass(frozen=True)
+class Cable:
+    """Where a cable stands in the model; particle numbers are relative to its world."""
+
+    config: CableConfig
+    particles: range
+    springs: range
+
+    @property
+    def count(self) -> int:
+        """Number of beads."""
+        return len(self.particles)
+
+
+def cable_line(
+    config: CableConfig, start: tuple[float, float], end: tuple[float, float]
+) -> np.ndarray:
+    """Bead positions (beads, 3) [m] on the table, from `start` towards `end`, one spacing apart."""
+    direction = np.subtract(end, start)
+    length = float(np.hypot(*direction))
+    if length == 0:
+        raise InputError("cable_line needs two different points")
+    steps = np.arange(config.beads)[:, None] * config.spacing
+    xy = np.asarray(start) + steps * direction / length
+    return np.column_stack([xy, np.full(config.beads, config.radius)])
+
+
+def cable_ring(config: CableConfig, centre: tuple[float, float]) -> np.ndarray:
+    """Bead positions (beads, 3) [m] on the table on the circle that fits the spacing."""
+    radius = config.spacing / (2 * math.sin(math.pi / config.beads))
+    angle = 2 * np.pi * np.arange(config.beads) / config.beads
+    xy = np.asarray(centre) + radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.column_stack([xy, np.full(config.beads, config.radius)])
+
+
+def add_cable(builder: newton.ModelBuilder, config: CableConfig, positions: np.ndarray) -> Cable:
+    """Add a cable whose beads start at `positions` (beads, 3) [m].
+
+    Rest lengths come from the config, not from the positions, so a cable may start crumpled.
+
+    Raises:
+        InputError: `positions` has another shape or is not finite.
+    """
+    positions = np.asarray(positions, dtype=float)
+    if positions.shape != (config.beads, 3) or not np.isfinite(positions).all():
+        raise InputError(
+            f"a cable of {config.beads} beads needs finite positions of shape ({config.beads}, 3), "
+            f"got {positions.shape}"
+        )
+    register_attributes(builder)
+    number = next_object(builder)
+    first_particle, first_spring = builder.particle_count, builder.spring_count
+    rest = _rest_shape(config)
+    for position, material in zip(positions, rest, strict=True):
+        builder.add_particle(
+            tuple(position),
+            (0.0, 0.0, 0.0),
+            config.mass,
+            radius=config.radius,
+            custom_attributes={
+                attribute("particle_object"): number,
+                attribute("particle_rest"): tuple(material),
+                attribute("particle_exclusion"): config.exclusion * config.spacing,
+            },
+        )
+    for step, ratio, stiffness, mode in (
+        (1, 1.0, config.link_stiffness, SpringMode.EQUAL),
+        (2, config.fold_limit, config.fold_stiffness, SpringMode.AT_LEAST),
+    ):
+        if ratio == 0:
+            continue
+        starts = range(config.beads if config.closed else config.beads - step)
+        # even links first, then odd ones: within a colour no two share a bead, so the processor
+        # can work on several at once
+        for i in (k for parity in (0, 1) for k in starts if (k // step) % 2 == parity):
+            j = (i + step) % config.beads
+            builder.add_spring(
+                first_particle + i,
+                first_particle + j,
+                stiffness,
+                0.0,
+                0.0,
+                custom_attributes={attribute("spring_mode"): int(mode)},
+            )
+            builder.spring_rest_length[-1] = ratio * config.spacing
+    return Cable(
+        config,
+        range(first_particle, builder.particle_count),
+        range(first_spring, builder.spring_count),
+    )
+
+
+def _rest_shape(config: CableConfig) -> np.ndarray:
+    """Straight line or circle of the undeformed cable, (beads, 3) [m], around its own origin."""
+    if config.closed:
+        return cable_ring(config, (0.0, 0.0)) * [1, 1, 0]
+    return cable_line(config, (0.0, 0.0), (1.0, 0.0)) * [1, 1, 0]

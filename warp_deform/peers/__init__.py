@@ -1,0 +1,20 @@
+"""The peers of the speed benchmark: the same scenes in PyBullet and in Newton's own solvers.
+
+They are cross-checks and yardsticks; no part of the product simulates with them.
+"""
+
+from .newton_peer import NEWTON_SETTINGS, NewtonSettings, time_newton
+from .pybullet_peer import time_pybullet
+from .scene import PEER_SCENES, PeerScene, peer_scene
+from .timing import PeerTiming
+
+__all__ = [
+    "NEWTON_SETTINGS",
+    "PEER_SCENES",
+    "NewtonSettings",
+    "PeerScene",
+    "PeerTiming",
+    "peer_scene",
+    "time_newton",
+    "time_pybullet",
+]

@@ -1,0 +1,144 @@
+"""The scenes in PyBullet, at the settings of the original DeformableRavens environment.
+
+Source: Seita et al., ICRA 2021, and its released code: a deformable world for every task, 240 Hz,
+gravity 9.8 m/s^2, every other solver setting left at PyBullet's default (50 iterations), beads that
+are 0.1 kg cubes of half extent 5 mm, point-to-point constraints of at most 100 N, a ground plane
+1 mm below a slab, both of friction 1.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..objects.box import l_block
+from .scene import PeerScene
+from .timing import FRAME_RATE, PeerTiming, measure
+
+__all__ = ["PyBulletWorld", "time_pybullet"]
+
+HZ = 240
+_MAX_FORCE = 100.0  # [N]
+_NOTE = (
+    "as the original: cubes as beads, point-to-point joints of at most 100 N, no bending stiffness; "
+    "without the arm, which the original also steps"
+)
+
+
+def time_pybullet(scene: str, *, seconds: float = 1.0, repeats: int = 5) -> PeerTiming:
+    """CPU cost of `scene` ("cable", "ring" or "block") in PyBullet, one process, one thread.
+
+    Raises:
+        InputError: PyBullet is not installed, or an argument is out of range.
+    """
+    bullet = _import_pybullet()
+    client = bullet.connect(bullet.DIRECT)
+    try:
+        bullet.resetSimulation(bullet.RESET_USE_DEFORMABLE_WORLD, physicsClientId=client)
+        parameters = bullet.getPhysicsEngineParameters(physicsClientId=client)
+    finally:
+        bullet.disconnect(physicsClientId=client)
+    return measure(
+        PyBulletWorld,
+        engine="pybullet",
+        scene=scene,
+        seconds=seconds,
+        repeats=repeats,
+        hz=HZ,
+        iterations=int(parameters["numSolverIterations"]),
+        note=_NOTE,
+    )
+
+
+def _import_pybullet() -> Any:
+    try:
+        import pybullet
+    except ImportError as error:
+        raise InputError(
+            "PyBullet is not installed; run: pip install 'warp-deform[dev]' "
+            "(its wheels stop at Python 3.11)"
+        ) from error
+    return pybullet
+
+
+class PyBulletWorld:
+    """One scene in a PyBullet client of its own."""
+
+    def __init__(self, scene: PeerScene) -> None:
+        self._bullet = bullet = _import_pybullet()
+        self._client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
+        bullet.setPhysicsEngineParameter(enableFileCaching=0, **self._client)
+        bullet.resetSimulation(bullet.RESET_USE_DEFORMABLE_WORLD, **self._client)
+        bullet.setGravity(0, 0, -9.8, **self._client)
+        bullet.setTimeStep(1 / HZ, **self._client)
+        self._add_table()
+        self._bodies = self._add_block(scene) if scene.cable is None else self._add_beads(scene)
+
+    def _add_table(self) -> None:
+        bullet = self._bullet
+        plane = bullet.createCollisionShape(bullet.GEOM_PLANE, **self._client)
+        slab = bullet.createCollisionShape(
+            bullet.GEOM_BOX, halfExtents=(1.0, 1.5, 0.005), **self._client
+        )
+        for shape, position in ((plane, (0, 0, -0.001)), (slab, (0.5, 0, -0.005))):
+            body = bullet.createMultiBody(0, shape, basePosition=position, **self._client)
+            bullet.changeDynamics(body, -1, lateralFriction=1.0, **self._client)
+
+    def _add_beads(self, scene: PeerScene) -> list[int]:
+        bullet, cable = self._bullet, scene.cable
+        assert cable is not None
+        shape = bullet.createCollisionShape(
+            bullet.GEOM_BOX, halfExtents=[cable.radius] * 3, **self._client
+        )
+        bodies = [
+            bullet.createMultiBody(cable.mass, shape, basePosition=tuple(bead), **self._client)
+            for bead in scene.beads
+        ]
+        for i, j in scene.links:
+            joint = bullet.createConstraint(
+                bodies[i],
+                -1,
+                bodies[j],
+                -1,
+                bullet.JOINT_POINT2POINT,
+                jointAxis=(0, 0, 0),
+                parentFramePosition=tuple(scene.beads[j] - scene.beads[i]),
+                childFramePosition=(0, 0, 0),
+                **self._client,
+            )
+            bullet.changeConstraint(joint, maxForce=_MAX_FORCE, **self._client)
+        return bodies
+
+    def _add_block(self, scene: PeerScene) -> list[int]:
+        bullet, block = self._bullet, l_block()
+        shape = bullet.createCollisionShapeArray(
+            shapeTypes=[bullet.GEOM_BOX] * len(block.parts),
+            halfExtents=[tuple(side / 2 for side in part.size) for part in block.parts],
+            collisionFramePositions=[part.offset for part in block.parts],
+            **self._client,
+        )
+        body = bullet.createMultiBody(
+            block.mass,
+            shape,
+            basePosition=tuple(scene.block_position),
+            baseOrientation=bullet.getQuaternionFromEuler((0, 0, scene.block_yaw)),
+            **self._client,
+        )
+        bullet.changeDynamics(body, -1, lateralFriction=block.friction, **self._client)
+        return [body]
+
+    def frame(self) -> None:
+        """Advance by four steps of 1/240 s."""
+        for _ in range(HZ // FRAME_RATE):
+            self._bullet.stepSimulation(**self._client)
+
+    def beads(self) -> np.ndarray:
+        """Positions of the moving bodies, (bodies, 3) [m]."""
+        pose = self._bullet.getBasePositionAndOrientation
+        return np.array([pose(body, **self._client)[0] for body in self._bodies])
+
+    def close(self) -> None:
+        """Disconnect the client."""
+        self._bullet.disconnect(**self._client)

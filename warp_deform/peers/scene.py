@@ -1,0 +1,107 @@
+"""The scenes on which this package and its peers are timed, as positions and links only.
+
+Every engine starts from the same numbers, so what differs is the engine.
+
+Source: Seita et al., ICRA 2021 (beads, spacing, masses, the stack that falls into a heap).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from ..errors import InputError
+from ..objects.cable import CableConfig, RingConfig, cable_ring
+
+__all__ = ["PEER_SCENES", "PeerScene", "SceneName", "peer_scene"]
+
+SceneName = Literal["cable", "ring", "block"]
+PEER_SCENES: tuple[str, ...] = get_args(SceneName)
+
+_CENTRE = (0.5, 0.0)
+_NOISE = 3e-4  # [m]; a perfect stack of spheres stands, and a perfect ring folds in its plane
+_DROP = 0.05  # [m]; clear height under the block
+
+
+@dataclass(frozen=True)
+class PeerScene:
+    """Where everything starts. A scene has either beads or one block.
+
+    Attributes:
+        name: "cable", "ring" or "block".
+        cable: What the beads are; None where the scene has none.
+        beads: Bead centres (beads, 3) [m]; neighbours are one spacing apart.
+        links: Pairs of linked beads (links, 2).
+        block_position: Origin of the L-block (3,) [m].
+        block_yaw: Its heading [rad].
+    """
+
+    name: str
+    cable: CableConfig | None
+    beads: np.ndarray
+    links: np.ndarray
+    block_position: np.ndarray
+    block_yaw: float
+
+    @property
+    def bodies(self) -> int:
+        """Number of things that move."""
+        return max(1, len(self.beads))
+
+    def stretch(self, beads: np.ndarray) -> float:
+        """Longest link over its rest length for beads at (beads, 3) [m]; 1 without links."""
+        if self.cable is None:
+            return 1.0
+        ends = beads[self.links]
+        return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max() / self.cable.spacing)
+
+
+def peer_scene(name: str, *, seed: int = 0) -> PeerScene:
+    """A start above the table; `seed` draws its small noise and its heading.
+
+    The cable is a vertical stack of 24 beads, the ring stands upright on its edge, the L-block
+    hangs flat 5 cm above the table. All three fall at once.
+
+    Raises:
+        InputError: there is no scene of that name.
+    """
+    if name not in PEER_SCENES:
+        raise InputError(f"no peer scene is called {name!r}; choose from {', '.join(PEER_SCENES)}")
+    rng = np.random.default_rng(seed)
+    yaw = float(rng.uniform(0, 2 * np.pi))
+    cable: CableConfig | None = None
+    beads, links = np.zeros((0, 3)), np.zeros((0, 2), dtype=int)
+    if name == "cable":
+        cable = CableConfig()
+        beads = _stack(cable, rng)
+    elif name == "ring":
+        cable = RingConfig()
+        beads = _upright_ring(cable, yaw, rng)
+    if cable is not None:
+        first = np.arange(cable.beads if cable.closed else cable.beads - 1)
+        links = np.column_stack([first, (first + 1) % cable.beads])
+    return PeerScene(name, cable, beads, links, np.array([*_CENTRE, 0.02 + _DROP]), yaw)
+
+
+def _stack(cable: CableConfig, rng: np.random.Generator) -> np.ndarray:
+    beads = np.empty((cable.beads, 3))
+    beads[0] = (*_CENTRE, cable.spacing)
+    for i in range(1, cable.beads):
+        target = np.array([*(_CENTRE + rng.normal(0, _NOISE, 2)), (i + 1) * cable.spacing])
+        step = target - beads[i - 1]
+        beads[i] = beads[i - 1] + cable.spacing * step / np.linalg.norm(step)
+    return beads
+
+
+def _upright_ring(cable: CableConfig, yaw: float, rng: np.random.Generator) -> np.ndarray:
+    across, up, _ = cable_ring(cable, (0.0, 0.0)).T
+    off_plane = rng.normal(0, _NOISE, cable.beads)
+    return np.column_stack(
+        [
+            _CENTRE[0] + across * np.cos(yaw) - off_plane * np.sin(yaw),
+            _CENTRE[1] + across * np.sin(yaw) + off_plane * np.cos(yaw),
+            up - up.min() + 2 * cable.radius,
+        ]
+    )

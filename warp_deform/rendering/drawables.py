@@ -1,0 +1,112 @@
+"""What a picture of one world shows, apart from where things are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..objects.box import Box
+from ..objects.cable import Cable
+from ..objects.colors import TABLE
+from ..objects.zone import Zone
+
+__all__ = ["FIRST_SEGMENT", "WORKSPACE_SEGMENT", "Drawables"]
+
+WORKSPACE_SEGMENT = 1
+"""Segmentation id of the bare table, as in the original."""
+FIRST_SEGMENT = 4
+"""Segmentation id of the first object or zone; the others follow in creation order."""
+LINK_SHARE = 0.5  # radius of a rod between beads, as a share of the bead's
+
+
+@dataclass(frozen=True, eq=False)
+class Drawables:
+    """Spheres, boxes, sheets and flat marks of one world, with a segmentation id and a colour each.
+
+    sphere_particle (S,) int32: which particle is a sphere's centre
+    sphere_radius (S,) float32 [m]; sphere_segment (S,) int32
+    box_body (B,) int32: which body a box moves with; box_pose (B, 7) float32: centre [m] and
+        quat_xyzw of the box in the body's frame; box_half (B, 3) float32 [m]; box_segment (B,) int32
+    quad_corners (Q, 4, 3) float32 [m], fixed in the world; quad_segment (Q,) int32
+    triangle_particle (T, 3) int32: corners of two-sided sheets; triangle_segment (T,) int32
+    link_particle (L, 2) int32: beads that scenes (not the top-down pictures) join by a thin rod;
+        link_radius (L,) float32 [m]; link_segment (L,) int32: whose colour the rod takes
+    palette (256, 3) uint8: colour of each segmentation id
+    segments: for every argument of `of`, in its order, the ids it got
+    """
+
+    sphere_particle: np.ndarray
+    sphere_radius: np.ndarray
+    sphere_segment: np.ndarray
+    box_body: np.ndarray
+    box_pose: np.ndarray
+    box_half: np.ndarray
+    box_segment: np.ndarray
+    quad_corners: np.ndarray
+    quad_segment: np.ndarray
+    palette: np.ndarray
+    segments: tuple[range, ...]
+    triangle_particle: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int32))
+    triangle_segment: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    link_particle: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    link_radius: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+    link_segment: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+
+    @classmethod
+    def of(cls, objects: Sequence[Cable | Box | Zone]) -> Drawables:
+        """Drawables of `objects` in creation order: every bead, body and zone gets an id of its own."""
+        spheres: list[tuple[int, float, int]] = []
+        links: list[tuple[int, int, float, int]] = []
+        boxes: list[tuple[int, tuple[float, ...], tuple[float, ...], int]] = []
+        quads: list[np.ndarray] = []
+        quad_segments: list[int] = []
+        palette = np.zeros((256, 3), np.uint8)
+        palette[WORKSPACE_SEGMENT] = TABLE
+        segments: list[range] = []
+        segment = FIRST_SEGMENT
+        for item in objects:
+            first = segment
+            if isinstance(item, Cable):
+                config, beads = item.config, item.particles
+                for particle, color in zip(beads, config.colors(), strict=True):
+                    spheres.append((particle, config.visual_radius, segment))
+                    palette[segment] = color
+                    segment += 1
+                for i in range(item.count if config.closed else item.count - 1):
+                    # the colour of the body, not of a marked end
+                    owner = first + (max(i, 1) if not config.closed else i)
+                    neighbour = beads[(i + 1) % item.count]
+                    links.append((beads[i], neighbour, LINK_SHARE * config.visual_radius, owner))
+            elif isinstance(item, Box):
+                for part in item.config.parts:
+                    pose = (*part.offset, 0.0, 0.0, 0.0, 1.0)
+                    half = tuple(side / 2 for side in part.size)
+                    boxes.append((item.body, pose, half, segment))
+                palette[segment] = item.config.color
+                segment += 1
+            else:
+                quads.append(item.corners)
+                quad_segments += [segment] * len(item.corners)
+                palette[segment] = item.color
+                segment += 1
+            segments.append(range(first, segment))
+        if segment > 256:
+            raise ValueError(f"{segment - FIRST_SEGMENT} objects do not fit 8-bit segmentation ids")
+        return cls(
+            sphere_particle=np.array([s[0] for s in spheres], np.int32),
+            sphere_radius=np.array([s[1] for s in spheres], np.float32),
+            sphere_segment=np.array([s[2] for s in spheres], np.int32),
+            box_body=np.array([b[0] for b in boxes], np.int32),
+            box_pose=np.array([b[1] for b in boxes], np.float32).reshape(-1, 7),
+            box_half=np.array([b[2] for b in boxes], np.float32).reshape(-1, 3),
+            box_segment=np.array([b[3] for b in boxes], np.int32),
+            quad_corners=np.concatenate([*quads, np.zeros((0, 4, 3))]).astype(np.float32),
+            quad_segment=np.array(quad_segments, np.int32),
+            palette=palette,
+            segments=tuple(segments),
+            link_particle=np.array([k[:2] for k in links], np.int32).reshape(-1, 2),
+            link_radius=np.array([k[2] for k in links], np.float32),
+            link_segment=np.array([k[3] for k in links], np.int32),
+        )

@@ -1,0 +1,262 @@
+"""Kernels of the pinhole z-buffer: which primitive every sample of a camera sees.
+
+A sample (row, column) looks along the ray d = ((column - cx) / fx, (row - cy) / fy, 1) in the
+camera's frame. The buffer's 64-bit keys hold the bits of the inverse depth above the primitive's
+number, so an atomic maximum keeps the nearest surface whatever the order of threads; 0 is nothing.
+
+Source: Olano and Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates", 1997 (edge
+functions from camera coordinates, so triangles need no clipping).
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from .camera import Camera
+from .geometry import Geometry, Scene
+
+__all__ = ["View", "draw", "inverse_depth", "primitive_of", "ray", "to_camera", "view_of"]
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+NEAR = wp.constant(0.01)  # [m], as the original's cameras
+
+
+@wp.struct
+class View:
+    """A camera as kernels need it: axes in the world, origin [m], intrinsics and size in samples."""
+
+    right: wp.vec3
+    down: wp.vec3
+    forward: wp.vec3
+    origin: wp.vec3
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rows: int
+    columns: int
+
+
+def view_of(camera: Camera, *, supersample: int = 1) -> View:
+    """The view of `camera` with `supersample` times as many samples as pixels along both axes."""
+    view = View()
+    pose, K = camera.world_T_camera, camera.intrinsics
+    view.right, view.down, view.forward, view.origin = (wp.vec3(*pose[:3, k]) for k in range(4))
+    view.fx, view.fy = K[0, 0] * supersample, K[1, 1] * supersample
+    view.cx, view.cy = ((K[k, 2] + 0.5) * supersample - 0.5 for k in (0, 1))
+    view.rows, view.columns = (side * supersample for side in camera.size)
+    return view
+
+
+@wp.func
+def to_camera(view: View, p: wp.vec3):
+    """A world point in the camera's frame."""
+    d = p - view.origin
+    return wp.vec3(wp.dot(view.right, d), wp.dot(view.down, d), wp.dot(view.forward, d))
+
+
+@wp.func
+def ray(view: View, row: float, column: float):
+    """Direction through a sample in the camera's frame; its third component is 1."""
+    return wp.vec3((column - view.cx) / view.fx, (row - view.cy) / view.fy, 1.0)
+
+
+@wp.func
+def key_of(inverse: float, primitive: int):
+    """Pack a positive inverse depth and a primitive."""
+    return (wp.int64(wp.cast(inverse, wp.int32)) << wp.int64(32)) | wp.int64(primitive + 1)
+
+
+@wp.func
+def inverse_depth(key: wp.int64):
+    """Inverse depth [1/m] that a key holds; 0 for an empty one."""
+    return wp.cast(int(key >> wp.int64(32)), float)
+
+
+@wp.func
+def primitive_of(key: wp.int64):
+    """Primitive that a key holds; -1 for an empty one."""
+    return int(key & wp.int64(0xFFFFFFFF)) - 1
+
+
+@wp.func
+def first_sample(x: float, count: int):
+    """Lowest sample at or after `x`, between 0 and `count`."""
+    return int(wp.clamp(wp.ceil(x), 0.0, float(count)))
+
+
+@wp.func
+def last_sample(x: float, count: int):
+    """Highest sample at or before `x`, between -1 and `count` - 1."""
+    return int(wp.clamp(wp.floor(x), -1.0, float(count) - 1.0))
+
+
+@wp.func
+def narrowed(view: View, slope: float, offset: float, span: wp.vec2):
+    """Part of the columns `span` where slope * x + offset >= 0 may hold."""
+    if wp.abs(slope) < 1.0e-9:
+        return span
+    root = -offset / slope * view.fx + view.cx
+    if slope > 0.0:
+        return wp.vec2(wp.clamp(wp.floor(root) - 1.0, span[0], span[1] + 1.0), span[1])
+    return wp.vec2(span[0], wp.clamp(wp.ceil(root) + 1.0, span[0] - 1.0, span[1]))
+
+
+@wp.kernel
+def raster_triangles(scene: Scene, view: View, buffer: wp.array2d(dtype=wp.int64)):
+    """One thread a triangle, seen from either side."""
+    f = wp.tid()
+    tri = scene.triangles[f]
+    a = to_camera(view, scene.points[tri[0]])
+    b = to_camera(view, scene.points[tri[1]])
+    c = to_camera(view, scene.points[tri[2]])
+    if wp.max(a[2], wp.max(b[2], c[2])) < NEAR:
+        return
+    c0 = int(0)
+    c1 = view.columns - 1
+    r0 = int(0)
+    r1 = view.rows - 1
+    if wp.min(a[2], wp.min(b[2], c[2])) > NEAR:
+        ax = a[0] / a[2]
+        bx = b[0] / b[2]
+        cx = c[0] / c[2]
+        ay = a[1] / a[2]
+        by = b[1] / b[2]
+        cy = c[1] / c[2]
+        c0 = first_sample(wp.min(ax, wp.min(bx, cx)) * view.fx + view.cx, view.columns)
+        c1 = last_sample(wp.max(ax, wp.max(bx, cx)) * view.fx + view.cx, view.columns)
+        r0 = first_sample(wp.min(ay, wp.min(by, cy)) * view.fy + view.cy, view.rows)
+        r1 = last_sample(wp.max(ay, wp.max(by, cy)) * view.fy + view.cy, view.rows)
+    if c0 > c1 or r0 > r1:
+        return
+    # edge functions; a shared edge gets the same numbers with the other sign, so there are no cracks
+    ea = wp.cross(b, c)
+    eb = wp.cross(c, a)
+    ec = wp.cross(a, b)
+    n = wp.cross(b - a, c - a)
+    plane = wp.dot(n, a)
+    # seen edge-on
+    if wp.abs(plane) < 1.0e-12:
+        return
+    n = n / plane
+    if plane < 0.0:
+        ea = -ea
+        eb = -eb
+        ec = -ec
+    # along a row the edge functions change by this
+    step = 1.0 / view.fx
+    for r in range(r0, r1 + 1):
+        y = (float(r) - view.cy) / view.fy
+        ra = ea[1] * y + ea[2]
+        rb = eb[1] * y + eb[2]
+        rc = ec[1] * y + ec[2]
+        rn = n[1] * y + n[2]
+        low = float(c0)
+        high = float(c1)
+        # a wide triangle: go only where the row can be inside, a sample more to either side
+        if c1 - c0 > 12:
+            span = narrowed(view, ea[0], ra, wp.vec2(low, high))
+            span = narrowed(view, eb[0], rb, span)
+            span = narrowed(view, ec[0], rc, span)
+            low = span[0]
+            high = span[1]
+        for q in range(int(low), int(high) + 1):
+            x = (float(q) - view.cx) * step
+            if ea[0] * x + ra >= 0.0 and eb[0] * x + rb >= 0.0 and ec[0] * x + rc >= 0.0:
+                inverse = n[0] * x + rn
+                if inverse > 0.0 and inverse * NEAR < 1.0:
+                    wp.atomic_max(buffer, r, q, key_of(inverse, f))
+
+
+@wp.func
+def sphere_span(x: float, z: float, radius: float):
+    """Smallest and largest x / z over a sphere in front of the camera (seen in one plane)."""
+    span = radius * wp.sqrt(wp.max(x * x + z * z - radius * radius, 0.0))
+    scale = 1.0 / (z * z - radius * radius)
+    return wp.vec2((x * z - span) * scale, (x * z + span) * scale)
+
+
+@wp.kernel
+def raster_spheres(scene: Scene, view: View, first: int, buffer: wp.array2d(dtype=wp.int64)):
+    """One thread a sphere."""
+    s = wp.tid()
+    radius = scene.sphere_radius[s]
+    p = to_camera(view, scene.points[scene.sphere_particle[s]])
+    if p[2] - radius < NEAR:
+        return
+    across = sphere_span(p[0], p[2], radius)
+    along = sphere_span(p[1], p[2], radius)
+    c0 = first_sample(across[0] * view.fx + view.cx, view.columns)
+    c1 = last_sample(across[1] * view.fx + view.cx, view.columns)
+    r0 = first_sample(along[0] * view.fy + view.cy, view.rows)
+    r1 = last_sample(along[1] * view.fy + view.cy, view.rows)
+    for r in range(r0, r1 + 1):
+        for q in range(c0, c1 + 1):
+            d = ray(view, float(r), float(q))
+            square = wp.dot(d, d)
+            # the ray's closest point to the centre; subtracting squares instead loses digits
+            nearest = wp.dot(d, p) / square
+            gap = d * nearest - p
+            inside = radius * radius - wp.dot(gap, gap)
+            if inside > 0.0:
+                wp.atomic_max(
+                    buffer, r, q, key_of(1.0 / (nearest - wp.sqrt(inside / square)), first + s)
+                )
+
+
+@wp.kernel
+def raster_links(scene: Scene, view: View, first: int, buffer: wp.array2d(dtype=wp.int64)):
+    """One thread a rod: a cylinder without caps, as its ends lie inside of beads."""
+    k = wp.tid()
+    radius = scene.link_radius[k]
+    ends = scene.link_particle[k]
+    a = to_camera(view, scene.points[ends[0]])
+    b = to_camera(view, scene.points[ends[1]])
+    length = wp.length(b - a)
+    if wp.min(a[2], b[2]) - radius < NEAR or length < 1.0e-9:
+        return
+    axis = (b - a) / length
+    xa = sphere_span(a[0], a[2], radius)
+    xb = sphere_span(b[0], b[2], radius)
+    ya = sphere_span(a[1], a[2], radius)
+    yb = sphere_span(b[1], b[2], radius)
+    c0 = first_sample(wp.min(xa[0], xb[0]) * view.fx + view.cx, view.columns)
+    c1 = last_sample(wp.max(xa[1], xb[1]) * view.fx + view.cx, view.columns)
+    r0 = first_sample(wp.min(ya[0], yb[0]) * view.fy + view.cy, view.rows)
+    r1 = last_sample(wp.max(ya[1], yb[1]) * view.fy + view.cy, view.rows)
+    flat_a = a - axis * wp.dot(axis, a)
+    for r in range(r0, r1 + 1):
+        for q in range(c0, c1 + 1):
+            d = ray(view, float(r), float(q))
+            # seen along the axis, the rod is a disc
+            flat_d = d - axis * wp.dot(axis, d)
+            square = wp.dot(flat_d, flat_d)
+            if square > 1.0e-12:
+                nearest = wp.dot(flat_d, flat_a) / square
+                gap = flat_d * nearest - flat_a
+                inside = radius * radius - wp.dot(gap, gap)
+                if inside > 0.0:
+                    depth = nearest - wp.sqrt(inside / square)
+                    along = wp.dot(axis, d * depth - a)
+                    if depth > NEAR and along >= 0.0 and along <= length:
+                        wp.atomic_max(buffer, r, q, key_of(1.0 / depth, first + k))
+
+
+def draw(geometry: Geometry, view: View, buffer: wp.array, *, links: bool) -> None:
+    """Clear `buffer` (rows, columns) and fill it with what `view` sees of `geometry`.
+
+    Primitives count triangles first, then spheres, then rods.
+    """
+    buffer.zero_()
+    scene, device = geometry.scene, geometry.device
+    spheres = geometry.triangle_count
+    rods = spheres + geometry.sphere_count
+    wp.launch(raster_triangles, spheres, inputs=[scene, view, buffer], device=device)
+    wp.launch(
+        raster_spheres, geometry.sphere_count, inputs=[scene, view, spheres, buffer], device=device
+    )
+    if links:
+        wp.launch(
+            raster_links, geometry.link_count, inputs=[scene, view, rods, buffer], device=device
+        )

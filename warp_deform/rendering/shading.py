@@ -1,0 +1,406 @@
+"""What a sample's surface looks like: materials, floor, a lamp with soft shadows, ambient light.
+
+Light adds up in linear colour, taken as the square of the stored one, so the shader needs no
+transcendental function. A level surface in full light at the table's centre has its palette's colour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from ..objects.colors import TABLE, Color
+from .drawables import WORKSPACE_SEGMENT
+from .geometry import MESH_MATERIAL, Scene
+from .pinhole import View, inverse_depth, primitive_of, ray, to_camera
+from .pixels import BOUNDS
+
+__all__ = ["FLOOR_SEGMENT", "ROBOT_SEGMENT", "Look", "Lighting", "lighting_of", "shade"]
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+FLOOR_SEGMENT = 0
+ROBOT_SEGMENT = 2
+"""Segmentation ids of the floor and of every mesh, as in the original."""
+
+FIRST_MESH = wp.constant(MESH_MATERIAL)
+ROBOT = wp.constant(ROBOT_SEGMENT)
+WORKSPACE = wp.constant(WORKSPACE_SEGMENT)
+X_LOW, X_HIGH = (wp.constant(value) for value in BOUNDS[0])
+Y_LOW, Y_HIGH = (wp.constant(value) for value in BOUNDS[1])
+TABLE_COLOR = wp.constant(wp.vec3(*(float(c) for c in TABLE)))
+SOFT = wp.constant(3)  # half width of the shadow's filter in texels
+NOTHING = wp.constant(-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """Surroundings and light; colours are 8-bit RGB."""
+
+    floor: float = -0.001
+    """Height of the floor [m]."""
+    floor_color: Color = (239, 239, 239)
+    floor_checker: Color = (158, 181, 224)
+    """Colour of every other square of 1 m; the same as `floor_color` for a plain floor."""
+    table: bool = True
+    """Whether the workspace is painted on the plane z = 0."""
+    horizon: Color = (178, 178, 204)
+    """Colour of what lies beyond the floor."""
+    haze: float = 0.0
+    """Distance at which the floor has half taken the horizon's colour [m]; 0 for never."""
+    lamp: tuple[float, float, float] = (0.1, -1.1, 2.4)
+    """Where the lamp hangs [m]."""
+    lamp_share: float = 0.62
+    """Share of the light on a level surface that comes from the lamp; the rest is ambient."""
+    occlusion: float = 0.0
+    """How strongly things above keep ambient light out, 0 to 1."""
+    gloss: float = 0.0
+    """Strength of highlights on meshes; objects have a third of it."""
+
+
+@wp.struct
+class Lighting:
+    """A `Look` as the kernel reads it; linear colours."""
+
+    floor: float
+    floor_color: wp.vec3
+    floor_checker: wp.vec3
+    table: int
+    horizon: wp.vec3
+    haze: float
+    lamp: wp.vec3
+    direct: float
+    ambient: float
+    occlusion: float
+    gloss: float
+
+
+@wp.struct
+class Surface:
+    """What one sample sees."""
+
+    position: wp.vec3
+    normal: wp.vec3
+    color: wp.vec3
+    gloss: float
+    depth: float
+    segment: int
+
+
+def linear(color: Color) -> wp.vec3:
+    """Linear colour, 0 to 1, of an 8-bit one."""
+    return wp.vec3(*((c / 255) ** 2 for c in color))
+
+
+def lighting_of(look: Look) -> Lighting:
+    """The kernel's form of `look`."""
+    lighting = Lighting()
+    lighting.floor, lighting.table = look.floor, int(look.table)
+    lighting.floor_color, lighting.floor_checker = linear(look.floor_color), linear(look.floor_checker)
+    lighting.horizon, lighting.haze = linear(look.horizon), look.haze
+    lighting.lamp = wp.vec3(*look.lamp)
+    x, y, z = look.lamp
+    cosine = z / ((x - 0.5) ** 2 + y**2 + z**2) ** 0.5
+    lighting.direct, lighting.ambient = look.lamp_share / cosine, 1.0 - look.lamp_share
+    lighting.occlusion, lighting.gloss = look.occlusion, look.gloss
+    return lighting
+
+
+@wp.func
+def squared(c: wp.vec3):
+    """Linear colour of a stored one, 0 to 255."""
+    return wp.cw_mul(c, c) * (1.0 / 65025.0)
+
+
+@wp.func
+def world_ray(view: View, row: float, column: float):
+    """Direction through a sample in the world, of unit depth."""
+    d = ray(view, row, column)
+    return view.right * d[0] + view.down * d[1] + view.forward
+
+
+@wp.func
+def ground(lighting: Lighting, view: View, row: float, column: float):
+    """Table, floor or horizon at a sample that sees no primitive."""
+    d = world_ray(view, row, column)
+    s = Surface()
+    s.normal = wp.vec3(0.0, 0.0, 1.0)
+    s.gloss = 0.0
+    s.segment = NOTHING
+    s.color = lighting.horizon
+    s.depth = 0.0
+    if d[2] > -1.0e-6:
+        return s
+    if lighting.table == 1:
+        depth = -view.origin[2] / d[2]
+        p = view.origin + d * depth
+        if depth > 0.0 and p[0] >= X_LOW and p[0] <= X_HIGH and p[1] >= Y_LOW and p[1] <= Y_HIGH:
+            s.position = p
+            s.depth = depth
+            s.segment = WORKSPACE
+            s.color = squared(TABLE_COLOR)
+            return s
+    depth = (lighting.floor - view.origin[2]) / d[2]
+    if depth > 0.0:
+        p = view.origin + d * depth
+        s.position = p
+        s.depth = depth
+        s.segment = 0
+        s.color = lighting.floor_color
+        if (int(wp.floor(p[0])) + int(wp.floor(p[1]))) % 2 != 0:
+            s.color = lighting.floor_checker
+    return s
+
+
+@wp.func
+def surface_at(
+    scene: Scene,
+    view: View,
+    lighting: Lighting,
+    triangles: int,
+    spheres: int,
+    key: wp.int64,
+    row: float,
+    column: float,
+):
+    """The surface of the primitive in `key` where the ray through (row, column) meets it."""
+    d = ray(view, row, column)
+    world_d = world_ray(view, row, column)
+    primitive = primitive_of(key)
+    s = Surface()
+    material = int(0)
+    if primitive < triangles:
+        tri = scene.triangles[primitive]
+        a = to_camera(view, scene.points[tri[0]])
+        b = to_camera(view, scene.points[tri[1]])
+        c = to_camera(view, scene.points[tri[2]])
+        n = wp.cross(b - a, c - a)
+        s.depth = wp.dot(n, a) / wp.dot(n, d)
+        p = d * s.depth
+        square = wp.dot(n, n)
+        wb = wp.clamp(wp.dot(wp.cross(p - a, c - a), n) / square, 0.0, 1.0)
+        wc = wp.clamp(wp.dot(wp.cross(b - a, p - a), n) / square, 0.0, 1.0)
+        wa = wp.max(1.0 - wb - wc, 0.0)
+        s.normal = wp.normalize(
+            scene.triangle_normals[primitive, 0] * wa
+            + scene.triangle_normals[primitive, 1] * wb
+            + scene.triangle_normals[primitive, 2] * wc
+        )
+        material = scene.triangle_material[primitive]
+    elif primitive < triangles + spheres:
+        k = primitive - triangles
+        radius = scene.sphere_radius[k]
+        centre = scene.points[scene.sphere_particle[k]]
+        p = to_camera(view, centre)
+        square = wp.dot(d, d)
+        nearest = wp.dot(d, p) / square
+        gap = d * nearest - p
+        s.depth = nearest - wp.sqrt(wp.max(radius * radius - wp.dot(gap, gap), 0.0) / square)
+        s.normal = wp.normalize(view.origin + world_d * s.depth - centre)
+        material = scene.sphere_material[k]
+    else:
+        k = primitive - triangles - spheres
+        s.depth = 1.0 / inverse_depth(key)
+        start = scene.points[scene.link_particle[k][0]]
+        axis = wp.normalize(scene.points[scene.link_particle[k][1]] - start)
+        p = view.origin + world_d * s.depth - start
+        s.normal = wp.normalize(p - axis * wp.dot(axis, p))
+        material = scene.link_material[k]
+    if wp.dot(s.normal, world_d) > 0.0:
+        s.normal = -s.normal
+    s.position = view.origin + world_d * s.depth
+    s.color = squared(scene.palette[material])
+    s.gloss = lighting.gloss
+    s.segment = ROBOT
+    if material < FIRST_MESH:
+        s.segment = material
+        s.gloss = lighting.gloss / 3.0
+    return s
+
+
+@wp.func
+def lit_share(shadow: wp.array2d(dtype=wp.int64), lamp: View, p: wp.vec3, n: wp.vec3):
+    """Share of the lamp that a point sees: a tent-edged box filter over the lamp's z-buffer."""
+    # a point a little off the surface, so that no surface shades itself
+    q = to_camera(lamp, p + n * 0.003)
+    if q[2] < 0.1:
+        return 1.0
+    inverse = 1.0 / (q[2] - 0.002)
+    x = q[0] / q[2] * lamp.fx + lamp.cx
+    y = q[1] / q[2] * lamp.fy + lamp.cy
+    edge = float(SOFT) + 1.0
+    if (
+        x < edge
+        or y < edge
+        or x > float(lamp.columns) - edge - 2.0
+        or y > float(lamp.rows) - edge - 2.0
+    ):
+        return 1.0
+    limit = wp.int64(wp.cast(inverse, wp.int32)) << wp.int64(32)
+    c = int(x)
+    r = int(y)
+    probes = int(0)
+    for i in range(5):
+        # corners and centre of the filter
+        dr = (2 * (i % 2) - 1) * SOFT
+        dc = (2 * (i / 2) - 1) * SOFT
+        if i == 4:
+            dr = 0
+            dc = 0
+        if shadow[r + dr, c + dc] > limit:
+            probes += 1
+    if probes == 0:
+        return 1.0
+    if probes == 5:
+        return 0.0
+    fx = x - float(c)
+    fy = y - float(r)
+    total = float(0.0)
+    for i in range(-SOFT, SOFT + 2):
+        wy = float(1.0)
+        if i == -SOFT:
+            wy = 1.0 - fy
+        if i == SOFT + 1:
+            wy = fy
+        for j in range(-SOFT, SOFT + 2):
+            wx = float(1.0)
+            if j == -SOFT:
+                wx = 1.0 - fx
+            if j == SOFT + 1:
+                wx = fx
+            if shadow[r + i, c + j] > limit:
+                total += wx * wy
+    width = float(2 * SOFT + 1)
+    return 1.0 - total / (width * width)
+
+
+@wp.func
+def open_share(above: wp.array2d(dtype=wp.int64), top: View, p: wp.vec3, n: wp.vec3):
+    """Share of the ambient light that nearby things above a point let through.
+
+    Heights around the point, read from a view straight from above, within a few centimetres.
+    """
+    q = to_camera(top, p + n * 0.004)
+    x = q[0] / q[2] * top.fx + top.cx
+    y = q[1] / q[2] * top.fy + top.cy
+    reach = top.fx / q[2] * 0.009
+    total = float(0.0)
+    for i in range(-2, 3):
+        for j in range(-2, 3):
+            c = int(x + float(j) * reach + 0.5)
+            r = int(y + float(i) * reach + 0.5)
+            if c >= 0 and r >= 0 and c < top.columns and r < top.rows:
+                key = above[r, c]
+                if key > wp.int64(0):
+                    rise = q[2] - 1.0 / inverse_depth(key)
+                    if rise > 0.002:
+                        total += rise / (rise + 0.006) / (1.0 + rise * rise * 150.0)
+    return 1.0 - total / 25.0
+
+
+@wp.func
+def radiance(
+    s: Surface,
+    view: View,
+    lighting: Lighting,
+    shadow: wp.array2d(dtype=wp.int64),
+    lamp: View,
+    above: wp.array2d(dtype=wp.int64),
+    top: View,
+):
+    """Linear colour that a surface sends to the camera."""
+    if s.segment == NOTHING:
+        return s.color
+    to_lamp = wp.normalize(lighting.lamp - s.position)
+    cosine = wp.dot(s.normal, to_lamp)
+    direct = float(0.0)
+    highlight = float(0.0)
+    if cosine > 0.0:
+        seen = lit_share(shadow, lamp, s.position, s.normal)
+        direct = lighting.direct * cosine * seen
+        if s.gloss > 0.0:
+            half = wp.normalize(to_lamp + wp.normalize(view.origin - s.position))
+            h = wp.max(wp.dot(s.normal, half), 0.0)
+            h = h * h
+            h = h * h
+            h = h * h
+            h = h * h
+            highlight = s.gloss * seen * h * h
+    # the sky is bright, the floor throws a little back
+    ambient = lighting.ambient * (0.7 + 0.3 * s.normal[2])
+    if lighting.occlusion > 0.0:
+        closed = 1.0 - open_share(above, top, s.position, s.normal)
+        ambient = ambient * wp.max(1.0 - lighting.occlusion * closed, 0.0)
+    color = s.color * (direct + ambient) + wp.vec3(highlight, highlight, highlight)
+    if s.segment == 0 and lighting.haze > 0.0:
+        gap = s.position - view.origin
+        ratio = wp.dot(gap, gap) / (lighting.haze * lighting.haze)
+        color = wp.lerp(color, lighting.horizon, ratio / (1.0 + ratio))
+    return color
+
+
+@wp.kernel
+def shade(
+    scene: Scene,
+    view: View,
+    lighting: Lighting,
+    supersample: int,
+    triangles: int,
+    spheres: int,
+    far: float,
+    buffer: wp.array2d(dtype=wp.int64),
+    shadow: wp.array2d(dtype=wp.int64),
+    lamp: View,
+    above: wp.array2d(dtype=wp.int64),
+    top: View,
+    out_color: wp.array2d(dtype=wp.vec3ub),
+    out_depth: wp.array2d(dtype=float),
+    out_segmentation: wp.array2d(dtype=wp.uint8),
+):
+    """One thread a pixel: the mean of its samples.
+
+    A pixel whose samples all see one primitive is shaded once. Depth and segmentation are whole
+    only with one sample a pixel.
+    """
+    i, j = wp.tid()
+    r0 = i * supersample
+    c0 = j * supersample
+    key = buffer[r0, c0]
+    same = bool(True)
+    for r in range(supersample):
+        for c in range(supersample):
+            if primitive_of(buffer[r0 + r, c0 + c]) != primitive_of(key):
+                same = False
+    middle = 0.5 * float(supersample - 1)
+    total = wp.vec3(0.0, 0.0, 0.0)
+    if same and (key != wp.int64(0) or supersample == 1 or lighting.table == 0):
+        row = float(r0) + middle
+        column = float(c0) + middle
+        # apart from each other, as handing over the whole scene costs more than the floor does
+        s = Surface()
+        if key == wp.int64(0):
+            s = ground(lighting, view, row, column)
+        else:
+            s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
+        total = radiance(s, view, lighting, shadow, lamp, above, top)
+        out_depth[i, j] = wp.where(s.segment == NOTHING or s.depth > far, far, s.depth)
+        out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
+    else:
+        for r in range(supersample):
+            for c in range(supersample):
+                key = buffer[r0 + r, c0 + c]
+                row = float(r0 + r)
+                column = float(c0 + c)
+                s = Surface()
+                if key == wp.int64(0):
+                    s = ground(lighting, view, row, column)
+                else:
+                    s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
+                total += radiance(s, view, lighting, shadow, lamp, above, top)
+        total = total / float(supersample * supersample)
+    out_color[i, j] = wp.vec3ub(
+        wp.uint8(wp.sqrt(wp.min(total[0], 1.0)) * 255.0 + 0.5),
+        wp.uint8(wp.sqrt(wp.min(total[1], 1.0)) * 255.0 + 0.5),
+        wp.uint8(wp.sqrt(wp.min(total[2], 1.0)) * 255.0 + 0.5),
+    )

@@ -1,0 +1,82 @@
+"""Contact and friction between particles and boxes, two-way."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .friction import friction
+from .lanes import add, mul, sub  # noqa: F401  (operators are found by name)
+from .rigid import rigid
+from .structures import structures
+
+__all__ = ["box_particle"]
+
+
+@functools.cache
+def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`project_box_particle`: one particle of one lane against one box.
+
+    The normal is that of the nearest point of the box; for a centre inside the box, that of the
+    nearest face. Separation is limited as in `sphere_contact`.
+    """
+    t = structures(scalar, lanes)
+    S, R3, V = t.S, t.R3, t.V
+    Shapes, Particles, Bodies = t.Shapes, t.Particles, t.Bodies
+    body = rigid(scalar, lanes)
+    response, push_body, moved = body.response, body.push_body, body.moved
+    coulomb_scalar = friction(scalar, lanes).coulomb_scalar
+
+    @wp.func
+    def project_box_particle(
+        i: int, lane: int, radius: S, shape: int, b: int, mu: S, push: S, q: Particles,
+        shapes: Shapes, bodies: Bodies,
+    ):  # fmt: skip
+        px = q.x[i]
+        p = R3(px.x[lane], px.y[lane], px.z[lane])
+        h = shapes.half[shape]
+        # the particle in the box's own frame
+        away = wp.quat_rotate_inv(bodies.q[b], p - bodies.x[b]) - shapes.center[shape]
+        at = wp.quat_rotate_inv(shapes.rotation[shape], away)
+        near = R3(
+            wp.clamp(at[0], -h[0], h[0]), wp.clamp(at[1], -h[1], h[1]), wp.clamp(at[2], -h[2], h[2])
+        )
+        n = at - near
+        gap = wp.length(n)
+        if gap < radius:
+            if gap > S(1.0e-8):
+                n = n / gap
+            else:
+                ox = wp.abs(at[0]) - h[0]
+                oy = wp.abs(at[1]) - h[1]
+                oz = wp.abs(at[2]) - h[2]
+                gap = wp.max(ox, wp.max(oy, oz))
+                if ox >= oy and ox >= oz:
+                    n = R3(wp.sign(at[0]), S(0.0), S(0.0))
+                elif oy >= oz:
+                    n = R3(S(0.0), wp.sign(at[1]), S(0.0))
+                else:
+                    n = R3(S(0.0), S(0.0), wp.sign(at[2]))
+            local = shapes.center[shape] + wp.quat_rotate(shapes.rotation[shape], near)
+            r = wp.quat_rotate(bodies.q[b], local)
+            n = wp.quat_rotate(bodies.q[b], wp.quat_rotate(shapes.rotation[shape], n))
+            po = q.xp[i]
+            step = p - R3(po.x[lane], po.y[lane], po.z[lane]) - moved(b, bodies, local)
+            approach = wp.dot(step, n)
+            depth = wp.min(radius - gap, wp.max(-approach, S(0.0)) + push)
+            wv = q.w[i]
+            wi = wv[lane]
+            w = wi + response(b, bodies, r, n)
+            if w > S(0.0):
+                slip = step - n * approach
+                f = coulomb_scalar(wp.dot(slip, slip), depth * mu * shapes.friction[shape])
+                impulse = (n * depth - slip * f) / w
+                px.x[lane] = px.x[lane] + impulse[0] * wi
+                px.y[lane] = px.y[lane] + impulse[1] * wi
+                px.z[lane] = px.z[lane] + impulse[2] * wi
+                q.x[i] = px
+                push_body(b, bodies, r, -impulse)
+                bodies.touching[b] = bodies.touching[b] + 1
+
+    return SimpleNamespace(project_box_particle=project_box_particle, V=V)

@@ -1,0 +1,316 @@
+"""The solver's working arrays: worlds of a model packed into groups of SIMD lanes."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from .structures import structures
+from .topology import WorldTopology, read_worlds
+
+__all__ = ["KERNEL_ARGUMENTS", "Mirrored", "SolverData"]
+
+KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near", "bodies",
+                    "grips", "watch")  # fmt: skip
+"""The kernel's structs, after the settings, in the order of its arguments."""
+
+_NUMPY = {wp.float32: np.float32, wp.float64: np.float64}
+
+
+class Mirrored:
+    """A Warp array with a NumPy view of its scalars; on the CPU the view is the array itself."""
+
+    def __init__(self, count: int, dtype: Any, device: Any, scalar: Any, shape: tuple[int, ...]) -> None:
+        self._host = wp.zeros(max(count, 1), dtype=dtype, device="cpu")
+        self.array = self._host if device.is_cpu else wp.zeros_like(self._host, device=device)
+        shape = (max(count, 1), *shape)
+        size = int(np.prod(shape)) * np.dtype(scalar).itemsize
+        buffer = (ctypes.c_byte * size).from_address(self._host.ptr)
+        self.view: np.ndarray = np.frombuffer(buffer, dtype=scalar).reshape(shape)
+
+    def to_device(self) -> None:
+        """Make the device see what was written to `view`."""
+        if self.array is not self._host:
+            wp.copy(self.array, self._host)
+
+    def to_host(self) -> None:
+        """Make `view` see what a kernel wrote."""
+        if self.array is not self._host:
+            wp.copy(self._host, self.array)
+
+
+class SolverData:
+    """Arrays of all worlds of a model in one precision and lane width.
+
+    World w lives in group ``slot[w] // L``, lane ``slot[w] % L``. Every array is a `Mirrored` under
+    ``arrays["struct.field"]``; `views` gives their NumPy views by the same names.
+    """
+
+    def __init__(
+        self,
+        model: newton.Model,
+        *,
+        scalar: Any = wp.float32,
+        lanes: int = 8,
+        pairs_per_particle: int = 48,
+    ) -> None:
+        self.model = model
+        self.device = model.device
+        self.scalar, self.lanes = scalar, lanes
+        self.number = _NUMPY[scalar]
+        self.types = structures(scalar, lanes)
+        worlds, self.particle_ids, self.body_ids = read_worlds(model)
+        self.world_count = len(worlds)
+        self._group(worlds)
+        self.arrays: dict[str, Mirrored] = {}
+        self._fill_topologies(pairs_per_particle)
+        self._fill_particles()
+        self._fill_bodies()
+        self._fill_grips()
+        self.watch_frames = 0
+        self.reset()
+
+    # -- construction
+
+    def _group(self, worlds: list[WorldTopology]) -> None:
+        """Sort worlds into groups of equal topology, in world order within each."""
+        keys: dict[bytes, int] = {}
+        members: list[list[int]] = []
+        self.topologies: list[WorldTopology] = []
+        for w, topology in enumerate(worlds):
+            k = keys.setdefault(topology.key(), len(keys))
+            if k == len(members):
+                members.append([])
+                self.topologies.append(topology)
+            members[k].append(w)
+        self.slot = np.zeros(self.world_count, int)
+        self.world_topology = np.zeros(self.world_count, int)
+        self.group_topology: list[int] = []
+        for k, list_ in enumerate(members):
+            for begin in range(0, len(list_), self.lanes):
+                group = len(self.group_topology)
+                self.group_topology.append(k)
+                for lane, w in enumerate(list_[begin : begin + self.lanes]):
+                    self.slot[w] = group * self.lanes + lane
+                    self.world_topology[w] = k
+        self.group_count = len(self.group_topology)
+        sizes = [self.topologies[k].particle_count for k in self.group_topology]
+        bodies = [self.topologies[k].body_count * self.lanes for k in self.group_topology]
+        self.group_particle = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+        self.group_body = np.concatenate([[0], np.cumsum(bodies)]).astype(int)
+        self.has_bodies = self.group_body[-1] > 0
+        self.has_particles = self.group_particle[-1] > 0
+
+    def _add(self, name: str, count: int, dtype: Any, shape: tuple[int, ...], number: Any) -> np.ndarray:
+        self.arrays[name] = Mirrored(count, dtype, self.device, number, shape)
+        return self.arrays[name].view
+
+    def _constant(self, name: str, values: np.ndarray, dtype: Any, number: Any) -> None:
+        values = np.asarray(values)
+        self._add(name, len(values), dtype, values.shape[1:], number)[: len(values)] = values
+
+    def _fill_topologies(self, pairs_per_particle: int) -> None:
+        t, number = self.types, self.number
+        tops = self.topologies
+
+        def starts(field: str) -> np.ndarray:
+            return np.concatenate([[0], np.cumsum([len(getattr(k, field)) for k in tops])])
+
+        def joined(field: str) -> np.ndarray:
+            return np.concatenate([np.asarray(getattr(k, field)) for k in tops])
+
+        for name, values in (
+            ("topology.particle_count", [k.particle_count for k in tops]),
+            ("topology.particle_start", starts("particle_radius")),
+            ("topology.body_count", [k.body_count for k in tops]),
+            ("topology.spring_start", starts("spring_ij")),
+            ("topology.pair_start", starts("pair_ij")),
+            ("topology.shape_start", starts("shape_body")),
+            ("springs.mode", joined("spring_mode")),
+            ("shapes.body", joined("shape_body")),
+        ):
+            self._constant(name, np.asarray(values), wp.int32, np.int32)
+        self._constant("topology.radius", joined("particle_radius"), t.S, number)
+        for name in ("springs.ij", "pairs.ij"):
+            self._constant(name, joined(_field(name)), wp.vec2i, np.int32)
+        for name in ("springs.length", "springs.compliance", "springs.limit", "pairs.distance",
+                     "shapes.friction"):  # fmt: skip
+            self._constant(name, joined(_field(name)), t.S, number)
+        for name, dtype in (("shapes.center", t.R3), ("shapes.half", t.R3), ("shapes.rotation", t.Q)):
+            self._constant(name, joined(_field(name)), dtype, number)
+        groups, L = self.group_count, self.lanes
+        capacity = [
+            min(len(tops[k].pair_ij), pairs_per_particle * max(tops[k].particle_count, 1))
+            for k in self.group_topology
+        ]
+        near_start = np.concatenate([[0], np.cumsum(capacity)])
+        for name, values in (
+            ("topology", self.group_topology),
+            ("particle_start", self.group_particle[:-1]),
+            ("body_start", self.group_body[:-1]),
+            ("near_start", near_start[:-1]),
+            ("near_capacity", capacity),
+        ):
+            self._constant(f"group.{name}", np.asarray(values), wp.int32, np.int32)
+        for name in ("active", "damping", "table_friction", "contact_friction", "stiffness",
+                     "calm_steps", "calm_after", "least_steps", "most_steps"):  # fmt: skip
+            self._add(f"group.{name}", groups, t.V, (L,), number)
+        self._add("group.gravity", groups, t.V3, (3, L), number)
+        total = int(near_start[-1])
+        self._add("near.count", groups, wp.int32, (), np.int32)
+        self._add("near.pair", total, wp.int32, (), np.int32)
+        self._add("near.mask", total, t.V, (L,), number)
+
+    def _fill_particles(self) -> None:
+        count, L = int(self.group_particle[-1]), self.lanes
+        for name in ("x", "v", "xp", "xr"):
+            self._add(f"particles.{name}", count, self.types.V3, (3, L), self.number)
+        for name in ("w", "w0"):
+            self._add(f"particles.{name}", count, self.types.V, (L,), self.number)
+        if self.has_particles:
+            inverse = self.model.particle_inv_mass.numpy()
+            for w in range(self.world_count):
+                self.lane("particles.w0", w)[:] = inverse[self.particle_ids[w]]
+
+    def _fill_bodies(self) -> None:
+        t, number, count = self.types, self.number, int(self.group_body[-1])
+        for name, dtype, shape in (
+            ("x", t.R3, (3,)), ("q", t.Q, (4,)), ("v", t.R3, (3,)), ("omega", t.R3, (3,)),
+            ("xp", t.R3, (3,)), ("qp", t.Q, (4,)), ("w", t.S, ()), ("w0", t.S, ()),
+            ("inertia", t.M33, (3, 3)), ("inverse_inertia", t.M33, (3, 3)),
+        ):  # fmt: skip
+            self._add(f"bodies.{name}", count, dtype, shape, number)
+        self._add("bodies.touching", count, wp.int32, (), np.int32)
+        self.views["bodies.q"][:, 3] = 1.0
+        if self.has_bodies:
+            for w in range(self.world_count):
+                ids, rows = self.body_ids[w], self.body_rows(w)
+                self.views["bodies.w0"][rows] = self.model.body_inv_mass.numpy()[ids]
+                self.views["bodies.inertia"][rows] = self.model.body_inertia.numpy()[ids]
+                self.views["bodies.inverse_inertia"][rows] = self.model.body_inv_inertia.numpy()[ids]
+
+    def _fill_grips(self) -> None:
+        t, number, slots = self.types, self.number, self.group_count * self.lanes
+        for name in ("particle", "body", "tick", "knot", "knot_start", "knot_end", "push", "push_steps"):
+            self._add(f"grips.{name}", slots, wp.int32, (), np.int32)
+        for name, dtype, shape in (
+            ("offset", t.R3, (3,)), ("turn", t.Q, (4,)), ("lower_start", t.S, ()),
+            ("lower_end", t.S, ()), ("shift", t.R3, (3,)), ("push_acceleration", t.R3, (3,)),
+        ):  # fmt: skip
+            self._add(f"grips.{name}", slots, dtype, shape, number)
+        self.reserve_knots(slots * 16)
+        for name in ("steps", "nonfinite", "stretch", "depth", "clamped"):
+            self._add(f"watch.{name}", self.group_count, t.V, (self.lanes,), number)
+        self._add("watch.overflow", self.group_count, wp.int32, (), np.int32)
+        self.reserve_frames(0)
+
+    def reserve_knots(self, count: int) -> None:
+        """Make room for `count` way-points of all paths together."""
+        t, number = self.types, self.number
+        self.knot_room = count
+        for name, dtype, shape in (
+            ("time", t.S, ()), ("position", t.R3, (3,)), ("rotation", t.Q, (4,))
+        ):  # fmt: skip
+            self._add(f"grips.{name}", count, dtype, shape, number)
+
+    def reserve_frames(self, frames: int) -> None:
+        """Make room for `frames` recorded frames."""
+        t, number = self.types, self.number
+        self.frame_room = frames
+        particles, bodies = int(self.group_particle[-1]), int(self.group_body[-1])
+        self._add("watch.frame_x", frames * particles, t.V3, (3, self.lanes), number)
+        self._add("watch.frame_body_x", frames * bodies, t.R3, (3,), number)
+        self._add("watch.frame_body_q", frames * bodies, t.Q, (4,), number)
+
+    # -- access
+
+    @property
+    def views(self) -> dict[str, np.ndarray]:
+        """NumPy views of all arrays by name."""
+        return {name: mirrored.view for name, mirrored in self.arrays.items()}
+
+    def struct(self, name: str) -> Any:
+        """One of the kernel's structs (see `KERNEL_ARGUMENTS`), filled with the arrays."""
+        value = getattr(self.types, name.capitalize())()
+        for key, mirrored in self.arrays.items():
+            owner, field = key.split(".")
+            if owner == name:
+                setattr(value, field, mirrored.array)
+        return value
+
+    def lane(self, name: str, world: int) -> np.ndarray:
+        """Writable view of one world's particles in an array of V3 -> (P, 3) or V -> (P,)."""
+        group, lane = divmod(int(self.slot[world]), self.lanes)
+        rows = slice(self.group_particle[group], self.group_particle[group + 1])
+        return self.arrays[name].view[rows][..., lane]
+
+    def body_rows(self, world: int) -> slice:
+        """Rows of one world's bodies in the arrays of bodies."""
+        group, lane = divmod(int(self.slot[world]), self.lanes)
+        count = self.topologies[self.group_topology[group]].body_count
+        start = int(self.group_body[group]) + lane * count
+        return slice(start, start + count)
+
+    def per_world(self, name: str, world: int) -> np.ndarray:
+        """Writable element of one world in a per-group array of V -> () or V3 -> (3,)."""
+        group, lane = divmod(int(self.slot[world]), self.lanes)
+        return self.arrays[name].view[group][..., lane : lane + 1]
+
+    def reset(self) -> None:
+        """Everything as the model starts, nothing gripped."""
+        views = self.views
+        if self.has_particles:
+            q, qd = self.model.particle_q.numpy(), self.model.particle_qd.numpy()
+            for w in range(self.world_count):
+                self.lane("particles.x", w)[:] = q[self.particle_ids[w]]
+                self.lane("particles.v", w)[:] = qd[self.particle_ids[w]]
+        views["particles.w"][:] = views["particles.w0"]
+        if self.has_bodies:
+            q, qd = self.model.body_q.numpy(), self.model.body_qd.numpy()
+            for w in range(self.world_count):
+                self.set_bodies(w, q[self.body_ids[w]], qd[self.body_ids[w]])
+        views["bodies.w"][:] = views["bodies.w0"]
+        self.clear_grips()
+
+    def clear_grips(self) -> None:
+        """Nothing is gripped or pushed in any world."""
+        for name in ("particle", "body", "push"):
+            self.arrays[f"grips.{name}"].view[:] = -1
+
+    def set_bodies(self, world: int, body_q: np.ndarray, body_qd: np.ndarray | None = None) -> None:
+        """Poses (B, 7) and twists (B, 6: linear of the centre of mass, angular) of one world's bodies."""
+        rows = self.body_rows(world)
+        com = self.topologies[self.world_topology[world]].body_com
+        views = self.views
+        quat = np.asarray(body_q)[:, 3:]
+        quat = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+        views["bodies.x"][rows] = np.asarray(body_q)[:, :3] + _rotate(quat, com)
+        views["bodies.q"][rows] = quat
+        views["bodies.v"][rows] = 0.0 if body_qd is None else np.asarray(body_qd)[:, :3]
+        views["bodies.omega"][rows] = 0.0 if body_qd is None else np.asarray(body_qd)[:, 3:]
+
+    def body_poses(self, world: int) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (B, 7) of the bodies' frames and twists (B, 6) of one world."""
+        rows = self.body_rows(world)
+        com = self.topologies[self.world_topology[world]].body_com
+        views = self.views
+        quat = views["bodies.q"][rows]
+        position = views["bodies.x"][rows] - _rotate(quat, com)
+        pose = np.column_stack([position, quat])
+        return pose, np.column_stack([views["bodies.v"][rows], views["bodies.omega"][rows]])
+
+
+def _field(name: str) -> str:
+    """Field of `WorldTopology` that fills an array: "springs.length" is "spring_length"."""
+    return name.replace("s.", "_", 1)
+
+
+def _rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Rotate vectors (n, 3) by quaternions (n, 4) xyzw."""
+    axis, w = quat[:, :3], quat[:, 3:]
+    twice = 2.0 * np.cross(axis, vector)
+    return vector + w * twice + np.cross(axis, twice)

@@ -1,0 +1,293 @@
+"""The fused forward kernel: one launch runs many substeps, one thread runs L worlds.
+
+Each substep predicts positions, moves the grip, solves distance constraints, contacts and bodies in
+Gauss-Seidel order, then resolves the table and derives velocities: XPBD with small steps and one
+iteration (Macklin et al., "Small Steps in Physics Simulation", 2019). A world that has come to rest
+after its path is frozen while its neighbours go on, so its result is that of running alone.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from .box_box import box_box
+from .box_particle import box_particle
+from .box_table import box_table
+from .distance import distance
+from .grip import grip
+from .lanes import (  # noqa: F401  (operators are found by name)
+    KERNEL_OPTIONS,
+    add,
+    any_less,
+    div,
+    dot,
+    largest,
+    length,
+    less,
+    mul,
+    nonfinite,
+    root,
+    select,
+    sub,
+)
+from .rigid import rigid
+from .sphere_contact import sphere_contact
+from .structures import structures
+from .table_contact import table_contact
+
+__all__ = ["forward_kernel"]
+
+
+@functools.cache
+def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
+    """The kernel for a precision and a width; launch it with one thread per group.
+
+    `with_bodies` False leaves the code of rigid bodies out, which halves the compile time.
+    """
+    t = structures(scalar, lanes)
+    S, V, V3, R3, L = t.S, t.V, t.V3, t.R3, t.L
+    predict, finish = (getattr(table_contact(scalar, lanes), n) for n in ("predict", "finish"))
+    project_distance = distance(scalar, lanes).project_distance
+    contact = sphere_contact(scalar, lanes)
+    list_near, project_contact = contact.list_near, contact.project_contact
+    grips_ = grip(scalar, lanes)
+    follow_path, take, let_go = grips_.follow_path, grips_.take, grips_.let_go
+    body = rigid(scalar, lanes)
+    predict_body, finish_body = body.predict_body, body.finish_body
+    project_table = box_table(scalar, lanes).project_table
+    project_box_particle = box_particle(scalar, lanes).project_box_particle
+    project_boxes = box_box(scalar, lanes).project_boxes
+    Settings, Topology, Group, Particles = t.Settings, t.Topology, t.Group, t.Particles
+    Springs, Pairs, Shapes, Near = t.Springs, t.Pairs, t.Shapes, t.Near
+    Bodies, Grips, Watch = t.Bodies, t.Grips, t.Watch
+
+    @wp.func
+    def solve_bodies(
+        g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
+        q: Particles, bodies: Bodies,
+    ):  # fmt: skip
+        """Contacts of one lane's bodies with particles, each other and the table."""
+        p0 = group.particle_start[g]
+        count = top.body_count[k]
+        b0 = group.body_start[g] + lane * count
+        first = top.shape_start[k]
+        last = top.shape_start[k + 1]
+        mv = group.contact_friction[g]
+        mu = mv[lane]
+        tv = group.table_friction[g]
+        radii = top.particle_start[k]
+        for shape in range(first, last):
+            b = b0 + shapes.body[shape]
+            far = wp.length(shapes.half[shape])
+            center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
+            for i in range(top.particle_count[k]):
+                radius = top.radius[radii + i]
+                x = q.x[p0 + i]
+                d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
+                if wp.dot(d, d) < (far + radius) * (far + radius):
+                    project_box_particle(p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies)
+        for sa in range(first, last):
+            for sb in range(sa + 1, last):
+                a = shapes.body[sa]
+                b = shapes.body[sb]
+                if a != b and bodies.w[b0 + a] + bodies.w[b0 + b] > S(0.0):
+                    pair_mu = mu * wp.min(shapes.friction[sa], shapes.friction[sb])
+                    project_boxes(sa, b0 + a, sb, b0 + b, pair_mu, push, shapes, bodies)
+        supported = int(0)
+        for b in range(count):
+            if bodies.w[b0 + b] > S(0.0):
+                supported = project_table(b0 + b, b, first, last, tv[lane], shapes, bodies)
+                if supported + bodies.touching[b0 + b] < 3:
+                    supported = 0
+                # the sign of `touching` tells finish_body whether the body may sleep
+                if supported == 0:
+                    bodies.touching[b0 + b] = -1 - bodies.touching[b0 + b]
+
+    @wp.func
+    def watch_group(
+        g: int, p0: int, n: int, s0: int, s1: int, springs: Springs, q: Particles, watch: Watch
+    ):
+        """Worst values of the guards, once every `check_every` substeps."""
+        zero = V(S(0.0))
+        bad = watch.nonfinite[g]
+        lowest = V(S(1.0e9))
+        for i in range(p0, p0 + n):
+            x = q.x[i]
+            bad = wp.max(bad, nonfinite(x.x + x.y + x.z))
+            lowest = wp.min(lowest, x.z)
+        watch.nonfinite[g] = bad
+        watch.depth[g] = wp.max(watch.depth[g], wp.max(zero - lowest, zero))
+        stretch = watch.stretch[g]
+        for s in range(s0, s1):
+            if springs.mode[s] == 0:
+                ij = springs.ij[s]
+                l = length(q.x[p0 + ij[0]] - q.x[p0 + ij[1]])
+                stretch = wp.max(stretch, l * (S(1.0) / springs.length[s]))
+        watch.stretch[g] = stretch
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=dict(KERNEL_OPTIONS))
+    def forward(
+        st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
+        q: Particles, near: Near, bodies: Bodies, grips: Grips, watch: Watch,
+    ):  # fmt: skip
+        g = wp.tid()
+        k = group.topology[g]
+        p0 = group.particle_start[g]
+        n = top.particle_count[k]
+        radii = top.particle_start[k]
+        s0 = top.spring_start[k]
+        s1 = top.spring_start[k + 1]
+        w0 = g * wp.static(L)
+        b0 = group.body_start[g]
+        body_count = top.body_count[k]
+        near_start = group.near_start[g]
+        near_count = int(0)
+        zero = V(S(0.0))
+        one = V(S(1.0))
+        dt = st.dt
+        inverse_dt = S(1.0) / dt
+        push = st.recovery * dt
+        kept = wp.max(zero, one - group.damping[g] * dt)
+        gravity = group.gravity[g]
+        fall = gravity * dt
+        inverse_dt2 = one * (inverse_dt * inverse_dt) / group.stiffness[g]
+        table_mu = group.table_friction[g]
+        contact_mu = group.contact_friction[g]
+        least = group.least_steps[g]
+        most = group.most_steps[g]
+        on = group.active[g]
+        steps = zero
+        quiet = zero
+        holding = zero
+        calm = group.calm_steps[g]
+        stale = on
+        travel = zero
+        clamped = zero
+        frame = int(0)
+        longest_push = int(0)
+        for lane in range(wp.static(L)):
+            if on[lane] > S(0.0):
+                if grips.particle[w0 + lane] >= 0 or grips.body[w0 + lane] >= 0:
+                    holding[lane] = S(1.0)
+                    take(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
+                if grips.push[w0 + lane] >= 0:
+                    longest_push = wp.max(longest_push, grips.push_steps[w0 + lane])
+        substep = int(0)
+        while substep < st.max_steps and any_less(zero - on, S(0.0)):
+            all_on = not any_less(on, S(0.5))
+            if st.record_every > 0 and substep % wp.max(st.record_every, 1) == 0:
+                for i in range(n):
+                    watch.frame_x[frame * st.particle_stride + p0 + i] = q.x[p0 + i]
+                if wp.static(with_bodies):
+                    for b in range(body_count * wp.static(L)):
+                        at = frame * st.body_stride + b0 + b
+                        watch.frame_body_x[at] = bodies.x[b0 + b]
+                        watch.frame_body_q[at] = bodies.q[b0 + b]
+                frame += 1
+            # predict
+            for i in range(p0, p0 + n):
+                predict(i, dt, kept, fall, q)
+            if wp.static(with_bodies):
+                for lane in range(wp.static(L)):
+                    if on[lane] > S(0.0):
+                        pull = R3(gravity.x[lane], gravity.y[lane], gravity.z[lane])
+                        for b in range(body_count):
+                            at = b0 + lane * body_count + b
+                            predict_body(at, dt, kept[lane], pull, bodies)
+            if substep < longest_push:
+                for lane in range(wp.static(L)):
+                    w = w0 + lane
+                    i = grips.push[w]
+                    if i >= 0 and substep < grips.push_steps[w] and on[lane] > S(0.0):
+                        x = q.x[p0 + i]
+                        kick = grips.push_acceleration[w] * (dt * dt * kept[lane])
+                        x.x[lane] = x.x[lane] + kick[0]
+                        x.y[lane] = x.y[lane] + kick[1]
+                        x.z[lane] = x.z[lane] + kick[2]
+                        q.x[p0 + i] = x
+            # grips
+            if any_less(zero - holding, S(0.0)):
+                for lane in range(wp.static(L)):
+                    if holding[lane] > S(0.0) and on[lane] > S(0.0):
+                        w = w0 + lane
+                        bl = b0 + lane * body_count
+                        if not follow_path(
+                            w, lane, p0, bl, top.shape_start[k], top.shape_start[k + 1],
+                            near_start, near_count, dt, q, pairs, shapes, near, bodies, grips,
+                        ):  # fmt: skip
+                            let_go(w, lane, p0, bl, q, bodies, grips)
+                            holding[lane] = S(0.0)
+                            after = group.calm_after[g]
+                            calm[lane] = after[lane]
+                            least[lane] = least[lane] + steps[lane]
+            # pairs that may touch soon
+            if any_less(zero - stale, S(0.0)):
+                near_count = list_near(
+                    p0, near_start, group.near_capacity[g], top.pair_start[k],
+                    top.pair_start[k + 1], st.margin, stale, q, pairs, near, n,
+                )  # fmt: skip
+                if near_count > group.near_capacity[g]:
+                    watch.overflow[g] = wp.max(
+                        watch.overflow[g], near_count - group.near_capacity[g]
+                    )
+                    near_count = group.near_capacity[g]
+                travel = select(stale, zero, travel)
+            # constraints
+            if st.alternate == 1 and substep % 2 == 1:
+                for s in range(s0, s1):
+                    project_distance(s1 - 1 - (s - s0), p0, inverse_dt2, q, springs)
+            else:
+                for s in range(s0, s1):
+                    project_distance(s, p0, inverse_dt2, q, springs)
+            for c in range(near_start, near_start + near_count):
+                project_contact(c, p0, contact_mu, push, q, pairs, near)
+            if wp.static(with_bodies):
+                for lane in range(wp.static(L)):
+                    if on[lane] > S(0.0):
+                        for b in range(body_count):
+                            bodies.touching[b0 + lane * body_count + b] = 0
+                        solve_bodies(g, lane, k, push, top, shapes, group, q, bodies)
+            # table, velocities
+            fastest = select(calm, V(st.calm_speed * dt), V(st.max_speed * dt))
+            moved2 = zero
+            for i in range(n):
+                radius = top.radius[radii + i]
+                moved2 = wp.max(
+                    moved2, finish(p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q)
+                )
+            if wp.static(with_bodies):
+                for lane in range(wp.static(L)):
+                    if on[lane] > S(0.0):
+                        for b in range(body_count):
+                            at = b0 + lane * body_count + b
+                            supported = bodies.touching[at] >= 0
+                            if not supported:
+                                bodies.touching[at] = -1 - bodies.touching[at]
+                            m = finish_body(at, dt, fastest[lane], supported, bodies)
+                            moved2[lane] = wp.max(moved2[lane], m)
+            moved = root(moved2)
+            travel = travel + moved
+            # the next substep may move by half as much again before its contacts are solved
+            stale = less(V(S(0.5) * st.margin), travel + moved * S(1.5)) * on
+            free_run = select(calm, zero, one)
+            clamped = clamped + less(V(st.max_speed * dt), moved) * free_run * on
+            steps = steps + on
+            calm = wp.max(calm - one, zero)
+            slow = less(moved, V(st.rest_speed * dt))
+            quiet = (quiet + one) * slow
+            rested = less(V(st.rest_steps), quiet + V(S(0.5))) * less(least, steps + V(S(0.5)))
+            done = wp.max(rested * (one - holding), less(most, steps + V(S(0.5))))
+            substep += 1
+            if substep % st.check_every == 0:
+                watch_group(g, p0, n, s0, s1, springs, q, watch)
+            on = on * (one - done)
+        watch_group(g, p0, n, s0, s1, springs, q, watch)
+        watch.steps[g] = steps
+        watch.clamped[g] = clamped
+        # a world cut off while it held something lets go: nothing is held between launches
+        for lane in range(wp.static(L)):
+            if holding[lane] > S(0.0):
+                let_go(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
+
+    return forward

@@ -1,0 +1,146 @@
+"""Grips: a particle or a body follows the tip along a path of knots, and is let go at its end."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .box_table import box_table
+from .lanes import add, mul, sub  # noqa: F401  (operators are found by name)
+from .sphere_contact import sphere_contact
+from .structures import structures
+
+__all__ = ["grip"]
+
+CONTACT = 1.0e-4
+"""A held box this close to the table [m] counts as having reached it."""
+
+
+@functools.cache
+def grip(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`follow_path` moves what one lane holds by one substep and returns whether it still holds it.
+
+    Positions are linear between knots, rotations normalised linear. Between `lower_start` and
+    `lower_end` the descent ends where the held thing meets anything; the rest of the path (the
+    dwell) is then shifted to that place. Held things are kinematic: their inverse mass is 0.
+    """
+    t = structures(scalar, lanes)
+    S, R3, Q = t.S, t.R3, t.Q
+    Shapes, Pairs, Particles = t.Shapes, t.Pairs, t.Particles
+    Bodies, Grips, Near = t.Bodies, t.Grips, t.Near
+    touches = sphere_contact(scalar, lanes).touches
+    corner = box_table(scalar, lanes).corner
+
+    @wp.func
+    def tip_position(w: int, clock: S, grips: Grips):
+        k = grips.knot[w]
+        span = grips.time[k + 1] - grips.time[k]
+        u = wp.clamp((clock - grips.time[k]) / wp.max(span, S(1.0e-9)), S(0.0), S(1.0))
+        return grips.position[k] * (S(1.0) - u) + grips.position[k + 1] * u + grips.shift[w]
+
+    @wp.func
+    def tip_rotation(w: int, clock: S, grips: Grips):
+        k = grips.knot[w]
+        span = grips.time[k + 1] - grips.time[k]
+        u = wp.clamp((clock - grips.time[k]) / wp.max(span, S(1.0e-9)), S(0.0), S(1.0))
+        return wp.normalize(grips.rotation[k] * (S(1.0) - u) + grips.rotation[k + 1] * u)
+
+    @wp.func
+    def set_knot(w: int, clock: S, grips: Grips):
+        k = grips.knot[w]
+        while k + 2 < grips.knot_end[w] and grips.time[k + 1] <= clock:
+            k += 1
+        grips.knot[w] = k
+
+    @wp.func
+    def reached(
+        w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int,
+        q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
+    ):  # fmt: skip
+        """Whether what is held touches the table or anything else."""
+        hit = bool(False)
+        particle = grips.particle[w]
+        if particle >= 0:
+            hit = touches(particle, lane, p0, start, n, q, pairs, near)
+        else:
+            b = b0 + grips.body[w]
+            hit = bodies.touching[b] > 0
+            for shape in range(first, last):
+                if shapes.body[shape] == grips.body[w]:
+                    for c in range(8):
+                        z = bodies.x[b][2] + wp.quat_rotate(bodies.q[b], corner(shape, c, shapes))[2]
+                        if z < S(CONTACT):
+                            hit = True
+        return hit
+
+    @wp.func
+    def follow_path(
+        w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int, dt: S,
+        q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
+    ):  # fmt: skip
+        tick = grips.tick[w] + 1
+        clock = S(tick) * dt
+        if clock > grips.lower_start[w] and clock < grips.lower_end[w]:
+            if reached(
+                w, lane, p0, b0, first, last, start, n, q, pairs, shapes, near, bodies, grips
+            ):
+                set_knot(w, clock - dt, grips)
+                here = tip_position(w, clock - dt, grips)
+                tick = int(grips.lower_end[w] / dt)
+                clock = S(tick) * dt
+                set_knot(w, clock, grips)
+                grips.shift[w] = here - tip_position(w, clock, grips)
+        grips.tick[w] = tick
+        set_knot(w, clock, grips)
+        position = tip_position(w, clock, grips)
+        rotation = tip_rotation(w, clock, grips)
+        held = position + wp.quat_rotate(rotation, grips.offset[w])
+        particle = grips.particle[w]
+        if particle >= 0:
+            i = p0 + particle
+            x = q.x[i]
+            x.x[lane] = held[0]
+            x.y[lane] = held[1]
+            x.z[lane] = held[2]
+            q.x[i] = x
+        else:
+            b = b0 + grips.body[w]
+            bodies.x[b] = held
+            bodies.q[b] = wp.normalize(rotation * grips.turn[w])
+        return clock < grips.time[grips.knot_end[w] - 1]
+
+    @wp.func
+    def take(w: int, lane: int, p0: int, b0: int, q: Particles, bodies: Bodies, grips: Grips):
+        """What is gripped becomes kinematic."""
+        if grips.particle[w] >= 0:
+            mass = q.w[p0 + grips.particle[w]]
+            mass[lane] = S(0.0)
+            q.w[p0 + grips.particle[w]] = mass
+        elif grips.body[w] >= 0:
+            bodies.w[b0 + grips.body[w]] = S(0.0)
+
+    @wp.func
+    def let_go(w: int, lane: int, p0: int, b0: int, q: Particles, bodies: Bodies, grips: Grips):
+        """What was gripped is free again, and at rest."""
+        particle = grips.particle[w]
+        if particle >= 0:
+            i = p0 + particle
+            mass = q.w[i]
+            free = q.w0[i]
+            mass[lane] = free[lane]
+            q.w[i] = mass
+            v = q.v[i]
+            v.x[lane] = S(0.0)
+            v.y[lane] = S(0.0)
+            v.z[lane] = S(0.0)
+            q.v[i] = v
+        else:
+            b = b0 + grips.body[w]
+            bodies.w[b] = bodies.w0[b]
+            bodies.v[b] = R3()
+            bodies.omega[b] = R3()
+        grips.particle[w] = -1
+        grips.body[w] = -1
+
+    return SimpleNamespace(follow_path=follow_path, take=take, let_go=let_go, Q=Q)

@@ -1,0 +1,87 @@
+"""What makes a simulated state invalid, by name; nothing here repairs anything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from ..errors import WarpDeformError
+
+__all__ = ["GuardLimits", "PhysicsError", "Problem", "ProblemKind", "WatchValues"]
+
+
+class ProblemKind(Enum):
+    """Why a state cannot be trusted."""
+
+    NONFINITE = "non-finite"
+    STRETCH = "stretch"
+    PENETRATION = "penetration"
+    OVERFLOW = "contact-buffer overflow"
+    SPEED_CLAMP = "speed clamp"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One guard that fired in one world, with the value it saw and the limit it holds."""
+
+    kind: ProblemKind
+    world: int
+    value: float
+    limit: float
+
+    def __str__(self) -> str:
+        return f"{self.kind.value} in world {self.world}: {self.value:.4g} (limit {self.limit:.4g})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuardLimits:
+    """Limits of the guards."""
+
+    stretch: float = 1.5
+    """Longest two-sided spring over its rest length; cables peak at 1.17 when dragged hard."""
+    depth: float = 0.01
+    """Deepest that a particle's centre may be under the table [m]."""
+    clamped_steps: int = 120
+    """Substeps of one launch in which the speed clamp may act (0.1 s at the default substep)."""
+
+
+@dataclass(frozen=True)
+class WatchValues:
+    """Worst values of one launch in one world."""
+
+    steps: int
+    nonfinite: bool
+    stretch: float
+    depth: float
+    clamped: int
+    overflow: int
+
+    def problems(self, world: int, limits: GuardLimits) -> tuple[Problem, ...]:
+        """The guards that these values violate."""
+        found = []
+        for bad, kind, value, limit in (
+            (self.nonfinite, ProblemKind.NONFINITE, float("nan"), 0.0),
+            (self.stretch > limits.stretch, ProblemKind.STRETCH, self.stretch, limits.stretch),
+            (self.depth > limits.depth, ProblemKind.PENETRATION, self.depth, limits.depth),
+            (self.overflow > 0, ProblemKind.OVERFLOW, self.overflow, 0),
+            (
+                self.clamped > limits.clamped_steps,
+                ProblemKind.SPEED_CLAMP,
+                self.clamped,
+                limits.clamped_steps,
+            ),
+        ):
+            if bad:
+                found.append(Problem(kind, world, value, limit))
+        return tuple(found)
+
+
+class PhysicsError(WarpDeformError):
+    """A guard fired. `problems` names every cause; `bundle` reproduces it, when one was written."""
+
+    def __init__(self, problems: tuple[Problem, ...], bundle: Path | None = None) -> None:
+        where = f"; reproduce it with warp_deform.solver.replay_bundle({str(bundle)!r})" if bundle else ""
+        super().__init__("; ".join(map(str, problems)) + where)
+        self.problems = problems
+        self.bundle = bundle

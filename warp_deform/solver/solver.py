@@ -1,0 +1,377 @@
+"""`SolverFusedXPBD`: the solver behind every task, as a Newton solver."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase
+
+from ..errors import InputError
+from ..objects.attributes import NAMESPACE, register_attributes
+from .data import KERNEL_ARGUMENTS, SolverData
+from .forward import forward_kernel
+from .guards import GuardLimits, PhysicsError, WatchValues
+
+__all__ = ["SolverConfig", "SolverFusedXPBD"]
+
+_FOREVER = 1.0e7
+"""More substeps than any launch has, exactly representable in float32."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverConfig:
+    """Parameters that all worlds share; those of a single world are set with `set_world`."""
+
+    dt: float = 1 / 60 / 20
+    """Substep [s]."""
+    damping: float = 1.0
+    """Air damping [1/s]."""
+    table_friction: float = 0.5
+    """Coulomb coefficient of particles, and factor on that of boxes, against the table."""
+    contact_friction: float = 0.3
+    """Coulomb coefficient between particles, and factor on that of boxes, in contact."""
+    stiffness: float = 1.0
+    """Factor on the stiffness of all springs."""
+    alternate: bool = True
+    """Sweep the constraints backwards in every other substep: halves the stretch of a dragged cable.
+    Shells need a fixed order instead, or they jitter."""
+    recovery: float = 0.1
+    """Fastest separation of overlapping things [m/s]."""
+    max_speed: float = 3.0
+    """Speed clamp [m/s]; a particle that meets it is counted by the guards."""
+    calm_speed: float = 0.1
+    """Speed clamp while a world is calmed, after a release for example [m/s]."""
+    margin: float = 0.01
+    """Pairs this much farther apart than touching are listed [m]."""
+    rest_speed: float = 0.01
+    """Slower than this is at rest [m/s]."""
+    rest_seconds: float = 0.05
+    """At rest for so long ends a world's rollout [s]."""
+    limits: GuardLimits = field(default_factory=GuardLimits)
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "max_speed", "calm_speed", "margin", "rest_speed", "stiffness"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"SolverConfig.{name} must be positive, got {getattr(self, name)}")
+        for name in ("damping", "table_friction", "contact_friction", "recovery", "rest_seconds"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"SolverConfig.{name} must not be negative, got {getattr(self, name)}")
+
+
+class SolverFusedXPBD(SolverBase):
+    """XPBD in one fused kernel: a launch runs many substeps, a thread runs L worlds in SIMD lanes.
+
+    References: Macklin et al., "XPBD", 2016; Macklin et al., "Small Steps in Physics Simulation",
+    2019; Mueller et al., "Detailed Rigid Body Simulation with Extended Position Based Dynamics", 2020.
+
+    Simulates particles joined by springs (two-sided, minimum, maximum, strain-limited), contact and
+    friction between particles, with the table z = 0 and with rigid bodies made of boxes, and grips.
+    Worlds of equal topology share lanes; mixed models are grouped by topology.
+
+    Limitations: no joints, no triangles, no shapes other than boxes; the only ground is z = 0;
+    `Contacts` are ignored, contacts are found in the kernel. The state in `newton.State` is float32
+    whatever the solver's precision.
+
+    Example:
+        builder = newton.ModelBuilder()
+        config = CableConfig()
+        add_cable(builder, config, cable_line(config, (0.5, -0.2), (0.5, 0.2)))
+        model = builder.finalize(device="cpu")
+        solver = SolverFusedXPBD(model)
+        state, after = model.state(), model.state()
+        solver.step(state, after, None, None, 1 / 60)
+    """
+
+    def __init__(
+        self,
+        model: newton.Model,
+        config: SolverConfig | None = None,
+        *,
+        lanes: int | None = None,
+        precision: str = "float32",
+        bundles: Path | None = None,
+    ) -> None:
+        """Pack `model`.
+
+        lanes: worlds a thread; None takes 8 for many worlds on the CPU and 1 otherwise.
+        precision: "float32" or "float64".
+        bundles: folder that gets a reproducing file whenever a guard fires.
+        """
+        super().__init__(model)
+        self.config = config or SolverConfig()
+        scalars = {"float32": wp.float32, "float64": wp.float64}
+        if precision not in scalars:
+            raise InputError(f"precision must be float32 or float64, not {precision!r}")
+        if lanes is None:
+            lanes = 8 if model.world_count > 1 and model.device.is_cpu else 1
+        self.data = SolverData(model, scalar=scalars[precision], lanes=lanes)
+        self.bundles = bundles
+        self._kernel = forward_kernel(scalars[precision], lanes, bool(self.data.has_bodies))
+        self._launch: Any = None
+        self._gravity()
+        for w in range(self.data.world_count):
+            self.set_world(
+                w, damping=self.config.damping, table_friction=self.config.table_friction,
+                contact_friction=self.config.contact_friction, stiffness=self.config.stiffness,
+            )  # fmt: skip
+        self.set_duration(_FOREVER, _FOREVER)
+
+    @classmethod
+    def register_custom_attributes(cls, builder: newton.ModelBuilder) -> None:
+        """Declare the attributes that `add_cable` and the like use, and grips in `Control`.
+
+        ``control.warp_deform.grip_particle`` (worlds,) int32: number of the held particle in its
+        world, -1 for none; ``control.warp_deform.grip_target`` (worlds,) vec3 [m]: where it is at
+        the end of the step.
+        """
+        register_attributes(builder)
+        for name, dtype, default in (
+            ("grip_particle", wp.int32, -1),
+            ("grip_target", wp.vec3, wp.vec3(0.0, 0.0, 0.0)),
+        ):
+            builder.add_custom_attribute(
+                newton.ModelBuilder.CustomAttribute(
+                    name=name,
+                    frequency=newton.Model.AttributeFrequency.WORLD,
+                    dtype=dtype,
+                    default=default,
+                    assignment=newton.Model.AttributeAssignment.CONTROL,
+                    namespace=NAMESPACE,
+                )
+            )
+
+    # -- parameters
+
+    def set_world(self, world: int, **parameters: float) -> None:
+        """Set damping [1/s], table_friction, contact_friction or stiffness (a factor) of one world."""
+        for name, value in parameters.items():
+            if name not in ("damping", "table_friction", "contact_friction", "stiffness"):
+                raise InputError(f"a world has no parameter {name!r}")
+            if not value >= 0 or (name == "stiffness" and value == 0):
+                raise InputError(f"{name} must be positive, got {value}")
+            self.data.per_world(f"group.{name}", world)[:] = value
+
+    def set_duration(
+        self, least: float | np.ndarray, most: float | np.ndarray, *, calm: float = 0.0, calm_after: float = 0.0
+    ) -> None:
+        """Substeps that worlds run at least after their path, and at most in all, in the next launch.
+
+        `calm`, `calm_after`: substeps clamped to `calm_speed` from the start and after a release.
+        """
+        for w in range(self.data.world_count):
+            for name, value in (("least_steps", least), ("most_steps", most)):
+                self.data.per_world(f"group.{name}", w)[:] = np.broadcast_to(
+                    value, self.data.world_count
+                )[w]
+            self.data.per_world("group.calm_steps", w)[:] = calm
+            self.data.per_world("group.calm_after", w)[:] = calm_after
+
+    def activate(self, worlds: np.ndarray | None = None) -> None:
+        """Only these worlds take part in the next launches (None: all); others keep their state."""
+        view = self.data.views["group.active"]
+        view[:] = 0.0
+        for w in range(self.data.world_count) if worlds is None else worlds:
+            self.data.per_world("group.active", int(w))[:] = 1.0
+
+    def _gravity(self) -> None:
+        gravity = self.model.gravity.numpy()
+        for w in range(self.data.world_count):
+            self.data.per_world("group.gravity", w)[:] = gravity[min(w, len(gravity) - 1)][:, None]
+        # padded lanes divide by their stiffness as well
+        self.data.views["group.stiffness"][:] = 1.0
+        self.activate()
+
+    def notify_model_changed(self, flags: int) -> None:
+        """Read gravity again; other model data are read once, at construction."""
+        if flags & int(newton.ModelFlags.MODEL_PROPERTIES):
+            self._gravity()
+
+    # -- running
+
+    def run(self, max_steps: int, *, record_every: int = 0) -> list[WatchValues]:
+        """Launch up to `max_steps` substeps on the working arrays; returns the guards' values by world.
+
+        Worlds stop early as `set_duration` says. Nothing is raised: see `check`.
+        """
+        data = self.data
+        frames = -(-max_steps // record_every) if record_every else 0
+        if frames > data.frame_room:
+            data.reserve_frames(frames)
+            self._launch = None
+        self._bundle = data_copy(data) if self.bundles is not None else None
+        settings = self._settings(max_steps, record_every)
+        self._last = (settings, max_steps, record_every)
+        for name in ("watch.steps", "watch.nonfinite", "watch.stretch", "watch.depth",
+                     "watch.clamped", "watch.overflow"):  # fmt: skip
+            data.arrays[name].view[...] = 0
+        for mirrored in data.arrays.values():
+            mirrored.to_device()
+        launch = self._recorded(settings)
+        launch.launch()
+        for mirrored in data.arrays.values():
+            mirrored.to_host()
+        return self._values()
+
+    def _settings(self, max_steps: int, record_every: int) -> Any:
+        c, data = self.config, self.data
+        settings = data.types.Settings()
+        settings.dt = c.dt
+        settings.max_steps = max_steps
+        settings.alternate = int(c.alternate)
+        settings.recovery = c.recovery
+        settings.max_speed = c.max_speed
+        settings.calm_speed = c.calm_speed
+        settings.margin = c.margin
+        settings.rest_speed = c.rest_speed
+        settings.rest_steps = max(1, round(c.rest_seconds / c.dt))
+        settings.check_every = 20
+        settings.record_every = record_every
+        settings.particle_stride = int(data.group_particle[-1])
+        settings.body_stride = int(data.group_body[-1])
+        return settings
+
+    def _recorded(self, settings: Any) -> Any:
+        """A recorded launch: three times cheaper to repeat than an eager one."""
+        if self._launch is None:
+            self._launch = wp.launch(
+                self._kernel,
+                dim=self.data.group_count,
+                inputs=[settings, *(self.data.struct(name) for name in KERNEL_ARGUMENTS)],
+                device=self.model.device,
+                record_cmd=True,
+            )
+        else:
+            self._launch.set_param_at_index(0, settings)
+        return self._launch
+
+    def forget_launch(self) -> None:
+        """Needed after arrays were replaced (`reserve_knots`)."""
+        self._launch = None
+
+    def _values(self) -> list[WatchValues]:
+        views, out = self.data.views, []
+        for slot in self.data.slot:
+            group, lane = divmod(int(slot), self.data.lanes)
+            out.append(
+                WatchValues(
+                    steps=int(views["watch.steps"][group, lane]),
+                    nonfinite=bool(views["watch.nonfinite"][group, lane] > 0),
+                    stretch=float(views["watch.stretch"][group, lane]),
+                    depth=float(views["watch.depth"][group, lane]),
+                    clamped=int(views["watch.clamped"][group, lane]),
+                    overflow=int(views["watch.overflow"][group]),
+                )
+            )
+        return out
+
+    def check(self, values: list[WatchValues]) -> None:
+        """Raise `PhysicsError` if a guard fired in any world, writing a bundle if asked for."""
+        problems = tuple(
+            p for w, v in enumerate(values) for p in v.problems(w, self.config.limits)
+        )
+        if problems:
+            raise PhysicsError(problems, self._write_bundle())
+
+    def _write_bundle(self) -> Path | None:
+        if self.bundles is None or self._bundle is None:
+            return None
+        from .bundle import write_bundle
+
+        return write_bundle(self.bundles, self)
+
+    # -- Newton
+
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        *,
+        observables: Any = None,
+    ) -> None:
+        """Advance every world by `dt` in ceil(dt / config.dt) substeps.
+
+        Raises:
+            PhysicsError: a guard fired.
+        """
+        self.read_state(state_in)
+        self.data.clear_grips()
+        steps = max(1, round(dt / self.config.dt))
+        ours = getattr(control, NAMESPACE, None) if control is not None else None
+        if ours is not None and hasattr(ours, "grip_particle"):
+            self._grip_from_control(ours, steps)
+        self.set_duration(_FOREVER, _FOREVER)
+        values = self.run(steps)
+        self.write_state(state_out)
+        self.check(values)
+
+    def _grip_from_control(self, ours: Any, steps: int) -> None:
+        views, targets = self.data.views, ours.grip_target.numpy()
+        duration = steps * self.config.dt
+        for w, particle in enumerate(ours.grip_particle.numpy()):
+            slot = self.data.slot[w]
+            if particle < 0:
+                continue
+            start = self.data.lane("particles.x", w)[particle]
+            first = 2 * slot
+            for name, value in (
+                ("particle", particle), ("tick", 0), ("knot", first), ("knot_start", first),
+                ("knot_end", first + 2), ("offset", 0.0), ("turn", (0, 0, 0, 1)), ("shift", 0.0),
+                ("lower_start", 0.0), ("lower_end", 0.0),
+            ):  # fmt: skip
+                views[f"grips.{name}"][slot] = value
+            # the knots end after the step, so that the grip lasts through it
+            beyond = 2.0
+            views["grips.time"][first : first + 2] = 0.0, beyond * duration
+            views["grips.position"][first] = start
+            views["grips.position"][first + 1] = start + beyond * (targets[w] - start)
+            views["grips.rotation"][first : first + 2] = (0, 0, 0, 1)
+
+    def read_state(self, state: newton.State) -> None:
+        """Take positions and velocities of all worlds from a Newton state."""
+        data = self.data
+        if data.has_particles:
+            q, qd = state.particle_q.numpy(), state.particle_qd.numpy()
+            for w in range(data.world_count):
+                data.lane("particles.x", w)[:] = q[data.particle_ids[w]]
+                data.lane("particles.v", w)[:] = qd[data.particle_ids[w]]
+        if data.has_bodies:
+            q, qd = state.body_q.numpy(), state.body_qd.numpy()
+            for w in range(data.world_count):
+                data.set_bodies(w, q[data.body_ids[w]], qd[data.body_ids[w]])
+
+    def write_state(self, state: newton.State) -> None:
+        """Give positions and velocities of all worlds to a Newton state."""
+        data = self.data
+        if data.has_particles:
+            q = np.empty((self.model.particle_count, 3), np.float32)
+            qd = np.empty_like(q)
+            for w in range(data.world_count):
+                q[data.particle_ids[w]] = data.lane("particles.x", w)
+                qd[data.particle_ids[w]] = data.lane("particles.v", w)
+            state.particle_q.assign(q)
+            state.particle_qd.assign(qd)
+        if data.has_bodies:
+            q = np.empty((self.model.body_count, 7), np.float32)
+            qd = np.empty((self.model.body_count, 6), np.float32)
+            for w in range(data.world_count):
+                q[data.body_ids[w]], qd[data.body_ids[w]] = data.body_poses(w)
+            state.body_q.assign(q)
+            state.body_qd.assign(qd)
+
+    def describe(self) -> str:
+        """The configuration as JSON."""
+        return json.dumps(asdict(self.config))
+
+
+def data_copy(data: SolverData) -> dict[str, np.ndarray]:
+    """Copies of all arrays, to reproduce a launch."""
+    return {name: view.copy() for name, view in data.views.items()}

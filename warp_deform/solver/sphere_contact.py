@@ -1,0 +1,119 @@
+"""Contact and friction between particles, from a list of near pairs that is exact by construction.
+
+A pair is listed for a lane when its particles were closer than touching distance + margin at that
+lane's last listing; a lane lists anew before its fastest particle can have moved half the margin.
+Each lane's mask depends on its own positions only, so a world's bits do not depend on its
+neighbours although the lanes share one list.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .friction import friction
+from .lanes import (  # noqa: F401  (operators are found by name)
+    add,
+    any_less,
+    div,
+    dot,
+    largest,
+    less,
+    mul,
+    root,
+    select,
+    sub,
+)
+from .structures import structures
+
+__all__ = ["sphere_contact"]
+
+
+@functools.cache
+def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`list_near` makes the list of a group, `project_contact` solves one of its pairs.
+
+    The normal correction separates at most as fast as the pair approached in this substep plus
+    `recovery`, so an overlap is pushed out without giving energy.
+    """
+    t = structures(scalar, lanes)
+    S, V, L = t.S, t.V, t.L
+    Pairs, Particles, Near = t.Pairs, t.Particles, t.Near
+    coulomb = friction(scalar, lanes).coulomb
+
+    @wp.func
+    def list_near(
+        p0: int, start: int, capacity: int, first: int, last: int, margin: S, stale: V,
+        q: Particles, pairs: Pairs, near: Near, count: int,
+    ):  # fmt: skip
+        for i in range(p0, p0 + count):
+            x = q.x[i]
+            r = q.xr[i]
+            r.x = select(stale, x.x, r.x)
+            r.y = select(stale, x.y, r.y)
+            r.z = select(stale, x.z, r.z)
+            q.xr[i] = r
+        n = int(0)
+        for k in range(first, last):
+            ij = pairs.ij[k]
+            d = q.xr[p0 + ij[0]] - q.xr[p0 + ij[1]]
+            reach = pairs.distance[k] + margin
+            l2 = dot(d, d)
+            if any_less(l2, reach * reach):
+                if n < capacity:
+                    near.pair[start + n] = k
+                    near.mask[start + n] = less(l2, V(reach * reach))
+                n += 1
+        return n
+
+    @wp.func
+    def project_contact(
+        k: int, p0: int, mu: V, push: S, q: Particles, pairs: Pairs, near: Near
+    ):
+        pair = near.pair[k]
+        ij = pairs.ij[pair]
+        h = pairs.distance[pair]
+        i = p0 + ij[0]
+        j = p0 + ij[1]
+        xi = q.x[i]
+        xj = q.x[j]
+        d = xi - xj
+        l2 = dot(d, d)
+        if any_less(l2, h * h):
+            zero = V(S(0.0))
+            one = V(S(1.0))
+            tiny = V(S(1.0e-9))
+            l = wp.max(root(l2), tiny)
+            n = d * (one / l)
+            moved = (xi - q.xp[i]) - (xj - q.xp[j])
+            approach = dot(moved, n)
+            depth = wp.max(V(h) - l, zero) * near.mask[k]
+            depth = wp.min(depth, wp.max(-approach, zero) + V(push))
+            wi = q.w[i]
+            wj = q.w[j]
+            share = one / wp.max(wi + wj, tiny)
+            slip = moved - n * approach
+            f = coulomb(dot(slip, slip), depth * mu)
+            step = n * (depth * share) - slip * (f * share)
+            q.x[i] = xi + step * wi
+            q.x[j] = xj - step * wj
+
+    @wp.func
+    def touches(
+        particle: int, lane: int, p0: int, start: int, n: int, q: Particles, pairs: Pairs, near: Near
+    ):
+        """Whether a particle of one lane touches another that is not its neighbour along the chain."""
+        hit = bool(False)
+        for k in range(start, start + n):
+            pair = near.pair[k]
+            ij = pairs.ij[pair]
+            if ij[0] == particle or ij[1] == particle:
+                d = q.x[p0 + ij[0]] - q.x[p0 + ij[1]]
+                h = pairs.distance[pair]
+                l2 = dot(d, d)
+                if near.mask[k][lane] > S(0.0) and l2[lane] < h * h:
+                    hit = True
+        return hit
+
+    return SimpleNamespace(list_near=list_near, project_contact=project_contact, touches=touches)

@@ -1,0 +1,178 @@
+"""The arrays that the fused kernel works on, bundled so that a launch takes a handful of arguments.
+
+Worlds with the same topology share one thread in groups of L. Arrays of V or V3 are indexed by
+group, arrays of scalars by world (``group * L + lane``; the last group is padded with copies).
+Indices inside a topology are local to its world.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .lanes import lane_types
+
+__all__ = ["structures"]
+
+
+@functools.cache
+def structures(scalar: Any, lanes: int) -> SimpleNamespace:
+    """Struct types for one precision and width."""
+    t = lane_types(scalar, lanes)
+    S, V, V3, R3, Q, M33 = t.S, t.V, t.V3, t.R3, t.Q, t.M33
+
+    @wp.struct
+    class Settings:
+        """What is the same for every world of a launch."""
+
+        dt: S  # [s]
+        max_steps: int  # substeps of this launch at most
+        alternate: int  # 1: sweep constraints backwards in every other substep
+        recovery: S  # fastest separation of overlapping bodies [m/s]
+        max_speed: S  # clamp [m/s]
+        calm_speed: S  # clamp while a world is calmed [m/s]
+        margin: S  # pairs this much farther apart than touching are still listed [m]
+        rest_speed: S  # slower than this is at rest [m/s]
+        rest_steps: S  # so many substeps at rest end a world's launch
+        check_every: int  # substeps between looks of the guards
+        record_every: int  # substeps between recorded frames; 0: record nothing
+        particle_stride: int  # particles of all groups: length of one recorded frame
+        body_stride: int  # bodies of all worlds: length of one recorded frame
+
+    # Small structs: a function that is not inlined copies those that it takes.
+    @wp.struct
+    class Topology:
+        """Where each topology's slice of the lists starts; (topologies,) or (topologies + 1,)."""
+
+        particle_count: wp.array(dtype=int)
+        particle_start: wp.array(dtype=int)  # in `Topology.radius`
+        radius: wp.array(dtype=S)  # of particles [m]
+        body_count: wp.array(dtype=int)
+        spring_start: wp.array(dtype=int)
+        pair_start: wp.array(dtype=int)
+        shape_start: wp.array(dtype=int)
+
+    @wp.struct
+    class Springs:
+        """Distance constraints between particles, numbered inside their world."""
+
+        ij: wp.array(dtype=wp.vec2i)
+        length: wp.array(dtype=S)  # [m]
+        compliance: wp.array(dtype=S)  # [m/N]
+        limit: wp.array(dtype=S)  # longest allowed length [m]; 0: none
+        mode: wp.array(dtype=int)
+
+    @wp.struct
+    class Pairs:
+        """Particles of one world that may touch."""
+
+        ij: wp.array(dtype=wp.vec2i)
+        distance: wp.array(dtype=S)  # sum of their radii [m]
+
+    @wp.struct
+    class Shapes:
+        """Boxes, with the local number of their body."""
+
+        body: wp.array(dtype=int)
+        center: wp.array(dtype=R3)  # in the frame of the body's centre of mass [m]
+        rotation: wp.array(dtype=Q)
+        half: wp.array(dtype=R3)  # half extents [m]
+        friction: wp.array(dtype=S)
+
+    @wp.struct
+    class Group:
+        """Per group: where its data start, and the parameters that may differ between worlds."""
+
+        topology: wp.array(dtype=int)
+        particle_start: wp.array(dtype=int)
+        body_start: wp.array(dtype=int)
+        near_start: wp.array(dtype=int)
+        near_capacity: wp.array(dtype=int)
+        active: wp.array(dtype=V)  # 1: simulate this world, 0: leave it alone
+        gravity: wp.array(dtype=V3)  # [m/s^2]
+        damping: wp.array(dtype=V)  # [1/s]
+        table_friction: wp.array(dtype=V)
+        contact_friction: wp.array(dtype=V)
+        stiffness: wp.array(dtype=V)  # factor on every spring's stiffness
+        calm_steps: wp.array(dtype=V)  # substeps to begin with that are clamped to calm_speed
+        calm_after: wp.array(dtype=V)  # and again so many after a release
+        least_steps: wp.array(dtype=V)  # a world runs at least this long after its grip path
+        most_steps: wp.array(dtype=V)  # and in all at most this long
+
+    @wp.struct
+    class Particles:
+        """State of all particles in lanes."""
+
+        x: wp.array(dtype=V3)  # position [m]
+        v: wp.array(dtype=V3)  # velocity [m/s]
+        xp: wp.array(dtype=V3)  # position at the start of the substep
+        xr: wp.array(dtype=V3)  # position when the contact list was last made
+        w: wp.array(dtype=V)  # inverse mass [1/kg], 0 while gripped
+        w0: wp.array(dtype=V)  # inverse mass when free
+
+    @wp.struct
+    class Near:
+        """Pairs close enough to touch soon, per group, in the order of the topology's pairs."""
+
+        count: wp.array(dtype=int)
+        pair: wp.array(dtype=int)
+        mask: wp.array(dtype=V)  # 1 where the pair is listed for the lane's own sake
+
+    @wp.struct
+    class Bodies:
+        """State of all rigid bodies, by body_start + lane * body_count + local number."""
+
+        x: wp.array(dtype=R3)  # centre of mass [m]
+        q: wp.array(dtype=Q)
+        v: wp.array(dtype=R3)  # [m/s]
+        omega: wp.array(dtype=R3)  # [rad/s]
+        xp: wp.array(dtype=R3)
+        qp: wp.array(dtype=Q)
+        w: wp.array(dtype=S)  # inverse mass [1/kg], 0 while gripped
+        w0: wp.array(dtype=S)
+        inertia: wp.array(dtype=M33)  # in the body's frame [kg m^2]
+        inverse_inertia: wp.array(dtype=M33)
+        touching: wp.array(dtype=int)  # contacts with particles and bodies in the last substep
+
+    @wp.struct
+    class Grips:
+        """One grip per world: what is held, and the path of the tip over simulated time."""
+
+        particle: wp.array(dtype=int)  # local number of the held particle or -1
+        body: wp.array(dtype=int)  # local number of the held body or -1
+        offset: wp.array(dtype=R3)  # of the held thing in the tip's frame [m]
+        turn: wp.array(dtype=Q)  # rotation of the held body in the tip's frame
+        tick: wp.array(dtype=int)  # substeps along the path
+        knot: wp.array(dtype=int)  # segment that the tip is on
+        knot_start: wp.array(dtype=int)
+        knot_end: wp.array(dtype=int)
+        time: wp.array(dtype=S)  # of each knot [s], ascending per world
+        position: wp.array(dtype=R3)
+        rotation: wp.array(dtype=Q)
+        lower_start: wp.array(dtype=S)  # between these times contact ends the descent [s]
+        lower_end: wp.array(dtype=S)
+        shift: wp.array(dtype=R3)  # added to the path once contact has ended the descent
+        push: wp.array(dtype=int)  # local number of a perturbed particle or -1
+        push_acceleration: wp.array(dtype=R3)  # [m/s^2]
+        push_steps: wp.array(dtype=int)
+
+    @wp.struct
+    class Watch:
+        """What the guards look at, the worst value of the launch per world, and what came out."""
+
+        steps: wp.array(dtype=V)  # substeps simulated
+        nonfinite: wp.array(dtype=V)  # 1 when a coordinate was not a number
+        stretch: wp.array(dtype=V)  # longest two-sided spring / its rest length
+        depth: wp.array(dtype=V)  # deepest a particle's centre was under the table [m]
+        clamped: wp.array(dtype=V)  # substeps in which the speed clamp acted
+        overflow: wp.array(dtype=int)  # per group: pairs that found no room in the list
+        frame_x: wp.array(dtype=V3)  # recorded particle positions
+        frame_body_x: wp.array(dtype=R3)
+        frame_body_q: wp.array(dtype=Q)
+
+    return SimpleNamespace(
+        **vars(t), Settings=Settings, Topology=Topology, Springs=Springs, Pairs=Pairs,
+        Shapes=Shapes, Group=Group, Particles=Particles, Near=Near, Bodies=Bodies, Grips=Grips,
+        Watch=Watch,
+    )  # fmt: skip

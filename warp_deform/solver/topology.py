@@ -1,0 +1,178 @@
+"""Reads a `newton.Model` into topologies: the constraint lists that worlds share.
+
+Two worlds have the same topology when their springs, particles, bodies and shapes are the same
+apart from where they start and how heavy they are; such worlds can share SIMD lanes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+
+from ..errors import InputError
+from ..objects.attributes import NAMESPACE
+
+__all__ = ["WorldTopology", "read_worlds"]
+
+
+@dataclass(frozen=True, eq=False)
+class WorldTopology:
+    """One world as the solver sees it; all indices are local to the world.
+
+    spring_ij (S, 2); spring_length (S,) [m]; spring_compliance (S,) [m/N]; spring_limit (S,) [m];
+    spring_mode (S,)
+    pair_ij (C, 2), pair_distance (C,) [m]: particles that may collide
+    particle_radius (P,) [m]
+    shape_body (K,); shape_center (K, 3) relative to the centre of mass; shape_rotation (K, 4) xyzw;
+    shape_half (K, 3) [m]; shape_friction (K,)
+    body_com (B, 3): centre of mass in the body's frame [m]
+    """
+
+    spring_ij: np.ndarray
+    spring_length: np.ndarray
+    spring_compliance: np.ndarray
+    spring_limit: np.ndarray
+    spring_mode: np.ndarray
+    pair_ij: np.ndarray
+    pair_distance: np.ndarray
+    particle_radius: np.ndarray
+    shape_body: np.ndarray
+    shape_center: np.ndarray
+    shape_rotation: np.ndarray
+    shape_half: np.ndarray
+    shape_friction: np.ndarray
+    body_com: np.ndarray
+
+    @property
+    def particle_count(self) -> int:
+        return len(self.particle_radius)
+
+    @property
+    def body_count(self) -> int:
+        return len(self.body_com)
+
+    def key(self) -> bytes:
+        """Equal for worlds that can share lanes."""
+        return b"|".join(np.ascontiguousarray(v).tobytes() for v in vars(self).values())
+
+
+def _slices(worlds: np.ndarray, count: int, what: str) -> list[np.ndarray]:
+    """Element numbers of every world; elements of the global world (-1) are only in a lone world."""
+    if count == 1:
+        return [np.arange(len(worlds))]
+    if (worlds < 0).any():
+        raise InputError(f"{what} outside every world are not supported next to replicated worlds")
+    return [np.flatnonzero(worlds == w) for w in range(count)]
+
+
+def read_worlds(model: newton.Model) -> tuple[list[WorldTopology], list[np.ndarray], list[np.ndarray]]:
+    """Topology, particle numbers and body numbers of every world of `model`.
+
+    Raises:
+        InputError: the model holds something that this solver does not simulate.
+    """
+    if not hasattr(model, NAMESPACE):
+        raise InputError(
+            "the model lacks warp_deform's attributes: build it with add_cable, add_box, ... or call "
+            "SolverFusedXPBD.register_custom_attributes(builder) first"
+        )
+    for what, amount in (("tetrahedra", model.tet_count), ("triangles", model.tri_count)):
+        if amount:
+            raise InputError(f"SolverFusedXPBD does not simulate {what} ({amount} in the model)")
+    ours = getattr(model, NAMESPACE)
+    count = max(1, model.world_count)
+    radius = model.particle_radius.numpy() if model.particle_count else np.zeros(0)
+    world = model.particle_world.numpy() if model.particle_count else np.zeros(0, int)
+    particles = _slices(world, count, "particles")
+    bodies = _slices(
+        model.body_world.numpy() if model.body_count else np.zeros(0, int), count, "bodies"
+    )
+    springs = _Springs(model, ours)
+    shapes = _Shapes(model)
+    topologies = []
+    for ids, body_ids in zip(particles, bodies, strict=True):
+        local = np.full(model.particle_count + 1, -1)
+        local[ids] = np.arange(len(ids))
+        pair_ij, pair_distance = _pairs(ids, ours, radius) if len(ids) else _no_pairs()
+        topologies.append(
+            WorldTopology(
+                **springs.of(ids, local),
+                pair_ij=pair_ij,
+                pair_distance=pair_distance,
+                particle_radius=radius[ids],
+                **shapes.of(body_ids),
+                body_com=model.body_com.numpy()[body_ids] if len(body_ids) else np.zeros((0, 3)),
+            )
+        )
+    return topologies, particles, bodies
+
+
+class _Springs:
+    def __init__(self, model: newton.Model, ours: object) -> None:
+        self.count = model.spring_count
+        if self.count:
+            self.ij = model.spring_indices.numpy().reshape(-1, 2)
+            self.length = model.spring_rest_length.numpy()
+            self.compliance = 1.0 / model.spring_stiffness.numpy()
+            self.limit = ours.spring_limit.numpy() * self.length  # type: ignore[attr-defined]
+            self.mode = ours.spring_mode.numpy()  # type: ignore[attr-defined]
+
+    def of(self, ids: np.ndarray, local: np.ndarray) -> dict[str, np.ndarray]:
+        if not self.count:
+            empty = np.zeros(0)
+            return {
+                "spring_ij": np.zeros((0, 2), int), "spring_length": empty,
+                "spring_compliance": empty, "spring_limit": empty, "spring_mode": empty.astype(int),
+            }  # fmt: skip
+        mine = np.isin(self.ij[:, 0], ids)
+        return {
+            "spring_ij": local[self.ij[mine]], "spring_length": self.length[mine],
+            "spring_compliance": self.compliance[mine], "spring_limit": self.limit[mine],
+            "spring_mode": self.mode[mine],
+        }  # fmt: skip
+
+
+class _Shapes:
+    def __init__(self, model: newton.Model) -> None:
+        self.model = model
+        self.body = model.shape_body.numpy() if model.shape_count else np.zeros(0, int)
+        if model.shape_count and (model.shape_type.numpy() != int(newton.GeoType.BOX)).any():
+            raise InputError("SolverFusedXPBD simulates boxes only; another shape is in the model")
+
+    def of(self, bodies: np.ndarray) -> dict[str, np.ndarray]:
+        rows = np.flatnonzero(np.isin(self.body, bodies))
+        if not len(rows):
+            return {
+                "shape_body": np.zeros(0, int), "shape_center": np.zeros((0, 3)),
+                "shape_rotation": np.zeros((0, 4)), "shape_half": np.zeros((0, 3)),
+                "shape_friction": np.zeros(0),
+            }  # fmt: skip
+        local = {b: i for i, b in enumerate(bodies)}
+        body = np.array([local[b] for b in self.body[rows]])
+        transform = self.model.shape_transform.numpy()[rows]
+        com = self.model.body_com.numpy()[self.body[rows]]
+        return {
+            "shape_body": body,
+            "shape_center": transform[:, :3] - com,
+            "shape_rotation": transform[:, 3:],
+            "shape_half": self.model.shape_scale.numpy()[rows],
+            "shape_friction": self.model.shape_material_mu.numpy()[rows],
+        }
+
+
+def _no_pairs() -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros((0, 2), int), np.zeros(0)
+
+
+def _pairs(ids: np.ndarray, ours: object, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs i < j that may collide: of different objects, or far enough apart in the rest shape."""
+    i, j = np.triu_indices(len(ids), 1)
+    owner = ours.particle_object.numpy()[ids]  # type: ignore[attr-defined]
+    rest = ours.particle_rest.numpy()[ids]  # type: ignore[attr-defined]
+    exclusion = ours.particle_exclusion.numpy()[ids]  # type: ignore[attr-defined]
+    apart = np.linalg.norm(rest[i] - rest[j], axis=1) > np.minimum(exclusion[i], exclusion[j])
+    keep = (owner[i] != owner[j]) | apart
+    pairs = np.column_stack([i, j])[keep]
+    return pairs, radius[ids][pairs].sum(axis=1)

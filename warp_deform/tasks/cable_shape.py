@@ -1,0 +1,139 @@
+"""cable-shape and cable-shape-notarget: lay a cable along two to four sides of a rectangle.
+
+Source: Seita et al., ICRA 2021, appendix on cable-shape.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from ..objects.cable import Cable, CableConfig, add_cable, cable_line
+from ..objects.zone import segment_zone
+from .demonstrators import pick_place, visible_point
+from .free_space import FreeSpace
+from .ground_truth import pose_rows
+from .metrics import share_in_zone, wrap_angle
+from .shapes import chain_yaw, sample_shape, to_world
+from .task import Action, Layout, Snapshot, Stage, Task
+
+if TYPE_CHECKING:
+    import newton
+
+__all__ = ["CableShape", "CableShapeNotarget"]
+
+_SETTLE_SECONDS = 2.0
+_GOAL_SETTLE_SECONDS = 1.0
+_STACK_NOISE = 0.001
+"""Spread of the stacked beads along x and y [m]; a perfect stack of spheres would not fall."""
+
+
+class CableShape(Task):
+    """Every one of 24 beads has to lie on the drawn shape.
+
+    Deliberate differences from the original: beads are spheres, so the stack that falls into a heap
+    is stacked with 1 mm of noise; a bead's yaw is the angle of the chain's tangent; a pick off the
+    bead's centre is made up for in the world's frame, not in that of the rolling bead.
+    """
+
+    name = "cable-shape"
+    stages = (Stage(lift=0.04, speed=0.15),)
+    success_score = 1.0
+    ground_truth_size = 147
+    objects = ("cable",)
+
+    cable: ClassVar[CableConfig] = CableConfig()
+    sides: ClassVar[tuple[int, ...]] = (2, 3, 4)
+    """Numbers of sides that a target may have."""
+    visible: ClassVar[bool] = True
+    """Whether the target is drawn; what is drawn also keeps the start away."""
+    tolerance: ClassVar[float] = 3.5 * 0.005
+    """A bead nearer than this to a target is in the zone [m]."""
+
+    def add_objects(self, builder: newton.ModelBuilder) -> tuple[Cable]:
+        """Add the cable, straight along the table."""
+        return (add_cable(builder, self.cable, cable_line(self.cable, (0.5, -0.17), (0.5, 0.17))),)
+
+    def sample(self, rng: np.random.Generator, space: FreeSpace) -> Layout:
+        """A target that fits the table at any yaw, and a stack of beads about to fall."""
+        length = self.cable.length
+        x, y, yaw = space.sample(rng, length, length, extent=length / 2)
+        frame = np.array([x, y, wrap_angle(yaw)])
+        shape = sample_shape(rng, self.sides, self.cable.beads)
+        zone = segment_zone(to_world(shape.outline(self.cable), frame))
+        if self.visible:
+            space = space.occupy_quads(zone.corners)
+        x, y, _ = space.sample(rng, length / 10, length / 10)
+        height = (np.arange(self.cable.beads) + 1) * self.cable.spacing
+        xy = rng.normal([x, y], _STACK_NOISE, (self.cable.beads, 2))
+        return Layout(
+            particle_q=np.column_stack([xy, height]),
+            body_q=np.zeros((0, 7)),
+            targets=to_world(shape.targets(self.cable), frame),
+            zones=(zone,) if self.visible else (),
+            settle_seconds=_SETTLE_SECONDS,
+            frame=frame,
+        )
+
+    def score(self, layout: Layout, snapshot: Snapshot) -> float:
+        """Share of the beads that are in the zone; which bead lies where does not matter."""
+        return share_in_zone(snapshot.particle_q, layout.targets, self.tolerance)
+
+    def demonstrate(
+        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
+    ) -> Action | None:
+        """Move the visible bead that is farthest from its own target onto it."""
+        targets = np.column_stack([layout.targets, np.zeros(self.cable.beads)])
+        distances = np.linalg.norm(snapshot.particle_q - targets, axis=1)
+        segments = snapshot.segments[len(layout.zones)]
+        for bead in np.argsort(-distances, kind="stable"):
+            pick = visible_point(snapshot.images.segmentation == segments[bead], rng)
+            if pick is not None:
+                offset = pick - snapshot.particle_q[bead, :2]
+                return pick_place(pick, layout.targets[bead] + offset, stage=self.stages[0])
+        return None
+
+    def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
+        """(147,): the target's centre, then bead 0, its target, bead 1, its target, ...
+
+        Each is x, y, -yaw / 15; a target's yaw is 0, the centre's that of the rectangle.
+        """
+        if layout.frame is None:
+            raise ValueError(f"{self.name} needs the frame of its targets")
+        centre = pose_rows(layout.frame, layout.frame[2])
+        targets = pose_rows(layout.targets, 0.0)
+        pairs = np.stack([self._chain_rows(snapshot.particle_q), targets], axis=1)
+        return np.concatenate([centre.ravel(), pairs.ravel()])
+
+    def _chain_rows(self, points: np.ndarray) -> np.ndarray:
+        return pose_rows(points, chain_yaw(points, closed=False))
+
+
+class CableShapeNotarget(CableShape):
+    """cable-shape with the target in a goal image instead of on the table."""
+
+    name = "cable-shape-notarget"
+    goal_conditioned = True
+    ground_truth_size = 144
+    visible = False
+
+    def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
+        """(144,): x, y, -yaw / 15 of every bead, then the same of the goal's beads."""
+        rows = [self._chain_rows(snapshot.particle_q), self._chain_rows(layout.targets)]
+        return np.concatenate(rows).ravel()
+
+    def goal_layout(self, layout: Layout) -> Layout:
+        """The cable laid on the targets, which settles to the links' true lengths."""
+        height = np.full(self.cable.beads, self.cable.radius)
+        return replace(
+            layout,
+            particle_q=np.column_stack([layout.targets, height]),
+            settle_seconds=_GOAL_SETTLE_SECONDS,
+            calm=True,
+        )
+
+    def goal_targets(self, snapshot: Snapshot) -> np.ndarray:
+        """Where the beads lie (24, 2) [m]."""
+        return np.array(snapshot.particle_q[:, :2], dtype=float)

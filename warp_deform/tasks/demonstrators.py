@@ -1,0 +1,68 @@
+"""What the scripted demonstrators share: where to pick, how to place, which bead goes where.
+
+Source: Seita et al., ICRA 2021, section on demonstrators.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from ..rendering.pixels import pixel_to_world
+from .metrics import wrap_angle
+from .task import Action, Stage
+
+__all__ = ["farthest_bead", "pick_place", "pick_place_pose", "ring_maps", "visible_point"]
+
+
+def visible_point(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+    """Point x, y (2,) [m] of a pixel drawn uniformly from `mask` (320, 160) eroded by 3 x 3.
+
+    None when nothing is left: what the mask shows is hidden, or too small to hit safely.
+    """
+    eroded = cv2.erode(np.asarray(mask, dtype=np.uint8), np.ones((3, 3), np.uint8))
+    pixels = np.argwhere(eroded)
+    return pixel_to_world(pixels[rng.integers(len(pixels))]) if len(pixels) else None
+
+
+def pick_place(
+    pick: np.ndarray, place: np.ndarray, *, stage: Stage, place_yaw: float = 0.0
+) -> Action:
+    """Action (7,) float64 from `pick` (2,), yaw 0, to `place` (2,) [m] at `place_yaw` [rad]."""
+    return np.array([*pick[:2], 0.0, *place[:2], place_yaw, stage.lift], dtype=float)
+
+
+def pick_place_pose(
+    pick: np.ndarray, pose: np.ndarray, target: np.ndarray, *, stage: Stage
+) -> Action:
+    """Action (7,) that takes a rigid body from `pose` to `target`, both (3,) x, y [m], yaw [rad].
+
+    The held body turns by place yaw minus pick yaw about the pick point (2,) and that point goes to
+    the place point; so the place point is where the target's body carries the picked spot.
+    """
+    turn = wrap_angle(target[2] - pose[2])
+    c, s = np.cos(turn), np.sin(turn)
+    place = target[:2] + np.array([[c, -s], [s, c]]) @ (pick[:2] - pose[:2])
+    return pick_place(pick, place, stage=stage, place_yaw=turn)
+
+
+def ring_maps(beads: int, *, reversals: bool) -> np.ndarray:
+    """Every way (maps, beads) to give a ring's beads to its targets in order around the ring.
+
+    Entry j of a map is the bead for target j: all cyclic shifts and, with `reversals`, those of the
+    ring turned over.
+    """
+    shifts = (np.arange(beads)[:, None] + np.arange(beads)) % beads
+    return np.concatenate([shifts, shifts[:, ::-1]]) if reversals else shifts
+
+
+def farthest_bead(beads: np.ndarray, targets: np.ndarray, maps: np.ndarray) -> tuple[int, int]:
+    """Bead and target farthest apart under the map of least mean distance; of equals the first.
+
+    beads, targets (n, 3) [m]; maps (m, n) as from `ring_maps`.
+    """
+    distances = np.linalg.norm(beads[:, None] - targets, axis=-1)  # bead, target
+    mapped = distances[maps, np.arange(len(targets))]
+    best = int(np.argmin(mapped.mean(axis=1)))
+    target = int(np.argmax(mapped[best]))
+    return int(maps[best, target]), target

@@ -1,0 +1,41 @@
+"""The tasks by name. A new task is one file and one line here; the tests run over this dict."""
+
+from __future__ import annotations
+
+import difflib
+
+from ..errors import InputError
+from .block import BlockNotarget
+from .cable_line import CableLineNotarget
+from .cable_ring import CableRing, CableRingNotarget
+from .cable_shape import CableShape, CableShapeNotarget
+from .task import Task
+
+__all__ = ["TASKS", "task"]
+
+TASKS: dict[str, type[Task]] = {
+    cls.name: cls
+    for cls in (
+        CableRing,
+        CableRingNotarget,
+        CableShape,
+        CableShapeNotarget,
+        CableLineNotarget,
+        BlockNotarget,
+    )
+}
+"""Task classes by the paper's names, in the paper's order."""
+
+
+def task(name: str) -> Task:
+    """The task called `name`.
+
+    Raises:
+        InputError: there is none; the message says which name is nearest.
+    """
+    if name not in TASKS:
+        near = difflib.get_close_matches(name, TASKS, n=1, cutoff=0.0)[0]
+        raise InputError(
+            f"there is no task {name!r}; did you mean {near!r}? `warp-deform list` shows all"
+        )
+    return TASKS[name]()
