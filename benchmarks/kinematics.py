@@ -135,7 +135,8 @@ def reach_table(arm: Robot) -> list[tuple[float, float, float]]:
         first, after = max(
             zip(edges[::2], edges[1::2], strict=True), key=lambda run: run[1] - run[0]
         )
-        smallest = radii[first] + (MARGIN if first else 0.0)
+        # Twice: between heights the inner edge bulges outwards.
+        smallest = radii[first] + (2.0 * MARGIN if first else 0.0)
         rows.append((round(z, 2), round(smallest, 3), round(radii[after - 1] - MARGIN, 3)))
     return rows
 

@@ -17,7 +17,7 @@ from warp_deform.tasks.block import BlockNotarget
 from warp_deform.tasks.cable_line import CableLineNotarget
 from warp_deform.tasks.cable_ring import CableRing, CableRingNotarget
 from warp_deform.tasks.cable_shape import CableShape, CableShapeNotarget
-from warp_deform.tasks.demonstrators import farthest_bead, ring_maps
+from warp_deform.tasks.demonstrators import farthest_bead, ring_maps, visible_point
 from warp_deform.tasks.free_space import FreeSpace, NoFreeSpace
 from warp_deform.tasks.ground_truth import quaternion_yaw
 from warp_deform.tasks.registry import TASKS, task
@@ -203,6 +203,15 @@ def test_ring_push_is_bounded_and_points_to_the_middle_of_the_table() -> None:
     assert beads == set(range(32))
 
 
+def test_ring_state_vector_alternates_beads_and_marks() -> None:
+    item, layout, _ = start(CableRing)
+    beads = np.roll(layout.particle_q, 3, axis=0)
+    rows = item.ground_truth(layout, snapshot(beads, layout)).reshape(-1, 3)
+    assert rows[::2, :2] == pytest.approx(beads[:, :2], abs=1e-6)
+    assert rows[1::2, :2] == pytest.approx(layout.targets, abs=1e-6)
+    assert (rows[1::2, 2] == 0).all()
+
+
 def test_ring_maps_are_the_64_symmetries() -> None:
     maps = ring_maps(32, reversals=True)
     assert maps.shape == (64, 32)
@@ -238,6 +247,16 @@ def test_ring_demonstrator_moves_the_bead_that_is_out_of_place() -> None:
     bead, target = farthest_bead(beads, on_table(layout.targets, 0.0), maps)
     assert bead == wrong
     assert layout.targets[target] == pytest.approx(home)
+
+
+def test_visible_point_stays_off_the_rim_and_ignores_slivers() -> None:
+    rng = np.random.default_rng(0)
+    mask = np.zeros(SHAPE, bool)
+    mask[100:102, 10:60] = True
+    assert visible_point(mask, rng) is None
+    mask[200:204, 30:34] = True
+    found = {tuple(world_to_pixel(visible_point(mask, rng))) for _ in range(100)}
+    assert found == {(201, 31), (201, 32), (202, 31), (202, 32)}
 
 
 @pytest.mark.parametrize("cls", SHAPES)

@@ -3,17 +3,18 @@
 They are cross-checks and yardsticks; no part of the product simulates with them.
 """
 
-from .newton_peer import NEWTON_SETTINGS, NewtonSettings, time_newton
+from .newton_peer import NEWTON_SOLVERS, NewtonSettings, newton_settings, time_newton
 from .pybullet_peer import time_pybullet
 from .scene import PEER_SCENES, PeerScene, peer_scene
 from .timing import PeerTiming
 
 __all__ = [
-    "NEWTON_SETTINGS",
+    "NEWTON_SOLVERS",
     "PEER_SCENES",
     "NewtonSettings",
     "PeerScene",
     "PeerTiming",
+    "newton_settings",
     "peer_scene",
     "time_newton",
     "time_pybullet",

@@ -22,7 +22,7 @@ __all__ = ["PyBulletWorld", "time_pybullet"]
 HZ = 240
 _MAX_FORCE = 100.0  # [N]
 _NOTE = (
-    "as the original: cubes as beads, point-to-point joints of at most 100 N, no bending stiffness; "
+    "as the original: cubes as beads, point-to-point joints of at most 100 N, no bending limit; "
     "without the arm, which the original also steps"
 )
 

@@ -21,7 +21,7 @@ SceneName = Literal["cable", "ring", "block"]
 PEER_SCENES: tuple[str, ...] = get_args(SceneName)
 
 _CENTRE = (0.5, 0.0)
-_NOISE = 3e-4  # [m]; a perfect stack of spheres stands, and a perfect ring folds in its plane
+_NOISE = 1e-4  # [m]; a perfect stack of spheres stands, and a perfect ring folds in its plane
 _DROP = 0.05  # [m]; clear height under the block
 
 

@@ -13,6 +13,7 @@ from ..errors import InputError
 from .camera import Camera, look_at
 from .drawables import Drawables
 from .geometry import Geometry, HostArray, Mesh
+from .occlusion import draw_occluders, occluders
 from .pinhole import draw, view_of
 from .shading import Look, lighting_of, shade
 
@@ -66,12 +67,9 @@ class Perspective:
         self._device = wp.get_device(device)
         self._supersample, self._links = supersample, links
         self._lighting = lighting_of(look)
-        self._lamp = view_of(_centred(look.lamp, SHADOW_SIZE, SHADOW_REACH))
+        self._lamp = occluders(_centred(look.lamp, SHADOW_SIZE, SHADOW_REACH), self._device)
         # a little off the vertical, which has no right or left
-        self._top = view_of(_centred((0.5, -1e-3, 3.0), ABOVE_SIZE, ABOVE_REACH))
-        self._shadow = self._buffer((SHADOW_SIZE, SHADOW_SIZE))
-        above = ABOVE_SIZE if look.occlusion > 0 else 1
-        self._above = self._buffer((above, above))
+        self._above = occluders(_centred((0.5, -1e-3, 3.0), ABOVE_SIZE, ABOVE_REACH), self._device)
         self._frames: dict[tuple[int, int], tuple[wp.array, HostArray, HostArray, HostArray]] = {}
         self._meshes: dict[tuple[int, int], Mesh] = {}
         self._geometries: WeakKeyDictionary[Drawables, tuple[Geometry, list[Mesh]]] = (
@@ -99,9 +97,9 @@ class Perspective:
         geometry = self._geometry(drawables, len(particle_q), len(body_q), robot_links)
         geometry.move(particle_q, body_q)
         geometry.move_scene(np.array([link[2] for link in robot_links]))
-        draw(geometry, self._lamp, self._shadow, links=self._links)
+        draw_occluders(self._lamp, geometry, links=self._links)
         if self._lighting.occlusion > 0:
-            draw(geometry, self._top, self._above, links=self._links)
+            draw_occluders(self._above, geometry, links=self._links)
         return [self._picture(geometry, camera) for camera in cameras]
 
     def _picture(self, geometry: Geometry, camera: Camera) -> RGBD:
@@ -127,10 +125,8 @@ class Perspective:
                 geometry.sphere_count,
                 FAR,
                 buffer,
-                self._shadow,
                 self._lamp,
                 self._above,
-                self._top,
                 color.array,
                 depth.array,
                 segmentation.array,

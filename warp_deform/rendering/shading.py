@@ -13,6 +13,7 @@ import warp as wp
 from ..objects.colors import TABLE, Color
 from .drawables import WORKSPACE_SEGMENT
 from .geometry import MESH_MATERIAL, Scene
+from .occlusion import Occluders, lit_share, open_share
 from .pinhole import View, inverse_depth, primitive_of, ray, to_camera
 from .pixels import BOUNDS
 
@@ -30,7 +31,6 @@ WORKSPACE = wp.constant(WORKSPACE_SEGMENT)
 X_LOW, X_HIGH = (wp.constant(value) for value in BOUNDS[0])
 Y_LOW, Y_HIGH = (wp.constant(value) for value in BOUNDS[1])
 TABLE_COLOR = wp.constant(wp.vec3(*(float(c) for c in TABLE)))
-SOFT = wp.constant(3)  # half width of the shadow's filter in texels
 NOTHING = wp.constant(-1)
 
 
@@ -220,94 +220,12 @@ def surface_at(
 
 
 @wp.func
-def lit_share(shadow: wp.array2d(dtype=wp.int64), lamp: View, p: wp.vec3, n: wp.vec3):
-    """Share of the lamp that a point sees: a tent-edged box filter over the lamp's z-buffer."""
-    # a point a little off the surface, so that no surface shades itself
-    q = to_camera(lamp, p + n * 0.003)
-    if q[2] < 0.1:
-        return 1.0
-    inverse = 1.0 / (q[2] - 0.002)
-    x = q[0] / q[2] * lamp.fx + lamp.cx
-    y = q[1] / q[2] * lamp.fy + lamp.cy
-    edge = float(SOFT) + 1.0
-    if (
-        x < edge
-        or y < edge
-        or x > float(lamp.columns) - edge - 2.0
-        or y > float(lamp.rows) - edge - 2.0
-    ):
-        return 1.0
-    limit = wp.int64(wp.cast(inverse, wp.int32)) << wp.int64(32)
-    c = int(x)
-    r = int(y)
-    probes = int(0)
-    for i in range(5):
-        # corners and centre of the filter
-        dr = (2 * (i % 2) - 1) * SOFT
-        dc = (2 * (i / 2) - 1) * SOFT
-        if i == 4:
-            dr = 0
-            dc = 0
-        if shadow[r + dr, c + dc] > limit:
-            probes += 1
-    if probes == 0:
-        return 1.0
-    if probes == 5:
-        return 0.0
-    fx = x - float(c)
-    fy = y - float(r)
-    total = float(0.0)
-    for i in range(-SOFT, SOFT + 2):
-        wy = float(1.0)
-        if i == -SOFT:
-            wy = 1.0 - fy
-        if i == SOFT + 1:
-            wy = fy
-        for j in range(-SOFT, SOFT + 2):
-            wx = float(1.0)
-            if j == -SOFT:
-                wx = 1.0 - fx
-            if j == SOFT + 1:
-                wx = fx
-            if shadow[r + i, c + j] > limit:
-                total += wx * wy
-    width = float(2 * SOFT + 1)
-    return 1.0 - total / (width * width)
-
-
-@wp.func
-def open_share(above: wp.array2d(dtype=wp.int64), top: View, p: wp.vec3, n: wp.vec3):
-    """Share of the ambient light that nearby things above a point let through.
-
-    Heights around the point, read from a view straight from above, within a few centimetres.
-    """
-    q = to_camera(top, p + n * 0.004)
-    x = q[0] / q[2] * top.fx + top.cx
-    y = q[1] / q[2] * top.fy + top.cy
-    reach = top.fx / q[2] * 0.009
-    total = float(0.0)
-    for i in range(-2, 3):
-        for j in range(-2, 3):
-            c = int(x + float(j) * reach + 0.5)
-            r = int(y + float(i) * reach + 0.5)
-            if c >= 0 and r >= 0 and c < top.columns and r < top.rows:
-                key = above[r, c]
-                if key > wp.int64(0):
-                    rise = q[2] - 1.0 / inverse_depth(key)
-                    if rise > 0.002:
-                        total += rise / (rise + 0.006) / (1.0 + rise * rise * 150.0)
-    return 1.0 - total / 25.0
-
-
-@wp.func
 def radiance(
     s: Surface,
     view: View,
     lighting: Lighting,
-    shadow: wp.array2d(dtype=wp.int64),
-    lamp: View,
-    above: wp.array2d(dtype=wp.int64),
-    top: View,
+    lamp: Occluders,
+    above: Occluders,
 ):
     """Linear colour that a surface sends to the camera."""
     if s.segment == NOTHING:
@@ -317,7 +235,7 @@ def radiance(
     direct = float(0.0)
     highlight = float(0.0)
     if cosine > 0.0:
-        seen = lit_share(shadow, lamp, s.position, s.normal)
+        seen = lit_share(lamp, s.position, s.normal)
         direct = lighting.direct * cosine * seen
         if s.gloss > 0.0:
             half = wp.normalize(to_lamp + wp.normalize(view.origin - s.position))
@@ -330,7 +248,7 @@ def radiance(
     # the sky is bright, the floor throws a little back
     ambient = lighting.ambient * (0.7 + 0.3 * s.normal[2])
     if lighting.occlusion > 0.0:
-        closed = 1.0 - open_share(above, top, s.position, s.normal)
+        closed = 1.0 - open_share(above, s.position, s.normal)
         ambient = ambient * wp.max(1.0 - lighting.occlusion * closed, 0.0)
     color = s.color * (direct + ambient) + wp.vec3(highlight, highlight, highlight)
     if s.segment == 0 and lighting.haze > 0.0:
@@ -350,10 +268,8 @@ def shade(
     spheres: int,
     far: float,
     buffer: wp.array2d(dtype=wp.int64),
-    shadow: wp.array2d(dtype=wp.int64),
-    lamp: View,
-    above: wp.array2d(dtype=wp.int64),
-    top: View,
+    lamp: Occluders,
+    above: Occluders,
     out_color: wp.array2d(dtype=wp.vec3ub),
     out_depth: wp.array2d(dtype=float),
     out_segmentation: wp.array2d(dtype=wp.uint8),
@@ -383,7 +299,7 @@ def shade(
             s = ground(lighting, view, row, column)
         else:
             s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-        total = radiance(s, view, lighting, shadow, lamp, above, top)
+        total = radiance(s, view, lighting, lamp, above)
         out_depth[i, j] = wp.where(s.segment == NOTHING or s.depth > far, far, s.depth)
         out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
     else:
@@ -397,7 +313,7 @@ def shade(
                     s = ground(lighting, view, row, column)
                 else:
                     s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-                total += radiance(s, view, lighting, shadow, lamp, above, top)
+                total += radiance(s, view, lighting, lamp, above)
         total = total / float(supersample * supersample)
     out_color[i, j] = wp.vec3ub(
         wp.uint8(wp.sqrt(wp.min(total[0], 1.0)) * 255.0 + 0.5),

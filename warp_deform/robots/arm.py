@@ -193,7 +193,7 @@ class Robot:
     def reach(self, z: float) -> tuple[float, float]:
         """Return the smallest and largest radius [m] from the base axis of a tip-down tip at z [m].
 
-        Every yaw is reachable between them, in all directions within 90 degrees of the x axis.
+        Every yaw is reachable between them, in all directions within 70 degrees of the x axis.
         (inf, 0.0), an empty range, at heights where the tip reaches nothing.
 
         Raises:

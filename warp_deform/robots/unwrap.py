@@ -49,10 +49,7 @@ def _least_motion(angles: list[float], reference: float, low: float, high: float
         below, above = angle + TURN * last, angle + TURN * first
         candidates = candidates or [below if low - below <= above - high else above]
         best = [
-            min(
-                (cost + abs(candidate - path[-1]), [*path, candidate])
-                for cost, path in best
-            )
+            min((cost + abs(candidate - path[-1]), [*path, candidate]) for cost, path in best)
             for candidate in candidates
         ]
     return min(best)[1][1:]

@@ -19,7 +19,7 @@ from .structures import structures
 if TYPE_CHECKING:
     from .solver import SolverFusedXPBD
 
-__all__ = ["replay_bundle", "write_bundle"]
+__all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
 _SETTINGS = ("dt", "max_steps", "alternate", "recovery", "max_speed", "calm_speed", "margin",
              "rest_speed", "rest_steps", "check_every", "record_every", "particle_stride",

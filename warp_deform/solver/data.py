@@ -298,10 +298,13 @@ class SolverData:
         rows = self.body_rows(world)
         com = self.topologies[self.world_topology[world]].body_com
         views = self.views
-        quat = views["bodies.q"][rows]
-        position = views["bodies.x"][rows] - _rotate(quat, com)
-        pose = np.column_stack([position, quat])
+        pose = self.frame_poses(views["bodies.x"][rows], views["bodies.q"][rows], com)
         return pose, np.column_stack([views["bodies.v"][rows], views["bodies.omega"][rows]])
+
+    @staticmethod
+    def frame_poses(x: np.ndarray, quat: np.ndarray, com: np.ndarray) -> np.ndarray:
+        """Poses (B, 7) of body frames from centres of mass x (B, 3), rotations and offsets (B, 3)."""
+        return np.column_stack([x - _rotate(quat, com), quat])
 
 
 def _field(name: str) -> str:

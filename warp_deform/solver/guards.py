@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..errors import WarpDeformError
 
-__all__ = ["GuardLimits", "PhysicsError", "Problem", "ProblemKind", "WatchValues"]
+__all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
 
 class ProblemKind(Enum):

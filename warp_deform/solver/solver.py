@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,54 +14,15 @@ from newton.solvers import SolverBase
 
 from ..errors import InputError
 from ..objects.attributes import NAMESPACE, register_attributes
+from .config import SolverConfig
 from .data import KERNEL_ARGUMENTS, SolverData
 from .forward import forward_kernel
-from .guards import GuardLimits, PhysicsError, WatchValues
+from .guards import PhysicsError, WatchValues
 
-__all__ = ["SolverConfig", "SolverFusedXPBD"]
+__all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
 _FOREVER = 1.0e7
 """More substeps than any launch has, exactly representable in float32."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolverConfig:
-    """Parameters that all worlds share; those of a single world are set with `set_world`."""
-
-    dt: float = 1 / 60 / 20
-    """Substep [s]."""
-    damping: float = 1.0
-    """Air damping [1/s]."""
-    table_friction: float = 0.5
-    """Coulomb coefficient of particles, and factor on that of boxes, against the table."""
-    contact_friction: float = 0.3
-    """Coulomb coefficient between particles, and factor on that of boxes, in contact."""
-    stiffness: float = 1.0
-    """Factor on the stiffness of all springs."""
-    alternate: bool = True
-    """Sweep the constraints backwards in every other substep: halves the stretch of a dragged cable.
-    Shells need a fixed order instead, or they jitter."""
-    recovery: float = 0.1
-    """Fastest separation of overlapping things [m/s]."""
-    max_speed: float = 3.0
-    """Speed clamp [m/s]; a particle that meets it is counted by the guards."""
-    calm_speed: float = 0.1
-    """Speed clamp while a world is calmed, after a release for example [m/s]."""
-    margin: float = 0.01
-    """Pairs this much farther apart than touching are listed [m]."""
-    rest_speed: float = 0.01
-    """Slower than this is at rest [m/s]."""
-    rest_seconds: float = 0.05
-    """At rest for so long ends a world's rollout [s]."""
-    limits: GuardLimits = field(default_factory=GuardLimits)
-
-    def __post_init__(self) -> None:
-        for name in ("dt", "max_speed", "calm_speed", "margin", "rest_speed", "stiffness"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"SolverConfig.{name} must be positive, got {getattr(self, name)}")
-        for name in ("damping", "table_friction", "contact_friction", "recovery", "rest_seconds"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"SolverConfig.{name} must not be negative, got {getattr(self, name)}")
 
 
 class SolverFusedXPBD(SolverBase):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from ..objects.box import Box, BoxConfig, add_box, l_block
+from ..solver.config import SolverConfig
 from .demonstrators import pick_place_pose, visible_point
 from .free_space import FreeSpace
 from .ground_truth import pose_rows, quaternion_yaw
@@ -42,6 +43,8 @@ class BlockNotarget(Task):
     success_score = 1.0
     ground_truth_size = 6
     objects = ("block",)
+    # friction multiplies: 0.3 of the block times 1.0 of the table, as in the original
+    solver = SolverConfig(table_friction=1.0, contact_friction=1.0)
 
     block: ClassVar[BoxConfig] = l_block()
     position_tolerance: ClassVar[float] = 0.01  # [m]

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from ..objects.cable import Cable, RingConfig, add_cable, cable_ring
+from ..objects.push import Push
+from ..objects.push import Push
 from ..objects.zone import ring_zone
 from ..rendering.pixels import BOUNDS
 from .demonstrators import farthest_bead, pick_place, ring_maps
@@ -18,7 +20,7 @@ from .free_space import FreeSpace
 from .ground_truth import pose_rows
 from .metrics import hull_area
 from .shapes import chain_yaw
-from .task import Action, Layout, Push, Snapshot, Stage, Task
+from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:
     import newton

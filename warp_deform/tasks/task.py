@@ -15,16 +15,19 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from .. import registration
+from ..robots.primitive import PrimitiveConfig
+from ..solver.config import SolverConfig
 
 if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     import newton
 
     from ..objects.box import Box
     from ..objects.cable import Cable
+    from ..objects.push import Push
     from ..objects.zone import Zone
     from .free_space import FreeSpace
 
-__all__ = ["Action", "Images", "Layout", "Push", "Snapshot", "Stage", "Task"]
+__all__ = ["Action", "Images", "Layout", "Snapshot", "Stage", "Task"]
 
 Action = np.ndarray
 """(7,) float64: pick x, y [m], yaw [rad], place x, y [m], yaw [rad], lift [m]."""
@@ -36,18 +39,6 @@ class Stage:
 
     lift: float
     speed: float
-
-
-@dataclass(frozen=True, eq=False)
-class Push:
-    """A bounded perturbation: one particle is accelerated for a while.
-
-    acceleration (3,) [m/s^2] comes on top of gravity.
-    """
-
-    particle: int
-    acceleration: np.ndarray
-    seconds: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +114,14 @@ class Task(abc.ABC):
     ground_truth_size: ClassVar[int]
     objects: ClassVar[tuple[str, ...]] = ()
     """Names of what is simulated, for listings."""
+    solver: ClassVar[SolverConfig] = SolverConfig()
+    """Parameters of the physics."""
+    primitive: ClassVar[PrimitiveConfig] = PrimitiveConfig()
+    """Speeds and heights of the robot's motion."""
+
+    def speed(self, lift: float) -> float:
+        """Speed [m/s] of the loaded tip at a lift [m]: that of the stage with the nearest lift."""
+        return min(self.stages, key=lambda stage: abs(stage.lift - lift)).speed
 
     @classmethod
     def env_id(cls) -> str:

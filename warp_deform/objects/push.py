@@ -1,0 +1,19 @@
+"""Pushes: bounded perturbations that bring an object out of order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Push:
+    """One particle is accelerated for a while.
+
+    acceleration (3,) [m/s^2] comes on top of gravity.
+    """
+
+    particle: int
+    acceleration: np.ndarray
+    seconds: float

@@ -1,0 +1,184 @@
+"""Grip paths in, trajectories out: one launch runs whole actions of many worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from .objects.push import Push
+    from .solver.guards import WatchValues
+    from .solver.solver import SolverFusedXPBD
+
+__all__ = ["GripPath", "Frames", "Rollout", "rollout"]
+
+_IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class GripPath:
+    """A tip that holds one particle or body and lets it go at the end of its path.
+
+    times (K,) [s] ascending from 0; positions (K, 3) [m] and rotations (K, 4) quat_xyzw of the tip
+    particle or body: local number of what is held
+    offset (3,) [m], turn (4,): pose of what is held in the tip's frame (a body: of its centre of mass)
+    lower: between these two times contact ends the descent, and the rest of the path stays there
+    """
+
+    times: np.ndarray
+    positions: np.ndarray
+    particle: int | None = None
+    body: int | None = None
+    rotations: np.ndarray | None = None
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    turn: np.ndarray = field(default_factory=lambda: _IDENTITY)
+    lower: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.particle is None) == (self.body is None):
+            raise InputError("a grip path holds either a particle or a body")
+        times = np.asarray(self.times, dtype=float)
+        if len(times) < 2 or times[0] != 0 or (np.diff(times) < 0).any():
+            raise InputError("the times of a grip path must start at 0 and ascend, at least two")
+        if np.shape(self.positions) != (len(times), 3) or not np.isfinite(self.positions).all():
+            raise InputError(f"a path of {len(times)} knots needs finite positions ({len(times)}, 3)")
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Recorded states of one world: times (F,) [s], particle_q (F, P, 3), body_q (F, B, 7)."""
+
+    times: np.ndarray
+    particle_q: np.ndarray
+    body_q: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """What one launch did to one world."""
+
+    seconds: float
+    """Simulated time [s]."""
+    watch: WatchValues
+    frames: Frames | None
+
+
+def rollout(
+    solver: SolverFusedXPBD,
+    worlds: Sequence[int],
+    *,
+    paths: Mapping[int, GripPath] | None = None,
+    pushes: Mapping[int, Push] | None = None,
+    least: float | Mapping[int, float] = 0.0,
+    most: float | Mapping[int, float] = 10.0,
+    calm: float | Mapping[int, float] = 0.0,
+    calm_after: float = 0.0,
+    record: float = 0.0,
+) -> dict[int, Rollout]:
+    """Run `worlds` until each has followed its path and come to rest; others keep their state.
+
+    least: a world runs at least so long after its path [s]; most: and at most so long in all [s]
+    calm: speeds are clamped to `calm_speed` for so long from the start, `calm_after`: after a release
+    record: interval of recorded frames [s]; 0 records nothing
+
+    A world's result does not depend on which other worlds run with it.
+    """
+    data, dt = solver.data, solver.config.dt
+    paths = paths or {}
+    data.clear_grips()
+    _write_paths(solver, paths)
+    for w, push in (pushes or {}).items():
+        slot = data.slot[w]
+        data.views["grips.push"][slot] = push.particle
+        data.views["grips.push_acceleration"][slot] = push.acceleration
+        data.views["grips.push_steps"][slot] = round(push.seconds / dt)
+    solver.activate(np.asarray(worlds, dtype=int))
+    longest = 1
+    for w in worlds:
+        limit = round(_of(most, w) / dt)
+        longest = max(longest, limit)
+        data.per_world("group.least_steps", w)[:] = round(_of(least, w) / dt)
+        data.per_world("group.most_steps", w)[:] = limit
+        data.per_world("group.calm_steps", w)[:] = round(_of(calm, w) / dt)
+        data.per_world("group.calm_after", w)[:] = round(calm_after / dt)
+    every = max(1, round(record / dt)) if record else 0
+    watch = solver.run(longest, record_every=every)
+    return {
+        w: Rollout(watch[w].steps * dt, watch[w], _frames(solver, w, watch[w].steps, every))
+        for w in worlds
+    }
+
+
+def _of(value: float | Mapping[int, float], world: int) -> float:
+    return float(value[world]) if isinstance(value, Mapping) else float(value)
+
+
+def _write_paths(solver: SolverFusedXPBD, paths: Mapping[int, GripPath]) -> None:
+    data = solver.data
+    knots = sum(len(path.times) for path in paths.values())
+    if knots > data.knot_room:
+        data.reserve_knots(2 * knots)
+        solver.forget_launch()
+    views, k = data.views, 0
+    for w, path in paths.items():
+        slot, n = data.slot[w], len(path.times)
+        count = data.topologies[data.world_topology[w]]
+        limit = count.particle_count if path.particle is not None else count.body_count
+        held = path.particle if path.particle is not None else path.body
+        if held is None or not 0 <= held < limit:
+            raise InputError(f"world {w} has no particle or body number {held} to grip")
+        views["grips.particle"][slot] = -1 if path.particle is None else path.particle
+        views["grips.body"][slot] = -1 if path.body is None else path.body
+        views["grips.offset"][slot] = path.offset
+        views["grips.turn"][slot] = path.turn
+        views["grips.tick"][slot] = 0
+        views["grips.shift"][slot] = 0.0
+        views["grips.knot"][slot] = k
+        views["grips.knot_start"][slot] = k
+        views["grips.knot_end"][slot] = k + n
+        lower = path.lower or (0.0, 0.0)
+        views["grips.lower_start"][slot], views["grips.lower_end"][slot] = lower
+        views["grips.time"][k : k + n] = path.times
+        views["grips.position"][k : k + n] = path.positions
+        rotations = _IDENTITY if path.rotations is None else _same_side(path.rotations)
+        views["grips.rotation"][k : k + n] = rotations
+        k += n
+
+
+def _same_side(rotations: np.ndarray) -> np.ndarray:
+    """Flip quaternions so that neighbours interpolate the short way round."""
+    out = np.array(rotations, dtype=float)
+    for i in range(1, len(out)):
+        if out[i] @ out[i - 1] < 0:
+            out[i] = -out[i]
+    return out
+
+
+def _frames(solver: SolverFusedXPBD, world: int, steps: int, every: int) -> Frames | None:
+    if not every:
+        return None
+    data = solver.data
+    count = -(-steps // every)
+    group, lane = divmod(int(data.slot[world]), data.lanes)
+    first, last = data.group_particle[group], data.group_particle[group + 1]
+    total = int(data.group_particle[-1])
+    if last > first:
+        particles = data.views["watch.frame_x"][: count * total].reshape(count, total, 3, -1)
+        particle_q = particles[:, first:last, :, lane].astype(np.float32)
+    else:
+        particle_q = np.zeros((count, 0, 3), np.float32)
+    rows = data.body_rows(world)
+    stride = int(data.group_body[-1])
+    body_q = np.zeros((count, rows.stop - rows.start, 7), np.float32)
+    if rows.stop > rows.start:
+        x = data.views["watch.frame_body_x"][: count * stride].reshape(count, stride, 3)[:, rows]
+        q = data.views["watch.frame_body_q"][: count * stride].reshape(count, stride, 4)[:, rows]
+        com = data.topologies[data.world_topology[world]].body_com
+        for f in range(count):
+            body_q[f] = data.frame_poses(x[f], q[f], com)
+    return Frames(np.arange(count) * every * solver.config.dt, particle_q, body_q)
