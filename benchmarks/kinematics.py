@@ -15,6 +15,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -35,7 +36,7 @@ MARGIN = 0.002  # [m]
 class Options:
     """What to measure."""
 
-    robot: str = "all"  # ur5, panda or all
+    robot: Literal["all", "ur5", "panda"] = "all"
     json: bool = False  # one JSON object on stdout
     reach_table: bool = False  # print the reach tables instead
 
@@ -65,7 +66,11 @@ def main(options: Options) -> None:
                 f"{name:7}{size:8}{cell['ms_per_pose']:10.3f}{cell['peer_ms_per_pose']:10.3f}"
                 f"{cell['ratio']:8.1f}{cell['success']:9.1%}{cell['peer_success']:9.1%}"
             )
-        print(f"{name:7}table area in reach:", row["table_share"])
+        shares = ", ".join(f"{share:.1%} at {z} m" for z, share in row["table_share"].items())
+        print(
+            f"{name:7}trajectories {row['trajectory_ms_per_pose']:.3f} ms/pose; "
+            f"table in reach: {shares}"
+        )
 
 
 def measure(arm: Robot) -> dict:

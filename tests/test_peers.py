@@ -14,6 +14,7 @@ from warp_deform.peers import (
     newton_settings,
     peer_scene,
     time_newton,
+    time_peer,
     time_pybullet,
 )
 from warp_deform.peers.newton_peer import NewtonWorld
@@ -80,6 +81,7 @@ def test_measured_time_is_cpu_time_per_simulated_second():
     assert timing.rest_ms_per_sim_second_p50 == pytest.approx(60, rel=0.2)
     # 6 frames of fall, then to 2 s, then 6 frames of rest: 126 frames at 1 % each
     assert timing.stretch_max == pytest.approx(2.26, rel=5e-3)
+    assert timing.report()["peer_ms_per_sim_second"] == timing.ms_per_sim_second_p50
     assert timing.bodies == 24 and timing.repeats == 1 and timing.seconds == pytest.approx(0.1)
 
 
@@ -99,6 +101,8 @@ def test_unknown_names_are_refused():
         peer_scene("rope")
     with pytest.raises(InputError, match="vbd, vbd-bodies, xpbd"):
         time_newton("cable", "mujoco")
+    with pytest.raises(InputError, match="pybullet, newton-vbd"):
+        time_peer("mujoco", "cable")
     with pytest.raises(InputError, match="even"):
         NewtonSettings(solver="xpbd", beads="bodies", substeps=3, iterations=2)
     with pytest.raises(InputError, match="iterations"):
@@ -175,7 +179,7 @@ def test_the_block_lands_flat_in_every_engine():
 def test_a_timing_reports_its_settings_and_what_it_leaves_out():
     bullet = time_pybullet("block", seconds=0.1, repeats=1)
     assert (bullet.engine, bullet.hz, bullet.iterations, bullet.bodies) == ("pybullet", 240, 50, 1)
-    vbd = time_newton("cable", "vbd", seconds=0.1, repeats=1)
+    vbd = time_peer("newton-vbd", "cable", seconds=0.1, repeats=1)
     assert vbd.engine == "newton-vbd" and vbd.hz == 60 * newton_settings("vbd", "cable").substeps
     assert "pass through" in vbd.note and vbd.bodies == 24 and vbd.stretch_max < 1.1
     for timing in (bullet, vbd):

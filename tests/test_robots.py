@@ -16,7 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from warp_deform.errors import InputError
 from warp_deform.robots import Robot, robot
+from warp_deform.robots.description import ArmConfig
+from warp_deform.robots.panda import PANDA
 from warp_deform.robots.unwrap import unwrap
+from warp_deform.robots.ur5 import UR5
 
 NAMES = ("ur5", "panda")
 BITS = ("q", "reached", "position_error", "rotation_error")
@@ -105,6 +108,15 @@ def test_top_down_matrices(arm: Robot) -> None:
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
     np.testing.assert_allclose(pose[:3, 0], [np.cos(0.3), np.sin(0.3), 0.0])
     np.testing.assert_allclose(pose[:, 3], [0.5, -0.1, 0.2, 1.0])
+
+
+@pytest.mark.parametrize("config", [UR5, PANDA], ids=NAMES)
+def test_closed_form_postures_are_exact(config: ArmConfig) -> None:
+    # So that the iteration has nothing to do, and the lengths in the module are those of the URDF.
+    arm = robot(config.name)
+    poses = poses_in_reach(arm, 200, seed=11)
+    position, rotation = pose_errors(arm.forward(config.posture(poses)), arm.top_down(poses))
+    assert position.max() < 1e-6 and rotation.max() < 1e-6
 
 
 def test_top_down_poses_are_met(arm: Robot) -> None:

@@ -24,6 +24,8 @@ _HOME = {
     "EpisodeWriter": "episodes",
     "InputError": "errors",
     "PickPlaceEnv": "env",
+    "PickPlaceVectorEnv": "vector_env",
+    "PrivilegedStage": "wrappers",
     "TASKS": "tasks.registry",
     "WarpDeformError": "errors",
 }

@@ -25,5 +25,8 @@ def register_environments() -> None:
     for task in TASKS:
         if env_id(task) not in registry:
             register(
-                env_id(task), entry_point="warp_deform.env:PickPlaceEnv", kwargs={"task": task}
+                env_id(task),
+                entry_point="warp_deform.env:PickPlaceEnv",
+                vector_entry_point="warp_deform.vector_env:PickPlaceVectorEnv",
+                kwargs={"task": task},
             )

@@ -156,9 +156,10 @@ def add_cable(builder: newton.ModelBuilder, config: CableConfig, positions: np.n
         if ratio == 0:
             continue
         starts = range(config.beads if config.closed else config.beads - step)
-        # even links first, then odd ones: within a colour no two share a bead, so the processor
-        # can work on several at once
-        for i in (k for parity in (0, 1) for k in starts if (k // step) % 2 == parity):
+        # in order along the chain: a sweep then carries a pull from end to end, and a dragged cable
+        # stretches by 1 to 4 %; even links first, then odd ones, would be a third faster in a lone
+        # world, but stretches by up to 50 %
+        for i in starts:
             j = (i + step) % config.beads
             builder.add_spring(
                 first_particle + i,

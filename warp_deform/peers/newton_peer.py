@@ -1,6 +1,6 @@
 """The scenes in Newton's own solvers on the CPU, each at the cheapest settings that do the job.
 
-"Do the job" means that the median over starts of a cable's largest stretch stays near 2 %. Every
+"Do the job" means that the median over starts of the largest stretch is 1 to 3 %. Every
 frame is recorded once as a CPU graph and replayed, which is several times cheaper than launching
 its kernels one by one.
 """

@@ -62,6 +62,20 @@ class PeerTiming:
     note: str
     """What this engine leaves out, in words."""
 
+    def report(self) -> dict[str, float | int | str]:
+        """The keys of a benchmark report that concern a peer."""
+        return {
+            "peer": self.engine,
+            "peer_ms_per_sim_second": self.ms_per_sim_second_p50,
+            "peer_ms_per_sim_second_p95": self.ms_per_sim_second_p95,
+            "peer_rest_ms_per_sim_second": self.rest_ms_per_sim_second_p50,
+            "peer_rest_ms_per_sim_second_p95": self.rest_ms_per_sim_second_p95,
+            "peer_hz": self.hz,
+            "peer_iterations": self.iterations,
+            "peer_stretch": self.stretch_max,
+            "peer_note": self.note,
+        }
+
 
 def measure(
     make_world: Callable[[PeerScene], PeerWorld],

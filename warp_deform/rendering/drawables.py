@@ -28,7 +28,8 @@ class Drawables:
     sphere_particle (S,) int32: which particle is a sphere's centre
     sphere_radius (S,) float32 [m]; sphere_segment (S,) int32
     box_body (B,) int32: which body a box moves with; box_pose (B, 7) float32: centre [m] and
-        quat_xyzw of the box in the body's frame; box_half (B, 3) float32 [m]; box_segment (B,) int32
+        quat_xyzw of the box in the body's frame; box_half (B, 3) float32 [m];
+        box_segment (B,) int32
     quad_corners (Q, 4, 3) float32 [m], fixed in the world; quad_segment (Q,) int32
     triangle_particle (T, 3) int32: corners of two-sided sheets; triangle_segment (T,) int32
     link_particle (L, 2) int32: beads that scenes (not the top-down pictures) join by a thin rod;
@@ -56,7 +57,7 @@ class Drawables:
 
     @classmethod
     def of(cls, objects: Sequence[Cable | Box | Zone]) -> Drawables:
-        """Drawables of `objects` in creation order: every bead, body and zone gets an id of its own."""
+        """Drawables of `objects` in creation order; every bead, body and zone gets an id."""
         spheres: list[tuple[int, float, int]] = []
         links: list[tuple[int, int, float, int]] = []
         boxes: list[tuple[int, tuple[float, ...], tuple[float, ...], int]] = []

@@ -86,11 +86,12 @@ def _splat(camera: Camera, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _points(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """World points (H * W, 3) float32 [m] of a depth picture (H, W) [m], rounded as in the original."""
+    """World points (H * W, 3) float32 [m] of depths (H, W) [m], rounded as in the original."""
     K, pose = camera.intrinsics, camera.world_T_camera
     row, column = np.indices(depth.shape, dtype=float)
     points = np.stack(
-        [(column - K[0, 2]) * (depth / K[0, 0]), (row - K[1, 2]) * (depth / K[1, 1]), depth], axis=-1
+        [(column - K[0, 2]) * (depth / K[0, 0]), (row - K[1, 2]) * (depth / K[1, 1]), depth],
+        axis=-1,
     ).astype(np.float32)
     x, y, z = points.reshape(-1, 3).T.astype(float)
     world = [pose[i, 0] * x + pose[i, 1] * y + pose[i, 2] * z + pose[i, 3] for i in range(3)]

@@ -96,7 +96,7 @@ def corner_normals(
     triangle_mesh: wp.array(dtype=int),
     normals: wp.array2d(dtype=wp.vec3),
 ):
-    """Write shading normals: smooth over a sheet, flat on boxes and marks, the mesh's own on meshes."""
+    """Write shading normals: smooth on sheets, flat on boxes and marks, a mesh's own."""
     f, k = wp.tid()
     tri = triangles[f]
     if f >= mesh_triangle:
@@ -258,8 +258,8 @@ class Geometry:
         particle_q, body_q = np.asarray(particle_q), np.asarray(body_q)
         if particle_q.shape != self._particles.shape or body_q.shape != (self.body_count, 7):
             raise InputError(
-                f"expected particle_q ({self.particle_count}, 3) and body_q ({self.body_count}, 7), "
-                f"got {particle_q.shape} and {body_q.shape}"
+                f"expected particle_q ({self.particle_count}, 3) and body_q "
+                f"({self.body_count}, 7), got {particle_q.shape} and {body_q.shape}"
             )
         if not (np.isfinite(particle_q).all() and np.isfinite(body_q).all()):
             raise InputError("a state that is not finite cannot be drawn")

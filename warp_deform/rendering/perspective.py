@@ -33,7 +33,7 @@ ABOVE_REACH = 0.7  # [m]
 class RGBD:
     """What one camera sees.
 
-    color (H, W, 3) uint8; depth (H, W) float32 [m] along the viewing axis, 10 where nothing is near;
+    color (H, W, 3) uint8; depth (H, W) float32 [m] along the viewing axis, at most 10;
     segmentation (H, W) uint8: 0 floor or nothing, 1 table, 2 robot, objects and zones from 4
     """
 

@@ -24,7 +24,7 @@ NEAR = wp.constant(0.01)  # [m], as the original's cameras
 
 @wp.struct
 class View:
-    """A camera as kernels need it: axes in the world, origin [m], intrinsics and size in samples."""
+    """A camera as kernels need it: axes in the world, origin [m], the rest in samples."""
 
     right: wp.vec3
     down: wp.vec3
@@ -130,7 +130,7 @@ def raster_triangles(scene: Scene, view: View, buffer: wp.array2d(dtype=wp.int64
         r1 = last_sample(wp.max(ay, wp.max(by, cy)) * view.fy + view.cy, view.rows)
     if c0 > c1 or r0 > r1:
         return
-    # edge functions; a shared edge gets the same numbers with the other sign, so there are no cracks
+    # edge functions; a shared edge gets the same numbers, negated, so there are no cracks
     ea = wp.cross(b, c)
     eb = wp.cross(c, a)
     ec = wp.cross(a, b)

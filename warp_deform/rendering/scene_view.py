@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from ..objects.colors import TABLE
+from ..objects.colors import BLUE, TABLE, Color
 from .camera import Camera, look_at
 from .drawables import Drawables
 from .geometry import box_mesh
@@ -14,10 +15,11 @@ from .perspective import Perspective, RobotLink
 from .pixels import BOUNDS
 from .shading import Look
 
-__all__ = ["STUDIO", "SceneView", "scene_camera"]
+__all__ = ["STUDIO", "ArmMeshes", "SceneView", "scene_camera"]
 
 FLOOR = -0.03
 """Height of the floor in scenes [m]: the table is a slab this thick."""
+LINK_COLORS: tuple[Color, Color] = ((96, 100, 106), (200, 202, 206))
 STUDIO = Look(
     floor=FLOOR,
     floor_color=(214, 211, 206),
@@ -34,7 +36,35 @@ STUDIO = Look(
 
 def scene_camera(size: tuple[int, int] = (720, 1280)) -> Camera:
     """A view over the whole table towards the arm, for pictures of `size` rows and columns."""
-    return look_at((1.35, -0.75, 0.8), (0.42, -0.02, 0.1), size=size, vertical_fov=0.72)
+    return look_at((1.5, -0.8, 1.0), (0.4, -0.03, 0.17), size=size, vertical_fov=0.73)
+
+
+class ArmMeshes:
+    """An arm's meshes, ready for `SceneView`: one colour a link, dark and light in turn.
+
+    meshes: (link, link_T_mesh (4, 4), trimesh.Trimesh) of everything that is drawn, as from the
+    `meshes` method of an arm; the link named "tip" is blue.
+    """
+
+    def __init__(self, meshes: Sequence[tuple[str, np.ndarray, Any]]) -> None:
+        names = list(dict.fromkeys(link for link, _, _ in meshes))
+        self._parts = [
+            (
+                link,
+                link_T_mesh,
+                np.array(mesh.vertices, np.float32),
+                np.array(mesh.faces, np.int32),
+                BLUE if link == "tip" else LINK_COLORS[names.index(link) % 2],
+            )
+            for link, link_T_mesh, mesh in meshes
+        ]
+
+    def at(self, link_poses: Mapping[str, np.ndarray]) -> list[RobotLink]:
+        """The links where world_T_link (4, 4) or (1, 4, 4) of each name puts them."""
+        return [
+            (vertices, faces, np.reshape(link_poses[link], (4, 4)) @ link_T_mesh, color)
+            for link, link_T_mesh, vertices, faces, color in self._parts
+        ]
 
 
 class SceneView:

@@ -1,7 +1,7 @@
 """What a sample's surface looks like: materials, floor, a lamp with soft shadows, ambient light.
 
 Light adds up in linear colour, taken as the square of the stored one, so the shader needs no
-transcendental function. A level surface in full light at the table's centre has its palette's colour.
+transcendental function. A level surface in full light in the table's middle has its own colour.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .occlusion import Occluders, lit_share, open_share
 from .pinhole import View, inverse_depth, primitive_of, ray, to_camera
 from .pixels import BOUNDS
 
-__all__ = ["FLOOR_SEGMENT", "ROBOT_SEGMENT", "Look", "Lighting", "lighting_of", "shade"]
+__all__ = ["FLOOR_SEGMENT", "ROBOT_SEGMENT", "Lighting", "Look", "lighting_of", "shade"]
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -97,7 +97,8 @@ def lighting_of(look: Look) -> Lighting:
     """The kernel's form of `look`."""
     lighting = Lighting()
     lighting.floor, lighting.table = look.floor, int(look.table)
-    lighting.floor_color, lighting.floor_checker = linear(look.floor_color), linear(look.floor_checker)
+    lighting.floor_color = linear(look.floor_color)
+    lighting.floor_checker = linear(look.floor_checker)
     lighting.horizon, lighting.haze = linear(look.horizon), look.haze
     lighting.lamp = wp.vec3(*look.lamp)
     x, y, z = look.lamp

@@ -30,7 +30,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 ROWS = wp.constant(2 * SHAPE[0] + 1)
 COLUMNS = wp.constant(2 * SHAPE[1] + 1)
 DENSITY = wp.constant(2.0 / PIXEL_SIZE)  # samples per metre
-# the table's corner in units of samples; sample (row, column) is at (column - X0, row - Y0) / DENSITY
+# sample (row, column) is at x = (column - X0) / DENSITY, y = (row - Y0) / DENSITY
 X0 = wp.constant(1.0 - 2.0 * BOUNDS[0][0] / PIXEL_SIZE)
 Y0 = wp.constant(1.0 - 2.0 * BOUNDS[1][0] / PIXEL_SIZE)
 TABLE_ID = wp.constant(WORKSPACE_SEGMENT)

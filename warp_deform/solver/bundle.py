@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import zipfile
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
+_HEADER = {"digest", "lanes", "precision", "bodies", "groups", "settings"}
 _SETTINGS = ("dt", "max_steps", "alternate", "recovery", "max_speed", "calm_speed", "margin",
              "rest_speed", "rest_steps", "check_every", "record_every", "particle_stride",
              "body_stride")  # fmt: skip
@@ -29,35 +32,58 @@ _SETTINGS = ("dt", "max_steps", "alternate", "recovery", "max_speed", "calm_spee
 def write_bundle(folder: Path, solver: SolverFusedXPBD) -> Path:
     """Write all inputs of the solver's last launch to an .npz file named after their hash."""
     folder.mkdir(parents=True, exist_ok=True)
-    arrays = solver._bundle or {}
-    settings, _, _ = solver._last
+    arrays, settings = solver._bundle or {}, solver._last
+    digest = _digest(arrays)
     header = {
+        "digest": digest,
         "lanes": solver.data.lanes,
         "precision": np.dtype(solver.data.number).name,
         "bodies": bool(solver.data.has_bodies),
         "groups": solver.data.group_count,
         "settings": {name: getattr(settings, name) for name in _SETTINGS},
     }
-    digest = hashlib.blake2b(digest_size=8)
-    for name in sorted(arrays):
-        digest.update(arrays[name].tobytes())
-    path = folder / f"launch_{digest.hexdigest()}.npz"
+    path = folder / f"launch_{digest}.npz"
     np.savez(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
     return path
+
+
+def _digest(arrays: dict[str, np.ndarray]) -> str:
+    """Hash of the arrays' names, shapes, types and bytes."""
+    digest = hashlib.blake2b(digest_size=8)
+    for name in sorted(arrays):
+        values = arrays[name]
+        digest.update(f"{name} {values.shape} {values.dtype.str}".encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a bundle.
+
+    Raises:
+        InputError: the file is not a bundle, or not the one that was written: the kernel trusts the
+            numbers in it, so nothing else may reach it.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+            values = {n: np.load(BytesIO(archive.read(f"{n}.npy")), allow_pickle=False) for n in names}
+        header = json.loads(values.pop("header").tobytes())
+        known = set(header) == _HEADER and set(header["settings"]) == set(_SETTINGS)
+    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} is not a bundle of a launch: {error}") from error
+    if not known or header["digest"] != _digest(values):
+        raise InputError(f"{path} is not a bundle of this version, or it was changed")
+    return header, values
 
 
 def replay_bundle(path: str | Path) -> dict[str, np.ndarray]:
     """Run the launch of a bundle again on the CPU; returns all arrays after it, by name.
 
     Raises:
-        InputError: the file is not a bundle.
+        InputError: the file is not a bundle, or was changed since it was written.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(file["header"].tobytes())
-            arrays = {name: file[name] for name in file.files if name != "header"}
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path} is not a bundle of a launch: {error}") from error
+    header, arrays = _read(Path(path))
     scalar = {"float32": wp.float32, "float64": wp.float64}[header["precision"]]
     types = structures(scalar, header["lanes"])
     settings = types.Settings()

@@ -203,9 +203,8 @@ class SolverData:
         ):  # fmt: skip
             self._add(f"grips.{name}", slots, dtype, shape, number)
         self.reserve_knots(slots * 16)
-        for name in ("steps", "nonfinite", "stretch", "depth", "clamped"):
+        for name in ("steps", "nonfinite", "stretch", "depth", "clamped", "overflow"):
             self._add(f"watch.{name}", self.group_count, t.V, (self.lanes,), number)
-        self._add("watch.overflow", self.group_count, wp.int32, (), np.int32)
         self.reserve_frames(0)
 
     def reserve_knots(self, count: int) -> None:

@@ -106,8 +106,9 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
 
     @wp.func
     def watch_group(
-        g: int, p0: int, n: int, s0: int, s1: int, springs: Springs, q: Particles, watch: Watch
-    ):
+        g: int, p0: int, n: int, s0: int, s1: int, b0: int, body_count: int, springs: Springs,
+        q: Particles, bodies: Bodies, watch: Watch,
+    ):  # fmt: skip
         """Worst values of the guards, once every `check_every` substeps."""
         zero = V(S(0.0))
         bad = watch.nonfinite[g]
@@ -116,6 +117,12 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
             x = q.x[i]
             bad = wp.max(bad, nonfinite(x.x + x.y + x.z))
             lowest = wp.min(lowest, x.z)
+        if wp.static(with_bodies):
+            for lane in range(wp.static(L)):
+                for b in range(b0 + lane * body_count, b0 + (lane + 1) * body_count):
+                    sum = bodies.x[b] + bodies.omega[b]
+                    if not wp.isfinite(sum[0] + sum[1] + sum[2]):
+                        bad[lane] = S(1.0)
         watch.nonfinite[g] = bad
         watch.depth[g] = wp.max(watch.depth[g], wp.max(zero - lowest, zero))
         stretch = watch.stretch[g]
@@ -224,14 +231,9 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
             # pairs that may touch soon
             if any_less(zero - stale, S(0.0)):
                 near_count = list_near(
-                    p0, near_start, group.near_capacity[g], top.pair_start[k],
-                    top.pair_start[k + 1], st.margin, stale, q, pairs, near, n,
+                    g, p0, near_start, group.near_capacity[g], top.pair_start[k],
+                    top.pair_start[k + 1], st.margin, stale, on, q, pairs, near, watch, n,
                 )  # fmt: skip
-                if near_count > group.near_capacity[g]:
-                    watch.overflow[g] = wp.max(
-                        watch.overflow[g], near_count - group.near_capacity[g]
-                    )
-                    near_count = group.near_capacity[g]
                 travel = select(stale, zero, travel)
             # constraints
             if st.alternate == 1 and substep % 2 == 1:
@@ -280,9 +282,9 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
             done = wp.max(rested * (one - holding), less(most, steps + V(S(0.5))))
             substep += 1
             if substep % st.check_every == 0:
-                watch_group(g, p0, n, s0, s1, springs, q, watch)
+                watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
             on = on * (one - done)
-        watch_group(g, p0, n, s0, s1, springs, q, watch)
+        watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
         watch.steps[g] = steps
         watch.clamped[g] = clamped
         # a world cut off while it held something lets go: nothing is held between launches

@@ -18,6 +18,8 @@ from typing import Any
 
 import warp as wp
 
+from ..errors import InputError
+
 __all__ = ["KERNEL_OPTIONS", "LANES", "PRECISIONS", "add", "any_less", "cross", "div", "dot",
            "largest", "length", "less", "lane_types", "mul", "nonfinite", "root", "select",
            "sub"]  # fmt: skip
@@ -154,8 +156,8 @@ def lane_types(scalar: Any, lanes: int) -> SimpleNamespace:
     """Types for a precision and a width: S, L, V, V3, R3 (vec3), Q (quaternion), M33.
 
     Raises:
-        ValueError: the precision or the number of lanes is not one that is built.
+        InputError: the precision or the number of lanes is not one that is built.
     """
     if (scalar, lanes) not in _TYPES:
-        raise ValueError(f"lanes must be one of {LANES} and the scalar float32 or float64")
+        raise InputError(f"lanes must be one of {LANES} and the scalar float32 or float64")
     return _TYPES[scalar, lanes]

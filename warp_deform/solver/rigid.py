@@ -17,7 +17,8 @@ __all__ = ["rigid"]
 
 SLEEP_SPEED = 0.004
 """A supported body slower than this [m/s] stays where it is: without it, the order in which the
-corners are solved lets a resting box creep."""
+corners are solved lets a resting box creep. It keeps its velocity, so that a force which friction
+does not hold still accelerates it, and it moves off once it is faster."""
 SLEEP_TURN = 0.05
 """The same for its angular speed [rad/s]."""
 
@@ -63,6 +64,11 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
         return now - (bodies.xp[b] + wp.quat_rotate(bodies.qp[b], local))
 
     @wp.func
+    def spin_down(b: int, omega: R3, bodies: Bodies):
+        """Minus the angular acceleration of free rotation, in the body's frame [rad/s^2]."""
+        return bodies.inverse_inertia[b] * wp.cross(omega, bodies.inertia[b] * omega)
+
+    @wp.func
     def predict_body(b: int, dt: S, kept: S, gravity: R3, bodies: Bodies):
         x = bodies.x[b]
         q = bodies.q[b]
@@ -71,8 +77,9 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
         if bodies.w[b] > S(0.0):
             bodies.x[b] = x + (bodies.v[b] + gravity * dt) * (dt * kept)
             omega = wp.quat_rotate_inv(q, bodies.omega[b])
-            torque = wp.cross(omega, bodies.inertia[b] * omega)
-            omega = omega - bodies.inverse_inertia[b] * torque * dt
+            # Euler's equations by the midpoint rule: one Euler step would feed energy in
+            half = omega - spin_down(b, omega, bodies) * (S(0.5) * dt)
+            omega = omega - spin_down(b, half, bodies) * dt
             bodies.q[b] = turned(q, wp.quat_rotate(q, omega) * (dt * kept))
 
     @wp.func
@@ -80,16 +87,13 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
         """Velocities from the substep; returns the squared step of the centre of mass [m^2], with
         the turning counted at 2 cm from it."""
         d = bodies.x[b] - bodies.xp[b]
+        # the inverse of `turned`, which turns by twice the arc tangent of half the vector's length
         turn = bodies.q[b] * wp.quat_inverse(bodies.qp[b])
-        rotation = R3(turn[0], turn[1], turn[2]) * S(2.0)
-        if turn[3] < S(0.0):
-            rotation = -rotation
+        rotation = R3(turn[0], turn[1], turn[2]) * (S(2.0) / turn[3])
         if bodies.w[b] > S(0.0) and supported:
             if wp.length(d) < S(SLEEP_SPEED) * dt and wp.length(rotation) < S(SLEEP_TURN) * dt:
                 bodies.x[b] = bodies.xp[b]
                 bodies.q[b] = bodies.qp[b]
-                d = R3()
-                rotation = R3()
         # a calmed body is slowed as a whole
         limit = fastest / wp.max(wp.length(d), fastest)
         bodies.v[b] = d * (limit / dt)

@@ -56,12 +56,14 @@ class SolverFusedXPBD(SolverBase):
         *,
         lanes: int | None = None,
         precision: str = "float32",
+        pairs_per_particle: int = 48,
         bundles: Path | None = None,
     ) -> None:
         """Pack `model`.
 
         lanes: worlds a thread; None takes 8 for many worlds on the CPU and 1 otherwise.
         precision: "float32" or "float64".
+        pairs_per_particle: room in the contact list; a guard fires when it does not suffice.
         bundles: folder that gets a reproducing file whenever a guard fires.
         """
         super().__init__(model)
@@ -71,7 +73,9 @@ class SolverFusedXPBD(SolverBase):
             raise InputError(f"precision must be float32 or float64, not {precision!r}")
         if lanes is None:
             lanes = 8 if model.world_count > 1 and model.device.is_cpu else 1
-        self.data = SolverData(model, scalar=scalars[precision], lanes=lanes)
+        self.data = SolverData(
+            model, scalar=scalars[precision], lanes=lanes, pairs_per_particle=pairs_per_particle
+        )
         self.bundles = bundles
         self._kernel = forward_kernel(scalars[precision], lanes, bool(self.data.has_bodies))
         self._launch: Any = None
@@ -165,12 +169,12 @@ class SolverFusedXPBD(SolverBase):
         if frames > data.frame_room:
             data.reserve_frames(frames)
             self._launch = None
-        self._bundle = data_copy(data) if self.bundles is not None else None
         settings = self._settings(max_steps, record_every)
-        self._last = (settings, max_steps, record_every)
         for name in ("watch.steps", "watch.nonfinite", "watch.stretch", "watch.depth",
                      "watch.clamped", "watch.overflow"):  # fmt: skip
             data.arrays[name].view[...] = 0
+        self._bundle = data_copy(data) if self.bundles is not None else None
+        self._last = settings
         for mirrored in data.arrays.values():
             mirrored.to_device()
         launch = self._recorded(settings)
@@ -226,7 +230,7 @@ class SolverFusedXPBD(SolverBase):
                     stretch=float(views["watch.stretch"][group, lane]),
                     depth=float(views["watch.depth"][group, lane]),
                     clamped=int(views["watch.clamped"][group, lane]),
-                    overflow=int(views["watch.overflow"][group]),
+                    overflow=int(views["watch.overflow"][group, lane]),
                 )
             )
         return out
@@ -258,7 +262,7 @@ class SolverFusedXPBD(SolverBase):
         *,
         observables: Any = None,
     ) -> None:
-        """Advance every world by `dt` in ceil(dt / config.dt) substeps.
+        """Advance every world by `dt` in round(dt / config.dt) substeps, at least one.
 
         Raises:
             PhysicsError: a guard fired.
@@ -270,6 +274,7 @@ class SolverFusedXPBD(SolverBase):
         if ours is not None and hasattr(ours, "grip_particle"):
             self._grip_from_control(ours, steps)
         self.set_duration(_FOREVER, _FOREVER)
+        self.activate()
         values = self.run(steps)
         self.write_state(state_out)
         self.check(values)

@@ -39,13 +39,13 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     """
     t = structures(scalar, lanes)
     S, V, L = t.S, t.V, t.L
-    Pairs, Particles, Near = t.Pairs, t.Particles, t.Near
+    Pairs, Particles, Near, Watch = t.Pairs, t.Particles, t.Near, t.Watch
     coulomb = friction(scalar, lanes).coulomb
 
     @wp.func
     def list_near(
-        p0: int, start: int, capacity: int, first: int, last: int, margin: S, stale: V,
-        q: Particles, pairs: Pairs, near: Near, count: int,
+        g: int, p0: int, start: int, capacity: int, first: int, last: int, margin: S, stale: V, on: V,
+        q: Particles, pairs: Pairs, near: Near, watch: Watch, count: int,
     ):  # fmt: skip
         for i in range(p0, p0 + count):
             x = q.x[i]
@@ -55,16 +55,22 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             r.z = select(stale, x.z, r.z)
             q.xr[i] = r
         n = int(0)
+        zero = V(S(0.0))
+        left_out = zero
         for k in range(first, last):
             ij = pairs.ij[k]
             d = q.xr[p0 + ij[0]] - q.xr[p0 + ij[1]]
             reach = pairs.distance[k] + margin
             l2 = dot(d, d)
-            if any_less(l2, reach * reach):
+            close = less(l2, V(reach * reach)) * on
+            if any_less(zero - close, S(0.0)):
                 if n < capacity:
                     near.pair[start + n] = k
-                    near.mask[start + n] = less(l2, V(reach * reach))
-                n += 1
+                    near.mask[start + n] = close
+                    n += 1
+                else:
+                    left_out = left_out + close
+        watch.overflow[g] = wp.max(watch.overflow[g], left_out)
         return n
 
     @wp.func

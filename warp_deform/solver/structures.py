@@ -166,7 +166,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         stretch: wp.array(dtype=V)  # longest two-sided spring / its rest length
         depth: wp.array(dtype=V)  # deepest a particle's centre was under the table [m]
         clamped: wp.array(dtype=V)  # substeps in which the speed clamp acted
-        overflow: wp.array(dtype=int)  # per group: pairs that found no room in the list
+        overflow: wp.array(dtype=V)  # pairs of the world that found no room in the list
         frame_x: wp.array(dtype=V3)  # recorded particle positions
         frame_body_x: wp.array(dtype=R3)
         frame_body_q: wp.array(dtype=Q)

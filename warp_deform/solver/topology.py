@@ -78,9 +78,7 @@ def read_worlds(model: newton.Model) -> tuple[list[WorldTopology], list[np.ndarr
             "the model lacks warp_deform's attributes: build it with add_cable, add_box, ... or call "
             "SolverFusedXPBD.register_custom_attributes(builder) first"
         )
-    for what, amount in (("tetrahedra", model.tet_count), ("triangles", model.tri_count)):
-        if amount:
-            raise InputError(f"SolverFusedXPBD does not simulate {what} ({amount} in the model)")
+    _refuse_unsupported(model)
     ours = getattr(model, NAMESPACE)
     count = max(1, model.world_count)
     radius = model.particle_radius.numpy() if model.particle_count else np.zeros(0)
@@ -107,6 +105,42 @@ def read_worlds(model: newton.Model) -> tuple[list[WorldTopology], list[np.ndarr
             )
         )
     return topologies, particles, bodies
+
+
+def _refuse_unsupported(model: newton.Model) -> None:
+    """Raise for content that would otherwise be left out without a word."""
+    for what, amount in (
+        ("tetrahedra", model.tet_count), ("triangles", model.tri_count),
+        ("bending edges", model.edge_count), ("muscles", model.muscle_count),
+        ("tendons", model.tendon_count),
+        ("particles attached to bodies", model.attachment_particle_body_count),
+    ):  # fmt: skip
+        if amount:
+            raise InputError(f"SolverFusedXPBD does not simulate {what} ({amount} in the model)")
+    if model.shape_count:
+        for kind in set(model.shape_type.numpy().tolist()) - {int(newton.GeoType.BOX)}:
+            name = newton.GeoType(kind).name.lower()
+            hint = "; the table z = 0 is built in" if kind == newton.GeoType.PLANE else ""
+            raise InputError(f"SolverFusedXPBD simulates boxes only, the model has a {name}{hint}")
+        if (model.shape_body.numpy() < 0).any():
+            raise InputError(
+                "SolverFusedXPBD has no fixed boxes: give the box a body (of mass 0 if it is to stay)"
+            )
+    if model.joint_count:
+        for kind in set(model.joint_type.numpy().tolist()) - {int(newton.JointType.FREE)}:
+            name = newton.JointType(kind).name.lower()
+            raise InputError(f"SolverFusedXPBD has no joints, the model has a {name} joint")
+    if model.body_count and (model.body_flags.numpy() & int(newton.BodyFlags.KINEMATIC)).any():
+        raise InputError("SolverFusedXPBD has no kinematic bodies: hold the body with a grip path")
+    if model.spring_count:
+        for what, values in (
+            ("rest length", model.spring_rest_length.numpy()),
+            ("stiffness", model.spring_stiffness.numpy()),
+        ):
+            if not (values > 0).all():
+                raise InputError(f"every spring needs a positive {what}, got {values.min()}")
+        if model.spring_damping.numpy().any():
+            raise InputError("SolverFusedXPBD has no spring damping: set it to 0")
 
 
 class _Springs:
@@ -138,8 +172,6 @@ class _Shapes:
     def __init__(self, model: newton.Model) -> None:
         self.model = model
         self.body = model.shape_body.numpy() if model.shape_count else np.zeros(0, int)
-        if model.shape_count and (model.shape_type.numpy() != int(newton.GeoType.BOX)).any():
-            raise InputError("SolverFusedXPBD simulates boxes only; another shape is in the model")
 
     def of(self, bodies: np.ndarray) -> dict[str, np.ndarray]:
         rows = np.flatnonzero(np.isin(self.body, bodies))

@@ -12,7 +12,6 @@ import numpy as np
 
 from ..objects.cable import Cable, RingConfig, add_cable, cable_ring
 from ..objects.push import Push
-from ..objects.push import Push
 from ..objects.zone import ring_zone
 from ..rendering.pixels import BOUNDS
 from .demonstrators import farthest_bead, pick_place, ring_maps

@@ -123,6 +123,18 @@ class Task(abc.ABC):
         """Speed [m/s] of the loaded tip at a lift [m]: that of the stage with the nearest lift."""
         return min(self.stages, key=lambda stage: abs(stage.lift - lift)).speed
 
+    def privileged_stage(
+        self, segment: int, snapshot: Snapshot, previous: Stage | None
+    ) -> Stage:
+        """Stage of a pick on what has the segmentation id `segment`, by the paper's hidden rule.
+
+        snapshot: the state before the action; previous: the episode's stage before, None at first.
+        A task with one stage needs no rule; one with several states its own here.
+        """
+        if len(self.stages) > 1:
+            raise TypeError(f"{self.name} has {len(self.stages)} stages and no rule between them")
+        return self.stages[0]
+
     @classmethod
     def env_id(cls) -> str:
         """Gymnasium id of the task."""

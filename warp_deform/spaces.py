@@ -1,0 +1,116 @@
+"""What an agent does and sees, as Gymnasium spaces and dictionaries of one running episode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike
+
+from .episodes import MAX_HEIGHT
+from .errors import InputError
+from .rendering.pixels import BOUNDS, SHAPE
+from .robots.primitive import Outcome
+from .tasks.task import Images, Task
+from .worlds import Worlds
+
+__all__ = ["action_space", "check_action", "information", "observation", "observation_space"]
+
+LIFT = (0.04, 0.40)
+"""Least and greatest height [m] at which the tip carries what it holds."""
+_NAMES = ("pick x", "pick y", "pick yaw", "place x", "place y", "place yaw", "lift")
+_POSE = (*BOUNDS[:2], (-np.pi, np.pi))
+_EXACT = np.array([*_POSE, *_POSE, LIFT])
+# A policy computes in float32: a limit rounded to float32 still lies within the space.
+_LOW = np.minimum(_EXACT[:, 0], _EXACT[:, 0].astype(np.float32))
+_HIGH = np.maximum(_EXACT[:, 1], _EXACT[:, 1].astype(np.float32))
+
+
+def action_space() -> spaces.Box:
+    """Box (7,) float64: pick x, y [m], yaw [rad], place x, y, yaw, lift [m], on the workspace."""
+    return spaces.Box(_LOW, _HIGH, dtype=np.float64)
+
+
+def observation_space(task: Task) -> spaces.Dict:
+    """color (320, 160, 3) uint8 and height (320, 160) float32 [m], with a goal also its images."""
+    color = spaces.Box(0, 255, (*SHAPE, 3), np.uint8)
+    height = spaces.Box(0.0, MAX_HEIGHT, SHAPE, np.float32)
+    seen: dict[str, spaces.Space[Any]] = {"color": color, "height": height}
+    if task.goal_conditioned:
+        seen |= {"goal_color": color, "goal_height": height}
+    return spaces.Dict(seen)
+
+
+def check_action(action: ArrayLike, *, name: str = "action") -> np.ndarray:
+    """The action as (7,) float64, unchanged.
+
+    Raises:
+        InputError: another shape, or a value that is not a number within the action space.
+    """
+    try:
+        values = np.array(action, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: 7 numbers are needed, got {action!r}") from error
+    if values.shape != _LOW.shape:
+        raise InputError(f"{name}: 7 numbers are needed, got shape {values.shape}")
+    for what, value, low, high in zip(_NAMES, values, _LOW, _HIGH, strict=True):
+        if not low <= value <= high:  # also when it is not a number
+            unit = "rad" if what.endswith("yaw") else "m"
+            raise InputError(
+                f"{name}: {what} is {value:.6g} {unit}, allowed are {low:.6g} to {high:.6g}"
+            )
+    return values
+
+
+def observation(worlds: Worlds, slot: int) -> dict[str, np.ndarray]:
+    """What an agent sees of a slot: new arrays, which the caller may change.
+
+    The images of a state that cannot be drawn are zero; its `physics_ok` is False.
+    """
+    images = _images(worlds, slot)
+    seen = {"color": images.color.copy(), "height": images.height.copy()}
+    if worlds.task.goal_conditioned:
+        goal = worlds.episodes[slot].goal
+        assert goal is not None, "Worlds gives every episode of such a task a goal"
+        seen |= {"goal_color": goal.color.copy(), "goal_height": goal.height.copy()}
+    return seen
+
+
+def information(
+    worlds: Worlds, slot: int, *, outcome: Outcome | None, stage_rule: str = "action"
+) -> dict[str, Any]:
+    """What is known about a slot's episode beyond the observation; not for policies.
+
+    success and is_success (both spellings are in use), score in [0, 1], physics_ok, problems (why
+    the physics cannot be trusted, "" when it can), state_hash, sim_seconds [s], seed,
+    discarded_starts, actions so far, outcome of the last one ("" after a reset),
+    stage_rule (who chose the lift), ground_truth (D,) float32, segmentation (320, 160) uint8.
+    """
+    episode = worlds.episodes[slot]
+    success = bool(worlds.solved(slot))
+    return {
+        "success": success,
+        "is_success": success,
+        "score": float(worlds.score(slot)),
+        "physics_ok": bool(episode.physics_ok),
+        "problems": "; ".join(map(str, episode.problems)),
+        "state_hash": worlds.hash(slot),
+        "sim_seconds": float(episode.sim_seconds),
+        "seed": int(episode.seed),
+        "discarded_starts": int(episode.discarded_starts),
+        "actions": int(episode.actions),
+        "outcome": outcome.value if outcome is not None else "",
+        "stage_rule": stage_rule,
+        "ground_truth": worlds.task.ground_truth(episode.layout, episode.snapshot),
+        "segmentation": _images(worlds, slot).segmentation.copy(),
+    }
+
+
+def _images(worlds: Worlds, slot: int) -> Images:
+    snapshot = worlds.episodes[slot].snapshot
+    if np.isfinite(snapshot.particle_q).all() and np.isfinite(snapshot.body_q).all():
+        return snapshot.images
+    return Images(
+        np.zeros((*SHAPE, 3), np.uint8), np.zeros(SHAPE, np.float32), np.zeros(SHAPE, np.uint8)
+    )
