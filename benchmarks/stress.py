@@ -19,7 +19,7 @@ import json
 import sys
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -54,7 +54,7 @@ class Tally:
 
 def stress(task: str, *, actions: int, seed: int = 0, count: int = 16) -> Tally:
     """Act `actions` times on `count` worlds of a task and look at every state."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([seed, *task.encode()])
     worlds = Worlds(task, count)
     tally = Tally(task)
     fresh = seed
@@ -134,10 +134,13 @@ def examine(
     arrays = (state.particle_q, state.particle_qd, state.body_q, state.body_qd)
     finite = all(np.isfinite(array).all() for array in arrays)
     score, solved = worlds.score(slot), worlds.solved(slot)
-    tally.solved += solved
+    tally.solved += int(solved)
     if finite:
-        speeds = [*np.linalg.norm(state.particle_qd, axis=1), *np.linalg.norm(state.body_qd[:, :3], axis=1)]
-        tally.restless += max(speeds) > MOVING
+        speeds = [
+            *np.linalg.norm(state.particle_qd, axis=1),
+            *np.linalg.norm(state.body_qd[:, :3], axis=1),
+        ]
+        tally.restless += int(max(speeds) > MOVING)
     moving = sum(motion.seconds for motion in report.motions)
     checks = {
         "outcome without a name": isinstance(report.outcome, Outcome),
@@ -160,7 +163,16 @@ def examine(
 def table(tallies: list[Tally]) -> str:
     """The tallies as a Markdown table, with totals below."""
     names = [outcome.value for outcome in Outcome]
-    head = ["task", "actions", *names, "solved", "still moving", "longest [s]", "broken", "wall [s]"]
+    head = [
+        "task",
+        "actions",
+        *names,
+        "solved",
+        "still moving",
+        "longest [s]",
+        "broken",
+        "wall [s]",
+    ]
     rows = [
         [t.task, t.actions, *(t.outcomes[name] for name in names), t.solved, t.restless,
          f"{t.longest:.1f}", len(t.broken), f"{t.seconds:.1f}"]
@@ -193,7 +205,7 @@ def main() -> int:
     report: dict[str, Any] = {
         "actions": sum(t.actions for t in tallies),
         "broken": sum(len(t.broken) for t in tallies),
-        "rows": [asdict(t) for t in tallies],
+        "rows": [vars(t) for t in tallies],
     }
     print(json.dumps(report) if options.json else table(tallies))
     return 1 if report["broken"] else 0

@@ -6,7 +6,6 @@ seed alone, so how seeds are spread over slots, processes and interrupted runs c
 
 from __future__ import annotations
 
-import functools
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,8 +17,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .collection import Attempt, Collection, append_attempt
-from .episode_loop import SOLVED, demonstrate, play
-from .episodes import EpisodeReader, EpisodeWriter, Goal, combine_hashes, rebuild_index
+from .episode_loop import SOLVED, Run, demonstrate, play, worlds_for
+from .episodes import EpisodeReader, EpisodeWriter, Goal, Step, combine_hashes, rebuild_index
 from .errors import InputError
 from .goals import load_goals
 from .recording import observe, record, task_config
@@ -111,8 +110,8 @@ def collect(config: CollectConfig) -> CollectReport:
     give more.
 
     Raises:
-        InputError: the folder belongs to another collection; nothing in it changes.
-        WarpDeformError: a worker process was killed; what it had finished is kept.
+        InputError: the folder belongs to another collection, whose episodes stay as they are.
+        WarpDeformError: a worker process was killed; what had been finished is kept.
     """
     began = time.perf_counter()
     if config.video is not None:
@@ -122,25 +121,150 @@ def collect(config: CollectConfig) -> CollectReport:
     config = replace(config, out=Path(config.out).resolve())
     count = worker_count(config.workers, config.episodes)
     with Collection(config.out, _description(config)).owned() as collection:
-        with _progress(config) as progress, Workers(count, ray=config.ray) as workers:
-            bar = progress.add_task(config.task, total=config.episodes)
-            first = True
-            while todo := _plan(config, collection.attempts):
-                # The first few run here: they compile the kernels once, and show what goes wrong.
-                here = first or len(todo) <= SLOTS
-                batch = todo[:SLOTS] if first and workers.apart else todo
-                chunks = [_Chunk(config, tuple(seeds)) for seeds in _split(batch, 1 if here else count)]
-                crew = Workers(1) if here else workers
-                for attempt in crew.run(attempt_chunk, chunks):
-                    collection.attempts[attempt.seed] = attempt
-                    kept, _ = _kept(config, collection.attempts)
-                    progress.update(bar, completed=len(kept))
-                first = False
+        with Workers(count, ray=config.ray) as workers:
+            _attempt_all(config, collection.attempts, workers)
         kept, attempts = _kept(config, collection.attempts)
         collection.keep(set(kept))
-        report = _report(config, kept, attempts)
+    report = _report(config, kept, attempts, time.perf_counter() - began)
     if config.video is not None and kept:
         from .filming import film
 
         film(config.out, config.video, seeds=kept[:FILMED])
-    return replace(report, seconds=time.perf_counter() - began)
+    return report
+
+
+def _attempt_all(config: CollectConfig, attempts: dict[int, Attempt], workers: Workers) -> None:
+    """Attempt seeds, round after round, until there are successes enough or no hope of them."""
+    here = Workers(1)
+    with _progress() as progress:
+        done = sum(attempt.success for attempt in attempts.values())
+        bar = progress.add_task(config.task, total=config.episodes, completed=done)
+        crew = here
+        while todo := _plan(config, attempts):
+            # The first few run here, while the workers start: kernels are compiled once.
+            few = todo[:SLOTS] if crew is here and workers.apart else todo
+            chunks = [_Chunk(config, part) for part in _split(few, crew.count)]
+            for attempt in crew.run(attempt_chunk, chunks):
+                attempts[attempt.seed] = attempt
+                progress.advance(bar, attempt.success)
+            crew = workers
+
+
+def _plan(config: CollectConfig, attempts: Mapping[int, Attempt]) -> list[int]:
+    """Seeds that should bring the missing successes; none when they are there, or hopeless.
+
+    The success rate so far says how many seeds a success takes.
+    """
+    rate = (sum(a.success for a in attempts.values()) + 1) / (len(attempts) + 1)
+    todo: list[int] = []
+    expected, seed = 0.0, config.seed
+    end = config.seed + most_attempts(config.episodes)
+    while seed < end and expected < config.episodes - 1e-6:
+        if seed in attempts:
+            expected += attempts[seed].success
+        else:
+            expected += rate
+            todo.append(seed)
+        seed += 1
+    return todo
+
+
+def _kept(config: CollectConfig, attempts: Mapping[int, Attempt]) -> tuple[list[int], int]:
+    """Seeds of the first successes, and how many seeds it took to get them."""
+    kept: list[int] = []
+    for tried in range(most_attempts(config.episodes)):
+        if len(kept) == config.episodes:
+            return kept, tried
+        attempt = attempts[config.seed + tried]
+        if attempt.success:
+            kept.append(attempt.seed)
+    return kept, most_attempts(config.episodes)
+
+
+def _split(seeds: Sequence[int], count: int) -> list[tuple[int, ...]]:
+    """Neighbouring seeds in chunks for `count` processes, one chunk for the present one."""
+    if count == 1:
+        return [tuple(seeds)]
+    size = math.ceil(len(seeds) / count / CHUNKS_PER_WORKER)
+    size = min(max(size, CHUNK[0]), CHUNK[1], math.ceil(len(seeds) / count))
+    return [tuple(seeds[i : i + size]) for i in range(0, len(seeds), size)]
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    config: CollectConfig
+    seeds: tuple[int, ...]
+
+
+def attempt_chunk(chunk: _Chunk) -> Iterator[Attempt]:
+    """Attempt seeds; a success is a file, and every attempt a line of the ledger, at once."""
+    config = chunk.config
+    writer = EpisodeWriter(config.out, overwrite=True)  # by the same episode, if at all
+    goals = [] if config.goals is None else load_goals(config.goals)
+
+    def act(worlds: Worlds, runs: Mapping[int, Run[Step]]) -> Mapping[int, np.ndarray | None]:
+        stop_if_orphaned()
+        return demonstrate(worlds, runs)
+
+    def goal(seed: int) -> Goal | None:
+        return goals[(seed - config.seed) % len(goals)] if goals else None
+
+    worlds = worlds_for(config.task, config.robot, SLOTS)
+    for slot, run in play(worlds, chunk.seeds, act=act, look=observe, goals=goal):
+        success = run.ended == SOLVED
+        if success:
+            writer.write(record(worlds, slot, run, demonstrator=config.demonstrator))
+        score = run.rows[-1].score if run.rows else 0.0
+        attempt = Attempt(run.seed, success, len(run.actions), score, run.ended or "")
+        append_attempt(config.out, attempt)
+        yield attempt
+
+
+def _description(config: CollectConfig) -> dict[str, object]:
+    """What all episodes of a collection have in common."""
+    return {
+        "task": config.task,
+        "robot": config.robot,
+        "demonstrator": config.demonstrator,
+        "seed": config.seed,
+        "goals": None
+        if config.goals is None
+        else [info.state_hash for info in EpisodeReader(config.goals).infos()],
+        "config": task_config(find_task(config.task)),
+    }
+
+
+def _report(
+    config: CollectConfig, kept: Sequence[int], attempts: int, seconds: float
+) -> CollectReport:
+    infos = [EpisodeReader(config.out).info(seed) for seed in kept]
+    if infos:
+        rebuild_index(config.out)
+    n = max(len(infos), 1)
+    return CollectReport(
+        task=config.task,
+        episodes=config.episodes,
+        attempts=attempts,
+        successes=len(infos),
+        success_rate=len(infos) / attempts,
+        mean_actions=sum(info.actions for info in infos) / n,
+        mean_score=sum(info.score for info in infos) / n,
+        seconds=seconds,
+        sim_seconds=math.fsum(info.sim_seconds for info in infos),
+        physics_ok=all(info.physics_ok for info in infos),
+        state_hash=combine_hashes(info.state_hash for info in infos),
+        discarded_starts=sum(info.discarded_starts for info in infos),
+    )
+
+
+def _progress() -> Progress:
+    """A bar on stderr while somebody looks at it."""
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    return Progress(
+        *columns,
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )

@@ -1,9 +1,9 @@
 """A folder that demonstrations are collected into: what it is of, and what has been attempted.
 
-    collection.json     what is collected; a run with other settings is refused
-    attempts.jsonl      one line per finished attempt, appended by whoever finished it
-    episode_*.parquet   the successes
-    surplus/            successes beyond those asked for, until more are asked for
+collection.json     what is collected; a run with other settings is refused
+attempts.jsonl      one line per finished attempt, appended by whoever finished it
+episode_*.parquet   the successes
+surplus/            successes beyond those asked for, until more are asked for
 """
 
 from __future__ import annotations
@@ -156,5 +156,3 @@ def _difference(found: Any, wanted: Mapping[str, Any], path: str = "") -> str:
 
 def _deciding_versions() -> dict[str, str]:
     return {name: version for name, version in versions().items() if name in _DECIDING}
-
-

@@ -227,9 +227,9 @@ def inspect(options: InspectOptions) -> Outcome:
 class BenchOptions(CommandOptions):
     """Time one simulated second of a scene; compiling is timed apart."""
 
-    scene: Literal["cable", "ring", "cloth", "bag"] = "cable"
-    """What is simulated, at the tasks' resolution and with self-contact."""
-    peer: Literal["pybullet", "newton-vbd"] | None = None
+    scene: Literal["cable", "heap", "ring", "block"] = "cable"
+    """What is simulated."""
+    peer: Literal["pybullet", "newton-vbd", "newton-vbd-bodies", "newton-xpbd"] | None = None
     """Another simulator to time on the same scene."""
 
 
@@ -238,7 +238,7 @@ def bench(options: BenchOptions) -> Outcome:
     from .bench import run
 
     quiet_warp()
-    report = run(options.scene, peer=options.peer)
+    report = run(scene=options.scene, peer=options.peer)
     return Outcome(data=report, text=_lines(report))
 
 

@@ -47,7 +47,7 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     ) -> None:
         self.render_mode = check_render_mode(render_mode, self.metadata)
         self.worlds = Worlds(task, 1, robot=robot)
-        self.observation_space = observation_space(self.task)
+        self.observation_space = observation_space(self.task)  # type: ignore[assignment]
         self.action_space = action_space()
         self._view = WorldsView(self.worlds)
         self._running = False
@@ -111,7 +111,7 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return action if action is not None and self.action_space.contains(action) else None
 
     def render(self) -> np.ndarray | None:
-        """The scene (360, 640, 3) uint8, black when the state cannot be drawn; None without mode."""
+        """The scene (360, 640, 3) uint8, black if it cannot be drawn; None without render mode."""
         if self.render_mode is None:
             return None
         if not self.worlds.episodes:
@@ -120,7 +120,7 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
 
 class WorldsView:
-    """Draws slots of `worlds` for people, the arm in its home posture; loads meshes on first use."""
+    """Draws slots of `worlds` for people, the arm in its home posture."""
 
     def __init__(self, worlds: Worlds) -> None:
         self._worlds = worlds

@@ -5,6 +5,7 @@ One loop serves demonstrations, evaluation and replay; they differ in who acts a
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
@@ -15,7 +16,7 @@ from .episodes import Goal
 from .errors import InputError, WarpDeformError
 from .worlds import DEMONSTRATOR_STREAM, Worlds, episode_rng
 
-__all__ = ["SOLVED", "Act", "Run", "demonstrate", "play"]
+__all__ = ["SOLVED", "Act", "Run", "demonstrate", "play", "worlds_for"]
 
 Row = TypeVar("Row")
 
@@ -51,6 +52,15 @@ def demonstrate(worlds: Worlds, runs: Mapping[int, Run[Row]]) -> dict[int, np.nd
         )
         for slot, run in runs.items()
     }
+
+
+@functools.lru_cache(maxsize=2)
+def worlds_for(task: str, robot: str, count: int) -> Worlds:
+    """This process's worlds of a task, built once and used again, in 8 lanes whatever their count.
+
+    The number of lanes changes no bit; one number means one kernel to compile.
+    """
+    return Worlds(task, count, robot=robot, lanes=8)
 
 
 def play(

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from .episodes import EpisodeReader, Goal, episode_name
+from .episodes import EpisodeReader, Goal
 from .errors import InputError
 from .rendering.pixels import SHAPE
 from .tasks.free_space import FreeSpace
-from .tasks.task import Images, Snapshot, Task
+from .tasks.task import Task
 
 __all__ = ["check_options", "goal_for", "next_seed"]
 
@@ -64,29 +64,16 @@ def goal_for(task: Task, given: GoalOption, *, seed: int) -> Goal:
 
 
 def _read(task: Task, path: Path, seed: int) -> Goal:
-    """The last state of an episode on disk as a goal."""
+    """The goal that an episode on disk shows."""
+    from .goals import load_goal  # with what makes goals, it is only needed for files
+
+    if not path.exists():
+        raise InputError(f"no goal at {path}; `warp-deform goals` makes a folder of them")
     if path.is_dir():
         reader = EpisodeReader(path)
-        chosen = reader.seeds[seed % len(reader)]
-    elif path.is_file():
-        reader = EpisodeReader(path.parent)
-        named = [number for number in reader.seeds if episode_name(number) == path.name]
-        if not named:
-            raise InputError(f"{path} is no episode file, episode_<9 digits>.parquet")
-        [chosen] = named
-    else:
-        raise InputError(f"no goal at {path}; `warp-deform goals` makes a folder of them")
-    info = reader.info(chosen)
-    if info.task != task.name:
-        raise InputError(f"{reader.path(chosen)} is of {info.task}, not of {task.name}")
-    last = reader.read_step(chosen, info.actions)
-    state = Snapshot(
-        last.particle_q,
-        last.particle_qd,
-        last.body_q,
-        last.body_qd,
-        (),
-        lambda: Images(last.color, last.height, np.zeros(SHAPE, np.uint8)),
-    )
-    kind = "demonstrated" if info.actions else "constructed"
-    return Goal(last.color, last.height, task.goal_targets(state), kind, info.seed)
+        path = reader.path(reader.seeds[seed % len(reader)])
+    goal = load_goal(path)
+    made = EpisodeReader(path.parent).info(goal.seed).task
+    if made != task.name:
+        raise InputError(f"{path} is of {made}, not of {task.name}")
+    return goal

@@ -33,7 +33,7 @@ def action_space() -> spaces.Box:
 
 
 def observation_space(task: Task) -> spaces.Dict:
-    """color (320, 160, 3) uint8 and height (320, 160) float32 [m], with a goal also its images."""
+    """Images: color (320, 160, 3) uint8 and height (320, 160) float32 [m]; with a goal also its."""
     color = spaces.Box(0, 255, (*SHAPE, 3), np.uint8)
     height = spaces.Box(0.0, MAX_HEIGHT, SHAPE, np.float32)
     seen: dict[str, spaces.Space[Any]] = {"color": color, "height": height}

@@ -78,7 +78,7 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         """The task that is played."""
         return self.worlds.task
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: Seeds = None, options: dict[str, Any] | None = None
     ) -> tuple[Batch, dict[str, Any]]:
         """Start an episode in every environment.

@@ -18,8 +18,8 @@ __all__ = ["Workers", "single_threaded", "stop_if_orphaned", "worker_count"]
 Chunk = TypeVar("Chunk")
 Result = TypeVar("Result")
 
-LEAST_EPISODES = 32
-"""A process takes seconds to start, so each gets so many episodes unless the user says otherwise."""
+LEAST_EPISODES = 64
+"""A process takes seconds to start: by default each gets at least so many episodes."""
 
 
 def worker_count(asked: int | None, episodes: int) -> int:

@@ -76,7 +76,7 @@ class VectorPrivilegedStage(VectorWrapper[Any, Any, Any, Any, Any]):
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         self._stages: list[Stage | None] = [None] * env.num_envs
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start episodes in the task's first stage."""
@@ -97,8 +97,8 @@ class VectorPrivilegedStage(VectorWrapper[Any, Any, Any, Any, Any]):
         seen, rewards, terminations, truncations, infos = self.env.step(
             np.column_stack([poses, lifts])
         )
-        for i in np.flatnonzero(terminations | truncations):
-            self._stages[i] = None
+        for over in np.flatnonzero(terminations | truncations):
+            self._stages[over] = None
         return seen, rewards, terminations, truncations, _mark(infos)
 
 

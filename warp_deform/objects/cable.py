@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -156,10 +157,7 @@ def add_cable(builder: newton.ModelBuilder, config: CableConfig, positions: np.n
         if ratio == 0:
             continue
         starts = range(config.beads if config.closed else config.beads - step)
-        # in order along the chain: a sweep then carries a pull from end to end, and a dragged cable
-        # stretches by 1 to 4 %; even links first, then odd ones, would be a third faster in a lone
-        # world, but stretches by up to 50 %
-        for i in starts:
+        for i in _from_both_ends(starts):
             j = (i + step) % config.beads
             builder.add_spring(
                 first_particle + i,
@@ -175,6 +173,18 @@ def add_cable(builder: newton.ModelBuilder, config: CableConfig, positions: np.n
         range(first_particle, builder.particle_count),
         range(first_spring, builder.spring_count),
     )
+
+
+def _from_both_ends(starts: range) -> list[int]:
+    """Order of the constraints along a chain: from both ends by turns, to the middle.
+
+    A sweep carries a pull from either end to the middle, and the processor works on two independent
+    chains at once. Solved strictly in order, a lone world takes a third longer; even links first,
+    then odd ones, a dragged cable stretches by up to 50 % instead of 5 to 10 %.
+    """
+    half = len(starts) // 2
+    pairs = zip_longest(starts[:half], reversed(starts[half:]))
+    return [i for pair in pairs for i in pair if i is not None]
 
 
 def _rest_shape(config: CableConfig) -> np.ndarray:

@@ -17,12 +17,16 @@ from ..objects.cable import CableConfig, RingConfig, cable_ring
 
 __all__ = ["PEER_SCENES", "PeerScene", "SceneName", "peer_scene"]
 
-SceneName = Literal["cable", "ring", "block"]
+SceneName = Literal["cable", "heap", "ring", "block"]
 PEER_SCENES: tuple[str, ...] = get_args(SceneName)
 
 _CENTRE = (0.5, 0.0)
 _NOISE = 1e-4  # [m]; a perfect stack of spheres stands, and a perfect ring folds in its plane
 _DROP = 0.05  # [m]; clear height under the block
+_ROOM = 0.08  # [m]; radius of the disc that holds a crumpled cable
+_FALL = 0.01  # [m]; clear height under its lowest bead
+_TURN = 1.1  # [rad]; spread of the turn from link to link
+_STEPS = 2000  # tries of a walk before another one begins
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class PeerScene:
     """Where everything starts. A scene has either beads or one block.
 
     Attributes:
-        name: "cable", "ring" or "block".
+        name: "cable", "heap", "ring" or "block".
         cable: What the beads are; None where the scene has none.
         beads: Bead centres (beads, 3) [m]; neighbours are one spacing apart.
         links: Pairs of linked beads (links, 2).
@@ -61,8 +65,9 @@ class PeerScene:
 def peer_scene(name: str, *, seed: int = 0) -> PeerScene:
     """A start above the table; `seed` draws its small noise and its heading.
 
-    The cable is a vertical stack of 24 beads, the ring stands upright on its edge, the L-block
-    hangs flat 5 cm above the table. All three fall at once.
+    The cable lies crumpled within 8 cm and drops by 1 cm, as it lies between two actions; the heap is
+    the same cable as a vertical stack that falls into the tightest tangle there is; the ring stands
+    upright on its edge; the L-block hangs flat 5 cm above the table.
 
     Raises:
         InputError: there is no scene of that name.
@@ -75,6 +80,9 @@ def peer_scene(name: str, *, seed: int = 0) -> PeerScene:
     beads, links = np.zeros((0, 3)), np.zeros((0, 2), dtype=int)
     if name == "cable":
         cable = CableConfig()
+        beads = _crumple(cable, rng)
+    elif name == "heap":
+        cable = CableConfig()
         beads = _stack(cable, rng)
     elif name == "ring":
         cable = RingConfig()
@@ -83,6 +91,29 @@ def peer_scene(name: str, *, seed: int = 0) -> PeerScene:
         first = np.arange(cable.beads if cable.closed else cable.beads - 1)
         links = np.column_stack([first, (first + 1) % cable.beads])
     return PeerScene(name, cable, beads, links, np.array([*_CENTRE, 0.02 + _DROP]), yaw)
+
+
+def _crumple(cable: CableConfig, rng: np.random.Generator) -> np.ndarray:
+    """A self-avoiding walk of exact links within a disc; a walk that runs into itself starts anew."""
+    while True:
+        beads = [np.array([*_CENTRE, 0.0])]
+        heading = rng.uniform(0, 2 * np.pi)
+        for _ in range(_STEPS):
+            turned = heading + rng.normal(0, _TURN)
+            step = np.array([np.cos(turned), np.sin(turned), rng.normal(0, 0.1)])
+            bead = beads[-1] + cable.spacing * step / np.linalg.norm(step)
+            apart = np.linalg.norm(bead - beads[:-1], axis=1) if len(beads) > 1 else np.ones(1)
+            fold = 1.3 * cable.spacing
+            if (
+                np.hypot(*(bead[:2] - _CENTRE)) < _ROOM
+                and apart.min() > 2.1 * cable.radius
+                and apart[-1] > fold
+            ):
+                beads.append(bead)
+                heading = turned
+            if len(beads) == cable.beads:
+                walk = np.array(beads)
+                return walk + [0, 0, cable.radius + _FALL - walk[:, 2].min()]
 
 
 def _stack(cable: CableConfig, rng: np.random.Generator) -> np.ndarray:

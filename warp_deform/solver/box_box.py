@@ -1,9 +1,8 @@
-"""Contact and friction between boxes.
+"""Where boxes touch each other.
 
 The axis of least overlap among the 15 candidates of two boxes (separating axis theorem) is the
-contact normal. For a face axis, the edges of the other box's facing side are clipped against that
-face: the ends of every clipped edge are contact points, which covers corners on a face as well as
-boxes that lie across each other. For an edge axis the contact is the two edges' closest points.
+contact normal. For a face axis the contact points are the corners of the area that the face and the
+other box's facing side have in common. For an edge axis they are the two edges' closest points.
 Source: Ericson, Real-Time Collision Detection, sections 4.4 and 5.5.
 """
 
@@ -13,22 +12,24 @@ from typing import Any
 
 import warp as wp
 
-from .friction import friction
-from .rigid import rigid
+from .body_contact import AHEAD, body_contact
 from .structures import structures
 
-__all__ = ["box_box"]
+__all__ = ["POINTS", "box_box"]
+
+POINTS = 12
+"""Most contacts of two boxes: 8 ends of edges and 4 corners."""
 
 
 @functools.cache
 def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`project_boxes(sa, a, sb, b, ...)`: shape sa of body a against shape sb of body b."""
+    """`list_boxes(c, sa, a, sb, b, ...)`: adds the contacts of shape sa of body a with shape sb of
+    body b to the list, from number c on, and returns the next number."""
     t = structures(scalar, lanes)
     S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
-    Shapes, Bodies = t.Shapes, t.Bodies
-    body = rigid(scalar, lanes)
-    response, push_body, moved = body.response, body.push_body, body.moved
-    coulomb_scalar = friction(scalar, lanes).coulomb_scalar
+    Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
+    contact = body_contact(scalar, lanes)
+    list_contact, share_load = contact.list_contact, contact.share_load
 
     @wp.func
     def column(m: M33, k: int):
@@ -44,32 +45,12 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
         )
 
     @wp.func
-    def contact(a: int, b: int, pa: R3, pb: R3, n: R3, mu: S, push: S, bodies: Bodies):
-        """Separate point pa of body a from point pb of body b along n (from a to b)."""
-        depth = wp.dot(pa - pb, n)
-        if depth > S(0.0):
-            ra = pa - bodies.x[a]
-            rb = pb - bodies.x[b]
-            step = moved(b, bodies, wp.quat_rotate_inv(bodies.q[b], rb)) - moved(
-                a, bodies, wp.quat_rotate_inv(bodies.q[a], ra)
-            )
-            approach = wp.dot(step, n)
-            depth = wp.min(depth, wp.max(-approach, S(0.0)) + push)
-            w = response(a, bodies, ra, n) + response(b, bodies, rb, n)
-            if w > S(0.0):
-                slip = step - n * approach
-                f = coulomb_scalar(wp.dot(slip, slip), depth * mu)
-                impulse = (n * depth - slip * f) / w
-                push_body(b, bodies, rb, impulse)
-                push_body(a, bodies, ra, -impulse)
-                bodies.touching[a] = bodies.touching[a] + 1
-                bodies.touching[b] = bodies.touching[b] + 1
-
-    @wp.func
-    def clip(a: int, b: int, axis: int, flip: S, ca: R3, aa: M33, ha: R3, cb: R3, ab: M33, hb: R3,
-             swap: int, mu: S, push: S, bodies: Bodies):  # fmt: skip
-        """Contacts of box b's side that faces the face `axis` of box a; flip: which of the two."""
-        n = column(aa, axis) * flip
+    def list_face(
+        c: int, a: int, b: int, axis: int, n: R3, ca: R3, aa: M33, ha: R3, cb: R3, ab: M33, hb: R3,
+        mu: S, push: S, bodies: Bodies, contacts: Contacts,
+    ):  # fmt: skip
+        """Contacts between the face of box a with outward normal n (its axis `axis`) and the side of
+        box b that faces it: the corners of their common area. Returns the next number."""
         u = column(aa, (axis + 1) % 3)
         v = column(aa, (axis + 2) % 3)
         hu = ha[(axis + 1) % 3]
@@ -78,13 +59,16 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
         k = int(0)
         best = S(0.0)
         for e in range(3):
-            c = wp.abs(wp.dot(column(ab, e), n))
-            if c > best:
-                best = c
+            opposed = wp.abs(wp.dot(column(ab, e), n))
+            if opposed > best:
+                best = opposed
                 k = e
-        side = column(ab, k) * (-wp.sign(wp.dot(column(ab, k), n)) * hb[k])
-        eu = column(ab, (k + 1) % 3) * hb[(k + 1) % 3]
-        ev = column(ab, (k + 2) % 3) * hb[(k + 2) % 3]
+        m = column(ab, k) * wp.sign(wp.dot(column(ab, k), n))
+        bu = column(ab, (k + 1) % 3)
+        bv = column(ab, (k + 2) % 3)
+        eu = bu * hb[(k + 1) % 3]
+        ev = bv * hb[(k + 2) % 3]
+        side = cb - m * hb[k]
         face = wp.dot(ca, n) + ha[axis]
         for edge in range(4):
             s0 = S(1.0)
@@ -93,8 +77,8 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
             s1 = S(1.0)
             if edge >= 2:
                 s1 = S(-1.0)
-            # corners in order around the side
-            p = cb + side + eu * s0 + ev * s1
+            # corners of b's side in order around it, its edges cut off at a's face
+            p = side + eu * s0 + ev * s1
             d = eu * (S(-2.0) * s0)
             if edge == 1 or edge == 3:
                 d = ev * (S(-2.0) * s1)
@@ -116,20 +100,31 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
                 hi = S(-1.0)
             if lo <= hi:
                 for end in range(2):
-                    at = p + d * lo
-                    if end == 1:
-                        at = p + d * hi
-                    gap = wp.dot(at, n) - face
-                    if gap < S(0.0):
-                        if swap == 0:
-                            contact(a, b, at - n * gap, at, n, mu, push, bodies)
-                        else:
-                            contact(b, a, at, at - n * gap, -n, mu, push, bodies)
+                    # the far end of an edge that is not cut off is the near end of the next one
+                    if end == 0 or hi < S(1.0):
+                        at = p + d * wp.where(end == 0, lo, hi)
+                        gap = wp.dot(at, n) - face
+                        if gap < S(AHEAD):
+                            list_contact(c, a, b, at - n * gap, at, n, mu, push, bodies, contacts)
+                            c += 1
+            # corner of a's face inside b's side
+            q = ca + n * ha[axis] + u * (hu * s0) + v * (hv * s1)
+            if (
+                wp.abs(wp.dot(q - cb, bu)) < hb[(k + 1) % 3]
+                and wp.abs(wp.dot(q - cb, bv)) < hb[(k + 2) % 3]
+            ):
+                gap = wp.dot(side - q, m) / wp.dot(m, n)
+                if gap < S(AHEAD):
+                    list_contact(c, a, b, q, q + n * gap, n, mu, push, bodies, contacts)
+                    c += 1
+        return c
 
     @wp.func
-    def project_boxes(
-        sa: int, a: int, sb: int, b: int, mu: S, push: S, shapes: Shapes, bodies: Bodies
-    ):
+    def list_boxes(
+        c: int, sa: int, a: int, sb: int, b: int, mu: S, push: S, shapes: Shapes, bodies: Bodies,
+        contacts: Contacts,
+    ):  # fmt: skip
+        start = int(c)
         ha = shapes.half[sa]
         hb = shapes.half[sb]
         ca = bodies.x[a] + wp.quat_rotate(bodies.q[a], shapes.center[sa])
@@ -155,7 +150,7 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
                 l = wp.length(n)
                 if l > S(1.0e-3) and least > S(0.0):
                     n = n / l
-                    overlap = reach(aa, ha, n) + reach(ab, hb, n) - wp.abs(wp.dot(d, n))
+                    overlap = reach(aa, ha, n) + reach(ab, hb, n) - wp.abs(wp.dot(d, n)) + S(AHEAD)
                     if overlap <= S(0.0):
                         least = S(-1.0)
                     elif overlap * bias < least:
@@ -164,11 +159,13 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
                         normal = n * wp.where(wp.dot(d, n) < S(0.0), S(-1.0), S(1.0))
             if least > S(0.0) and kind >= 0:
                 if kind < 3:
-                    flip = wp.where(wp.dot(column(aa, kind), normal) < S(0.0), S(-1.0), S(1.0))
-                    clip(a, b, kind, flip, ca, aa, ha, cb, ab, hb, 0, mu, push, bodies)
+                    c = list_face(
+                        c, a, b, kind, normal, ca, aa, ha, cb, ab, hb, mu, push, bodies, contacts
+                    )
                 elif kind < 6:
-                    flip = wp.where(wp.dot(column(ab, kind - 3), normal) < S(0.0), S(1.0), S(-1.0))
-                    clip(b, a, kind - 3, flip, cb, ab, hb, ca, aa, ha, 1, mu, push, bodies)
+                    c = list_face(
+                        c, b, a, kind - 3, -normal, cb, ab, hb, ca, aa, ha, mu, push, bodies, contacts
+                    )
                 else:
                     ea = (kind - 6) // 3
                     eb = (kind - 6) % 3
@@ -186,6 +183,11 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
                     bottom = S(1.0) - uv * uv
                     su = (wp.dot(w, u) - uv * wp.dot(w, v)) / bottom
                     sv = (uv * wp.dot(w, u) - wp.dot(w, v)) / bottom
-                    contact(a, b, pa + u * su, pb + v * sv, normal, mu, push, bodies)
+                    pa += u * su
+                    pb += v * sv
+                    list_contact(c, a, b, pa, pb, normal, mu, push, bodies, contacts)
+                    c += 1
+        share_load(start, c, bodies, contacts)
+        return c
 
-    return SimpleNamespace(project_boxes=project_boxes, Q=Q)
+    return SimpleNamespace(list_boxes=list_boxes, Q=Q)

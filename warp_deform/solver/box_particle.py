@@ -64,7 +64,7 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
             po = q.xp[i]
             step = p - R3(po.x[lane], po.y[lane], po.z[lane]) - moved(b, bodies, local)
             approach = wp.dot(step, n)
-            depth = wp.min(radius - gap, wp.max(-approach, S(0.0)) + push)
+            depth = wp.min(radius - gap, wp.max(push - approach, S(0.0)))
             wv = q.w[i]
             wi = wv[lane]
             w = wi + response(b, bodies, r, n)
@@ -78,5 +78,6 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
                 q.x[i] = px
                 push_body(b, bodies, r, -impulse)
                 bodies.touching[b] = bodies.touching[b] + 1
+                bodies.support[b] = bodies.support[b] + 1
 
     return SimpleNamespace(project_box_particle=project_box_particle, V=V)

@@ -1,4 +1,4 @@
-"""Boxes on the table: the corners of every box against the plane z = 0, then friction."""
+"""Boxes on the table: the corners of every box against the plane z = 0."""
 
 import functools
 from types import SimpleNamespace
@@ -6,30 +6,22 @@ from typing import Any
 
 import warp as wp
 
-from .friction import friction
-from .rigid import rigid
+from .body_contact import AHEAD, body_contact
 from .structures import structures
 
 __all__ = ["box_table"]
 
-NORMAL_PASSES = 2
-"""Passes over the corners; the second evens out what the order of the first one left."""
-TOUCHING = 2.0e-5
-"""A corner lower than this [m] takes its share of the friction."""
-
 
 @functools.cache
 def box_table(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`project_table(b, first, last, ...)`: body b with shapes first..last; returns corners in contact.
-
-    All normal corrections come before friction, and the Coulomb budget is shared evenly between the
-    corners that touch; solved corner by corner, a lone cube would creep by 5 mm/s.
+    """`list_table(c, b, local, first, last, ...)`: adds the corners of body b with shapes
+    first..last that may touch the table to the contacts, from number c on; returns the next number.
     """
     t = structures(scalar, lanes)
-    S, R3, Shapes, Bodies = t.S, t.R3, t.Shapes, t.Bodies
-    body = rigid(scalar, lanes)
-    response, push_body, moved = body.response, body.push_body, body.moved
-    coulomb_scalar = friction(scalar, lanes).coulomb_scalar
+    S, R3 = t.S, t.R3
+    Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
+    contact = body_contact(scalar, lanes)
+    list_contact, share_load = contact.list_contact, contact.share_load
 
     @wp.func
     def corner(shape: int, c: int, shapes: Shapes):
@@ -42,49 +34,22 @@ def box_table(scalar: Any, lanes: int) -> SimpleNamespace:
         return shapes.center[shape] + at
 
     @wp.func
-    def project_table(
-        b: int, local: int, first: int, last: int, mu: S, shapes: Shapes, bodies: Bodies
-    ):
+    def list_table(
+        c: int, b: int, local: int, first: int, last: int, mu: S, push: S, shapes: Shapes,
+        bodies: Bodies, contacts: Contacts,
+    ):  # fmt: skip
+        start = int(c)
         up = R3(S(0.0), S(0.0), S(1.0))
-        normal = S(0.0)
-        contacts = int(0)
-        for step in range(wp.static(NORMAL_PASSES)):
-            for shape in range(first, last):
-                if shapes.body[shape] == local:
-                    for c in range(8):
-                        r = wp.quat_rotate(bodies.q[b], corner(shape, c, shapes))
-                        z = bodies.x[b][2] + r[2]
-                        if z < S(0.0):
-                            push = -z / response(b, bodies, r, up)
-                            normal += push
-                            push_body(b, bodies, r, up * push)
-        touching = int(0)
         for shape in range(first, last):
             if shapes.body[shape] == local:
-                for c in range(8):
-                    if bodies.x[b][2] + wp.quat_rotate(bodies.q[b], corner(shape, c, shapes))[2] < S(
-                        TOUCHING
-                    ):
-                        touching += 1
-        if normal > S(0.0) and touching > 0:
-            budget = normal / S(touching)
-            for shape in range(first, last):
-                if shapes.body[shape] == local:
-                    for c in range(8):
-                        at = corner(shape, c, shapes)
-                        r = wp.quat_rotate(bodies.q[b], at)
-                        if bodies.x[b][2] + r[2] < S(TOUCHING):
-                            d = moved(b, bodies, at)
-                            d[2] = S(0.0)
-                            l = wp.length(d)
-                            if l > S(1.0e-12):
-                                n = d / l
-                                w = response(b, bodies, r, n)
-                                f = coulomb_scalar(
-                                    l * l, mu * shapes.friction[shape] * budget * w
-                                )
-                                push_body(b, bodies, r, n * (-f * l / w))
-            contacts = touching
-        return contacts
+                for k in range(8):
+                    p = bodies.x[b] + wp.quat_rotate(bodies.q[b], corner(shape, k, shapes))
+                    if p[2] < S(AHEAD):
+                        foot = R3(p[0], p[1], S(0.0))
+                        table_mu = mu * shapes.friction[shape]
+                        list_contact(c, -1, b, foot, p, up, table_mu, push, bodies, contacts)
+                        c += 1
+        share_load(start, c, bodies, contacts)
+        return c
 
-    return SimpleNamespace(project_table=project_table, corner=corner)
+    return SimpleNamespace(list_table=list_table, corner=corner)

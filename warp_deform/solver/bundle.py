@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
 _HEADER = {"digest", "lanes", "precision", "bodies", "groups", "settings"}
-_SETTINGS = ("dt", "max_steps", "alternate", "recovery", "max_speed", "calm_speed", "margin",
+_SETTINGS = ("dt", "max_steps", "recovery", "max_speed", "calm_speed", "margin",
              "rest_speed", "rest_steps", "check_every", "record_every", "particle_stride",
              "body_stride")  # fmt: skip
 

@@ -24,16 +24,13 @@ class SolverConfig:
     """Coulomb coefficient between particles, and factor on that of boxes, in contact."""
     stiffness: float = 1.0
     """Factor on the stiffness of all springs."""
-    alternate: bool = True
-    """Sweep the constraints backwards in every other substep: halves the stretch of a dragged cable.
-    Shells need a fixed order instead, or they jitter."""
     recovery: float = 0.1
     """Fastest separation of overlapping things [m/s]."""
     max_speed: float = 3.0
     """Speed clamp [m/s]; a particle that meets it is counted by the guards."""
     calm_speed: float = 0.1
     """Speed clamp while a world is calmed, after a release for example [m/s]."""
-    margin: float = 0.01
+    margin: float = 0.005
     """Pairs this much farther apart than touching are listed [m]."""
     rest_speed: float = 0.01
     """Slower than this is at rest [m/s]."""

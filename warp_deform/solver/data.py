@@ -9,13 +9,14 @@ import newton
 import numpy as np
 import warp as wp
 
+from .box_box import POINTS
 from .structures import structures
 from .topology import WorldTopology, read_worlds
 
 __all__ = ["KERNEL_ARGUMENTS", "Mirrored", "SolverData"]
 
 KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near", "bodies",
-                    "grips", "watch")  # fmt: skip
+                    "contacts", "grips", "watch")  # fmt: skip
 """The kernel's structs, after the settings, in the order of its arguments."""
 
 _NUMPY = {wp.float32: np.float32, wp.float64: np.float64}
@@ -148,12 +149,15 @@ class SolverData:
             for k in self.group_topology
         ]
         near_start = np.concatenate([[0], np.cumsum(capacity)])
+        contact_room = [_contact_room(tops[k].shape_body) for k in self.group_topology]
+        contact_start = np.concatenate([[0], np.cumsum(contact_room)])
         for name, values in (
             ("topology", self.group_topology),
             ("particle_start", self.group_particle[:-1]),
             ("body_start", self.group_body[:-1]),
             ("near_start", near_start[:-1]),
             ("near_capacity", capacity),
+            ("contact_start", contact_start[:-1]),
         ):
             self._constant(f"group.{name}", np.asarray(values), wp.int32, np.int32)
         for name in ("active", "damping", "table_friction", "contact_friction", "stiffness",
@@ -164,6 +168,12 @@ class SolverData:
         self._add("near.count", groups, wp.int32, (), np.int32)
         self._add("near.pair", total, wp.int32, (), np.int32)
         self._add("near.mask", total, t.V, (L,), number)
+        total = int(contact_start[-1])
+        for name in ("a", "b"):
+            self._add(f"contacts.{name}", total, wp.int32, (), np.int32)
+        for name in ("ra", "rb", "normal", "u", "v", "weights", "steps", "impulse"):
+            self._add(f"contacts.{name}", total, t.R3, (3,), number)
+        self._add("contacts.mu", total, t.S, (), number)
 
     def _fill_particles(self) -> None:
         count, L = int(self.group_particle[-1]), self.lanes
@@ -182,9 +192,11 @@ class SolverData:
             ("x", t.R3, (3,)), ("q", t.Q, (4,)), ("v", t.R3, (3,)), ("omega", t.R3, (3,)),
             ("xp", t.R3, (3,)), ("qp", t.Q, (4,)), ("w", t.S, ()), ("w0", t.S, ()),
             ("inertia", t.M33, (3, 3)), ("inverse_inertia", t.M33, (3, 3)),
+            ("dx", t.R3, (3,)), ("dr", t.R3, (3,)), ("spread", t.M33, (3, 3)),
         ):  # fmt: skip
             self._add(f"bodies.{name}", count, dtype, shape, number)
-        self._add("bodies.touching", count, wp.int32, (), np.int32)
+        for name in ("touching", "support"):
+            self._add(f"bodies.{name}", count, wp.int32, (), np.int32)
         self.views["bodies.q"][:, 3] = 1.0
         if self.has_bodies:
             for w in range(self.world_count):
@@ -304,6 +316,13 @@ class SolverData:
     def frame_poses(x: np.ndarray, quat: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Poses (B, 7) of body frames from centres of mass x (B, 3), rotations and offsets (B, 3)."""
         return np.column_stack([x - _rotate(quat, com), quat])
+
+
+def _contact_room(shape_body: np.ndarray) -> int:
+    """Most contacts that bodies with these shapes can have."""
+    a, b = np.triu_indices(len(shape_body), 1)
+    pairs = int((shape_body[a] != shape_body[b]).sum())
+    return POINTS * pairs + 8 * len(shape_body)
 
 
 def _field(name: str) -> str:

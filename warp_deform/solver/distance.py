@@ -51,12 +51,12 @@ def distance(scalar: Any, lanes: int) -> SimpleNamespace:
                 c = wp.max(c, zero)
             wi = q.w[i]
             wj = q.w[j]
-            w = wi + wj
-            s = c / (w + inverse_dt2 * springs.compliance[k] + tiny)
+            w = wi + wj + tiny
+            safe = wp.max(l, tiny)
+            s = c / ((w + inverse_dt2 * springs.compliance[k]) * safe)
             limit = springs.limit[k]
             if limit > S(0.0):
-                s = wp.max(s, (l - V(limit)) / (w + tiny))
-            s = s / wp.max(l, tiny)
+                s = wp.max(s, (l - V(limit)) / (w * safe))
             q.x[i] = xi - d * (s * wi)
             q.x[j] = xj + d * (s * wj)
 

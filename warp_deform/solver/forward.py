@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from .body_contact import body_contact
 from .box_box import box_box
 from .box_particle import box_particle
 from .box_table import box_table
@@ -55,17 +56,21 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
     follow_path, take, let_go = grips_.follow_path, grips_.take, grips_.let_go
     body = rigid(scalar, lanes)
     predict_body, finish_body = body.predict_body, body.finish_body
-    project_table = box_table(scalar, lanes).project_table
+    list_table = box_table(scalar, lanes).list_table
     project_box_particle = box_particle(scalar, lanes).project_box_particle
-    project_boxes = box_box(scalar, lanes).project_boxes
+    list_boxes = box_box(scalar, lanes).list_boxes
+    bodies_ = body_contact(scalar, lanes)
+    begin_body, solve_contacts, end_body = (
+        getattr(bodies_, n) for n in ("begin_body", "solve_contacts", "end_body")
+    )
     Settings, Topology, Group, Particles = t.Settings, t.Topology, t.Group, t.Particles
     Springs, Pairs, Shapes, Near = t.Springs, t.Pairs, t.Shapes, t.Near
-    Bodies, Grips, Watch = t.Bodies, t.Grips, t.Watch
+    Bodies, Contacts, Grips, Watch = t.Bodies, t.Contacts, t.Grips, t.Watch
 
     @wp.func
     def solve_bodies(
         g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
-        q: Particles, bodies: Bodies,
+        q: Particles, bodies: Bodies, contacts: Contacts,
     ):  # fmt: skip
         """Contacts of one lane's bodies with particles, each other and the table."""
         p0 = group.particle_start[g]
@@ -87,22 +92,25 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                 d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
                 if wp.dot(d, d) < (far + radius) * (far + radius):
                     project_box_particle(p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies)
+        for b in range(b0, b0 + count):
+            begin_body(b, bodies)
+        start = group.contact_start[g]
+        c = int(start)
         for sa in range(first, last):
             for sb in range(sa + 1, last):
-                a = shapes.body[sa]
-                b = shapes.body[sb]
-                if a != b and bodies.w[b0 + a] + bodies.w[b0 + b] > S(0.0):
+                a = b0 + shapes.body[sa]
+                b = b0 + shapes.body[sb]
+                if a != b and bodies.w[a] + bodies.w[b] > S(0.0):
                     pair_mu = mu * wp.min(shapes.friction[sa], shapes.friction[sb])
-                    project_boxes(sa, b0 + a, sb, b0 + b, pair_mu, push, shapes, bodies)
-        supported = int(0)
+                    c = list_boxes(c, sa, a, sb, b, pair_mu, push, shapes, bodies, contacts)
         for b in range(count):
             if bodies.w[b0 + b] > S(0.0):
-                supported = project_table(b0 + b, b, first, last, tv[lane], shapes, bodies)
-                if supported + bodies.touching[b0 + b] < 3:
-                    supported = 0
-                # the sign of `touching` tells finish_body whether the body may sleep
-                if supported == 0:
-                    bodies.touching[b0 + b] = -1 - bodies.touching[b0 + b]
+                c = list_table(
+                    c, b0 + b, b, first, last, tv[lane], push, shapes, bodies, contacts
+                )
+        solve_contacts(start, c, bodies, contacts)
+        for b in range(b0, b0 + count):
+            end_body(b, bodies)
 
     @wp.func
     def watch_group(
@@ -136,7 +144,7 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
     @wp.kernel(module="unique", enable_backward=False, module_options=dict(KERNEL_OPTIONS))
     def forward(
         st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
-        q: Particles, near: Near, bodies: Bodies, grips: Grips, watch: Watch,
+        q: Particles, near: Near, bodies: Bodies, contacts: Contacts, grips: Grips, watch: Watch,
     ):  # fmt: skip
         g = wp.tid()
         k = group.topology[g]
@@ -236,12 +244,10 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                 )  # fmt: skip
                 travel = select(stale, zero, travel)
             # constraints
-            if st.alternate == 1 and substep % 2 == 1:
-                for s in range(s0, s1):
-                    project_distance(s1 - 1 - (s - s0), p0, inverse_dt2, q, springs)
-            else:
-                for s in range(s0, s1):
-                    project_distance(s, p0, inverse_dt2, q, springs)
+            # always in the same order: sweeping backwards in every other substep makes tight heaps
+            # crawl for ever, and shells jitter
+            for s in range(s0, s1):
+                project_distance(s, p0, inverse_dt2, q, springs)
             for c in range(near_start, near_start + near_count):
                 project_contact(c, p0, contact_mu, push, q, pairs, near)
             if wp.static(with_bodies):
@@ -249,7 +255,8 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                     if on[lane] > S(0.0):
                         for b in range(body_count):
                             bodies.touching[b0 + lane * body_count + b] = 0
-                        solve_bodies(g, lane, k, push, top, shapes, group, q, bodies)
+                            bodies.support[b0 + lane * body_count + b] = 0
+                        solve_bodies(g, lane, k, push, top, shapes, group, q, bodies, contacts)
             # table, velocities
             fastest = select(calm, V(st.calm_speed * dt), V(st.max_speed * dt))
             moved2 = zero
@@ -263,10 +270,7 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                     if on[lane] > S(0.0):
                         for b in range(body_count):
                             at = b0 + lane * body_count + b
-                            supported = bodies.touching[at] >= 0
-                            if not supported:
-                                bodies.touching[at] = -1 - bodies.touching[at]
-                            m = finish_body(at, dt, fastest[lane], supported, bodies)
+                            m = finish_body(at, dt, fastest[lane], bodies)
                             moved2[lane] = wp.max(moved2[lane], m)
             moved = root(moved2)
             travel = travel + moved

@@ -188,7 +188,6 @@ class SolverFusedXPBD(SolverBase):
         settings = data.types.Settings()
         settings.dt = c.dt
         settings.max_steps = max_steps
-        settings.alternate = int(c.alternate)
         settings.recovery = c.recovery
         settings.max_speed = c.max_speed
         settings.calm_speed = c.calm_speed

@@ -34,13 +34,13 @@ __all__ = ["sphere_contact"]
 def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     """`list_near` makes the list of a group, `project_contact` solves one of its pairs.
 
-    The normal correction separates at most as fast as the pair approached in this substep plus
-    `recovery`, so an overlap is pushed out without giving energy.
+    A correction may stop an approach, but it separates a pair at `recovery` at most, counting what
+    already separates it: an overlap that takes many substeps to undo does not gather speed.
     """
     t = structures(scalar, lanes)
     S, V, L = t.S, t.V, t.L
     Pairs, Particles, Near, Watch = t.Pairs, t.Particles, t.Near, t.Watch
-    coulomb = friction(scalar, lanes).coulomb
+    coulomb_soft = friction(scalar, lanes).coulomb_soft
 
     @wp.func
     def list_near(
@@ -95,12 +95,12 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             moved = (xi - q.xp[i]) - (xj - q.xp[j])
             approach = dot(moved, n)
             depth = wp.max(V(h) - l, zero) * near.mask[k]
-            depth = wp.min(depth, wp.max(-approach, zero) + V(push))
+            depth = wp.min(depth, wp.max(V(push) - approach, zero))
             wi = q.w[i]
             wj = q.w[j]
             share = one / wp.max(wi + wj, tiny)
             slip = moved - n * approach
-            f = coulomb(dot(slip, slip), depth * mu)
+            f = coulomb_soft(dot(slip, slip), depth * mu)
             step = n * (depth * share) - slip * (f * share)
             q.x[i] = xi + step * wi
             q.x[j] = xj - step * wj

@@ -28,7 +28,6 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
 
         dt: S  # [s]
         max_steps: int  # substeps of this launch at most
-        alternate: int  # 1: sweep constraints backwards in every other substep
         recovery: S  # fastest separation of overlapping bodies [m/s]
         max_speed: S  # clamp [m/s]
         calm_speed: S  # clamp while a world is calmed [m/s]
@@ -89,6 +88,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         body_start: wp.array(dtype=int)
         near_start: wp.array(dtype=int)
         near_capacity: wp.array(dtype=int)
+        contact_start: wp.array(dtype=int)
         active: wp.array(dtype=V)  # 1: simulate this world, 0: leave it alone
         gravity: wp.array(dtype=V3)  # [m/s^2]
         damping: wp.array(dtype=V)  # [1/s]
@@ -134,6 +134,26 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         inertia: wp.array(dtype=M33)  # in the body's frame [kg m^2]
         inverse_inertia: wp.array(dtype=M33)
         touching: wp.array(dtype=int)  # contacts with particles and bodies in the last substep
+        support: wp.array(dtype=int)  # the same and those with the table
+        dx: wp.array(dtype=R3)  # correction by contacts in this substep [m]
+        dr: wp.array(dtype=R3)  # the same as a rotation vector [rad]
+        spread: wp.array(dtype=M33)  # inverse inertia in the world's frame [1/(kg m^2)]
+
+    @wp.struct
+    class Contacts:
+        """Scratch per group, for one lane at a time: where bodies touch each other and the table."""
+
+        a: wp.array(dtype=int)  # body row, -1: the table
+        b: wp.array(dtype=int)
+        ra: wp.array(dtype=R3)  # arms from the centres of mass [m]
+        rb: wp.array(dtype=R3)
+        normal: wp.array(dtype=R3)  # from a to b
+        u: wp.array(dtype=R3)  # across it
+        v: wp.array(dtype=R3)
+        weights: wp.array(dtype=R3)  # inverse masses along normal, u and v [1/kg]
+        steps: wp.array(dtype=R3)  # gap, with the overlap that may remain, and slip along u, v [m]
+        impulse: wp.array(dtype=R3)  # along normal, u and v [kg m]
+        mu: wp.array(dtype=S)
 
     @wp.struct
     class Grips:
@@ -174,5 +194,5 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
     return SimpleNamespace(
         **vars(t), Settings=Settings, Topology=Topology, Springs=Springs, Pairs=Pairs,
         Shapes=Shapes, Group=Group, Particles=Particles, Near=Near, Bodies=Bodies, Grips=Grips,
-        Watch=Watch,
+        Watch=Watch, Contacts=Contacts,
     )  # fmt: skip

@@ -14,12 +14,13 @@ from ..objects.cable import Cable, RingConfig, add_cable, cable_ring
 from ..objects.push import Push
 from ..objects.zone import ring_zone
 from ..rendering.pixels import BOUNDS
+from .cable_physics import CABLE_SOLVER, CABLE_STAGE
 from .demonstrators import farthest_bead, pick_place, ring_maps
 from .free_space import FreeSpace
 from .ground_truth import pose_rows
 from .metrics import hull_area
 from .shapes import chain_yaw
-from .task import Action, Layout, Snapshot, Stage, Task
+from .task import Action, Layout, Snapshot, Task
 
 if TYPE_CHECKING:
     import newton
@@ -45,7 +46,8 @@ class CableRing(Task):
     """
 
     name = "cable-ring"
-    stages = (Stage(lift=0.04, speed=0.15),)
+    stages = (CABLE_STAGE,)
+    solver = CABLE_SOLVER
     success_score = 0.75
     ground_truth_size = 192
     objects = ("cable",)

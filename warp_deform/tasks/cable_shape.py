@@ -12,12 +12,13 @@ import numpy as np
 
 from ..objects.cable import Cable, CableConfig, add_cable, cable_line
 from ..objects.zone import segment_zone
+from .cable_physics import CABLE_SOLVER, CABLE_STAGE
 from .demonstrators import pick_place, visible_point
 from .free_space import FreeSpace
 from .ground_truth import pose_rows
 from .metrics import share_in_zone, wrap_angle
 from .shapes import chain_yaw, sample_shape, to_world
-from .task import Action, Layout, Snapshot, Stage, Task
+from .task import Action, Layout, Snapshot, Task
 
 if TYPE_CHECKING:
     import newton
@@ -39,7 +40,8 @@ class CableShape(Task):
     """
 
     name = "cable-shape"
-    stages = (Stage(lift=0.04, speed=0.15),)
+    stages = (CABLE_STAGE,)
+    solver = CABLE_SOLVER
     success_score = 1.0
     ground_truth_size = 147
     objects = ("cable",)

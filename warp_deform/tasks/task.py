@@ -123,9 +123,7 @@ class Task(abc.ABC):
         """Speed [m/s] of the loaded tip at a lift [m]: that of the stage with the nearest lift."""
         return min(self.stages, key=lambda stage: abs(stage.lift - lift)).speed
 
-    def privileged_stage(
-        self, segment: int, snapshot: Snapshot, previous: Stage | None
-    ) -> Stage:
+    def privileged_stage(self, segment: int, snapshot: Snapshot, previous: Stage | None) -> Stage:
         """Stage of a pick on what has the segmentation id `segment`, by the paper's hidden rule.
 
         snapshot: the state before the action; previous: the episode's stage before, None at first.

@@ -1,0 +1,168 @@
+"""A video of recorded episodes: simulated again, with the arm that moves through its way-points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .episode_loop import worlds_for
+from .episodes import Episode, EpisodeReader
+from .errors import InputError, WarpDeformError
+from .rendering.caption import annotate
+from .rendering.scene_view import ArmMeshes, SceneView
+from .rendering.video import VideoWriter
+from .replay import Recording
+from .workers import single_threaded
+from .worlds import StepReport, Worlds
+
+__all__ = ["check_video", "film"]
+
+FPS = 24
+LONGEST = 20.0
+"""Length of a video [s]: longer episodes are shown faster, and the picture says how much."""
+RETURN_SECONDS = 0.5
+"""Time that the drawn arm takes back to where it waits [s]; the next action starts from there."""
+STILL_SECONDS = 0.7
+"""The first and the last state of an episode stay for so long in the video [s]."""
+_SLOTS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """What one frame shows: a state, joint positions (dof,) [rad], and the row it comes after."""
+
+    particle_q: np.ndarray
+    body_q: np.ndarray
+    q: np.ndarray
+    row: int
+
+
+def check_video(path: Path) -> None:
+    """Raise InputError unless a video can be written to `path`."""
+    VideoWriter(path, FPS)
+
+
+def film(
+    folder: Path,
+    path: Path,
+    *,
+    seeds: Sequence[int] | None = None,
+    size: tuple[int, int] = (540, 960),
+) -> None:
+    """Write an MP4 of episodes of a folder, by default the first; the arm is the recorded one.
+
+    The states are simulated again, not stored, and have to be the recorded ones bit by bit.
+    size: rows and columns of a frame.
+
+    Raises:
+        InputError: the path does not end with .mp4 or cannot be written, or there is no episode.
+        WarpDeformError: the simulation differs from the recording.
+    """
+    reader = EpisodeReader(folder)
+    chosen = reader.seeds[:1] if seeds is None else seeds
+    infos = [reader.info(seed) for seed in chosen]
+    for info in infos:
+        if not info.actions:
+            raise InputError(f"{reader.path(info.seed)} has no action that could be shown")
+    length = LONGEST - 2 * STILL_SECONDS * len(infos)
+    speed = max(1.0, sum(info.sim_seconds for info in infos) / length)
+    view = SceneView(size)
+    with single_threaded(), VideoWriter(path, FPS) as video:
+        for info in infos:
+            worlds = worlds_for(info.task, info.robot, _SLOTS)
+            episode, robot = reader.read(info.seed), worlds.robot
+            arm = ArmMeshes(robot.meshes())
+            inset: tuple[int, np.ndarray | None] = -1, None
+            for shot in _shots(worlds, Recording(reader), episode, speed):
+                if shot.row != inset[0]:
+                    inset = shot.row, _seen(episode, shot.row)
+                links = arm.at(robot.link_poses(shot.q))
+                drawables = worlds.episodes[0].drawables
+                frame = view.render(drawables, shot.particle_q, shot.body_q, links)
+                lines = _caption(episode, shot.row, speed)
+                video.write(annotate(frame, lines=lines, inset=inset[1]))
+
+
+def _shots(worlds: Worlds, recording: Recording, episode: Episode, speed: float) -> Iterator[_Shot]:
+    """Every frame of an episode, while it is simulated again in slot 0."""
+    seed = episode.info.seed
+    goal = recording.goal(seed)
+    worlds.reset({0: seed}, goals={} if goal is None else {0: goal})
+    _check(worlds, episode, 0)
+    interval = speed / FPS
+    still = round(STILL_SECONDS * FPS)
+    for t, step in enumerate(episode.steps[:-1]):
+        start = worlds.episodes[0].snapshot
+        assert step.action is not None
+        report = worlds.step({0: step.action}, record=interval)[0]
+        _check(worlds, episode, t + 1)
+        arm = _ArmPath(report, worlds.robot.home_q)
+        if t == 0:
+            yield from [_Shot(start.particle_q, start.body_q, arm.at(0.0), t)] * still
+        assert report.frames is not None
+        frames = report.frames
+        for time, particle_q, body_q in zip(
+            frames.times, frames.particle_q, frames.body_q, strict=True
+        ):
+            yield _Shot(particle_q, body_q, arm.at(time), t)
+        end = worlds.episodes[0].snapshot
+        for time in np.arange(frames.times[-1] + interval, arm.seconds, interval):
+            yield _Shot(end.particle_q, end.body_q, arm.at(time), t)
+    yield from [_Shot(end.particle_q, end.body_q, arm.at(arm.seconds), t + 1)] * still
+
+
+class _ArmPath:
+    """Joint positions during one action: along its motions, then back to where it began."""
+
+    def __init__(self, report: StepReport, home_q: np.ndarray) -> None:
+        self._pieces: list[tuple[float, np.ndarray, np.ndarray]] = []
+        begin, last = 0.0, None
+        for motion, joints in zip(report.motions, report.joints, strict=True):
+            if joints is None:  # out of reach: the arm stays where it is
+                break
+            self._pieces.append((begin, begin + motion.times, joints))
+            begin, last = begin + motion.seconds, joints[-1]
+        wait = self._pieces[0][2][0] if self._pieces else home_q
+        if last is not None:
+            times = begin + np.array([0.0, RETURN_SECONDS])
+            self._pieces.append((begin, times, np.array([last, wait])))
+        self._wait = wait
+        self.seconds = begin + (RETURN_SECONDS if last is not None else 0.0)
+
+    def at(self, time: float) -> np.ndarray:
+        """Joint positions (dof,) [rad] at a time from the beginning of the action [s]."""
+        piece = None
+        for candidate in self._pieces:
+            if candidate[0] <= time:
+                piece = candidate
+        if piece is None:
+            return self._wait
+        _, times, joints = piece
+        return np.array([np.interp(time, times, q) for q in joints.T])
+
+
+def _check(worlds: Worlds, episode: Episode, t: int) -> None:
+    """Raise unless the simulated state is the recorded one of row t."""
+    if worlds.hash(0) != episode.steps[t].state_hash:
+        raise WarpDeformError(
+            f"row {t} of seed {episode.info.seed} comes out differently here, so its video would "
+            "show something else; `warp-deform replay --verify` compares everything"
+        )
+
+
+def _caption(episode: Episode, row: int, speed: float) -> tuple[str, ...]:
+    info, step = episode.info, episode.steps[row]
+    doing = f"action {row + 1} of {info.actions}" if row < info.actions else "done"
+    fast = f"   {speed:.1f} x" if speed > 1.05 else ""
+    return info.task, f"{doing}   score {step.score:.2f}{fast}", f"seed {info.seed}"
+
+
+def _seen(episode: Episode, row: int) -> np.ndarray:
+    """What a policy sees in a row: the top-down picture, beside the goal's where there is one."""
+    pictures = [episode.steps[row].color]
+    if episode.goal is not None:
+        pictures.append(episode.goal.color)
+    return np.concatenate(pictures, axis=1)
