@@ -119,7 +119,9 @@ def frames(solver: SolverFusedXPBD, steps: int, every: int = 1) -> np.ndarray:
     return recorded.reshape(count, total, 3, -1)[..., 0].copy()
 
 
-def body_frames(solver: SolverFusedXPBD, steps: int, every: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def body_frames(
+    solver: SolverFusedXPBD, steps: int, every: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
     """Run a lone world; centres of mass (F, B, 3) and rotations (F, B, 4) of its bodies."""
     solver.run(steps, record_every=every)
     count, total = -(-steps // every), int(solver.data.group_body[-1])

@@ -8,29 +8,19 @@ from scipy.spatial.transform import Rotation
 from solver_scenes import (
     LOOSE,
     G,
-    add_particles,
     body_frames,
     box_solver,
     energy,
-    finalize,
     ideal,
-    new_builder,
-    positions,
     rotation_matrices,
     tilt,
-    velocities,
 )
 
 from warp_deform.objects import (
     BoxConfig,
     BoxPart,
-    CableConfig,
-    add_box,
-    add_cable,
-    cable_line,
     l_block,
 )
-from warp_deform.rollout import GripPath, rollout
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 
 DT = 1 / 1200
@@ -67,7 +57,9 @@ def assert_stands(solver: SolverFusedXPBD, start: np.ndarray, *, settle: float =
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("config", [CUBE, PLATE, BAR, l_block()], ids=["cube", "plate", "bar", "L"])
 def test_a_box_rests_flat_without_creep(config, precision):
-    solver = box_solver((config, (0.5, 0, -config.lowest)), config=SOLID, yaw=0.4, precision=precision)
+    solver = box_solver(
+        (config, (0.5, 0, -config.lowest)), config=SOLID, yaw=0.4, precision=precision
+    )
     assert_stands(solver, x_of(solver))
     assert solver.data.views["bodies.x"][0, 2] - (x_of(solver)[0, 2]) == 0
     corners = x_of(solver)[0, 2] + config.lowest - config.inertia()[0][2]
@@ -95,7 +87,10 @@ def test_a_small_box_stands_on_a_large_one_whatever_their_order():
 
 def test_a_large_box_stands_on_a_small_one():
     large = block((0.2, 0.2, 0.02), 0.6, 0.2)
-    for parts in ([(CUBE, (0, 0, 0.02)), (large, (0, 0, 0.05))], [(large, (0, 0, 0.05)), (CUBE, (0, 0, 0.02))]):
+    for parts in (
+        [(CUBE, (0, 0, 0.02)), (large, (0, 0, 0.05))],
+        [(large, (0, 0, 0.05)), (CUBE, (0, 0, 0.02))],
+    ):
         solver = box_solver(*parts, config=SOLID)
         assert_stands(solver, np.array([p for _, p in parts]))
 
@@ -113,12 +108,12 @@ def test_boxes_balance_edge_on_edge():
     solver = box_solver((BAR, (0, 0, 0.02)), (BAR, (0, 0, 0.055)), config=SOLID)
     views = solver.data.views
     views["bodies.q"][0] = Rotation.from_euler("x", 45, degrees=True).as_quat()
-    views["bodies.q"][1] = Rotation.from_euler("zx", [90, 45], degrees=True).as_quat()
+    views["bodies.q"][1] = Rotation.from_euler("ZX", [90, 45], degrees=True).as_quat()
     views["bodies.w"][0] = views["bodies.w0"][0] = 0.0
     diagonal = 0.01 * np.sqrt(2)
     views["bodies.x"][0, 2] = diagonal
     views["bodies.x"][1, 2] = 3 * diagonal + 1e-3
-    x, _ = body_frames(solver, 120)
+    x, _ = body_frames(solver, 48)
     assert x[-1, 1, 2] == pytest.approx(3 * diagonal, abs=2e-4)
     assert x[:, 1, 2].min() > 3 * diagonal - 2e-4
 
@@ -134,7 +129,9 @@ def test_a_box_dropped_on_an_edge_settles_on_a_face(angles):
     assert np.abs(solver.data.views["bodies.v"]).max() < 1e-3
 
 
-@pytest.mark.parametrize("config", [CUBE, PLATE, block((0.03, 0.06, 0.04), 0.15)], ids=["cube", "plate", "flat"])
+@pytest.mark.parametrize(
+    "config", [CUBE, PLATE, block((0.03, 0.06, 0.04), 0.15)], ids=["cube", "plate", "flat"]
+)
 def test_a_box_slides_to_a_stop_after_v2_over_2_mu_g(config):
     mu, speed = config.friction, 0.8
     solver = box_solver((config, (0, 0, -config.lowest)), config=ideal(table_friction=1.0))
@@ -145,7 +142,9 @@ def test_a_box_slides_to_a_stop_after_v2_over_2_mu_g(config):
     assert np.abs(x_of(solver)[0, 1]) < 1e-3
 
 
-def on_slope(config: BoxConfig, ratio: float, seconds: float, solver_config: SolverConfig | None = None):
+def on_slope(
+    config: BoxConfig, ratio: float, seconds: float, solver_config: SolverConfig | None = None
+):
     """Acceleration and distance [m] down a slope with tan(angle) = ratio * friction."""
     angle = np.arctan(ratio * config.friction)
     solver = box_solver(
@@ -215,7 +214,7 @@ def test_a_sliding_box_drags_the_one_below_by_friction():
     solver.run(60)
     views = solver.data.views
     views["bodies.v"][1] = 0.5, 0, 0
-    momentum = 0.1 * 0.5
+    momentum = np.array([0.2, 0.1]) @ views["bodies.v"][:, 0]
     seconds = 0.05
     solver.run(round(seconds / DT))
     v = views["bodies.v"][:, 0]
@@ -226,7 +225,9 @@ def test_a_sliding_box_drags_the_one_below_by_friction():
 
 def test_no_stack_gains_energy():
     spots = [(CUBE, (0.004 * k, 0.003 * k, 0.03 + 0.05 * k)) for k in range(3)]
-    solver = box_solver(*spots, yaw=[0.2, 0.9, 1.7], config=ideal(table_friction=1.0, contact_friction=1.0))
+    solver = box_solver(
+        *spots, yaw=[0.2, 0.9, 1.7], config=ideal(table_friction=1.0, contact_friction=1.0)
+    )
     levels = [energy(solver)]
     for _ in range(80):
         solver.run(15)

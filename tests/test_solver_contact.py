@@ -42,7 +42,9 @@ def test_a_sliding_bead_stops_after_v2_over_2_mu_g():
         assert np.abs(velocities(solver)).max() < 1e-3
 
 
-def slope(ratios: np.ndarray, mu: float, *, steps: int, warm: int = 120) -> tuple[np.ndarray, np.ndarray]:
+def slope(
+    ratios: np.ndarray, mu: float, *, steps: int, warm: int = 120
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean speed and acceleration down the slope of beads; ratios: tan(angle) / mu."""
     one = new_builder()
     add_particles(one, [(0, 0, RADIUS)])
@@ -216,7 +218,9 @@ def test_a_dragged_ring_keeps_its_perimeter():
     times = np.array([0.0, 2.0, 2.2])
     start = positions(solver)[0]
     path = np.array([start, start + [0.0, 0.3, 0.0], start + [0.0, 0.3, 0.0]])
-    result = rollout(solver, [0], paths={0: GripPath(times, path, particle=0)}, record=0.05, most=5.0)
+    result = rollout(
+        solver, [0], paths={0: GripPath(times, path, particle=0)}, record=0.05, most=5.0
+    )
     x = result[0].frames.particle_q
     edges = np.linalg.norm(x - np.roll(x, -1, axis=1), axis=2)
     perimeter = config.beads * config.spacing
@@ -232,7 +236,9 @@ def test_a_dragged_cable_trails_behind_the_tip():
     solver = finalize(builder, SolverConfig(), precision="float32")
     start = positions(solver)[-1]
     path = np.array([start, start + [0.3, 0.0, 0.0]])
-    result = rollout(solver, [0], paths={0: GripPath(np.array([0.0, 2.0]), path, particle=23)}, most=5.0)
+    result = rollout(
+        solver, [0], paths={0: GripPath(np.array([0.0, 2.0]), path, particle=23)}, most=5.0
+    )
     x = positions(solver)
     np.testing.assert_allclose(x[-1], start + [0.3, 0, 0], atol=2e-3)
     assert np.abs(x[:, 1]).max() < 1e-3

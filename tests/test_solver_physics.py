@@ -128,7 +128,11 @@ def test_a_tumbling_box_keeps_momentum_and_energy(config):
         views = solver.data.views
         views["bodies.v"][0] = 0.3, -0.2, 0.1
         views["bodies.omega"][0] = 1.0, 8.0, 0.5
-        spin, start, x = angular_momentum(solver)[0], energy(solver, gravity=0.0), views["bodies.x"].copy()
+        spin, start, x = (
+            angular_momentum(solver)[0],
+            energy(solver, gravity=0.0),
+            views["bodies.x"].copy(),
+        )
         solver.run(round(1.0 / dt))
         np.testing.assert_allclose(views["bodies.v"][0], [0.3, -0.2, 0.1], rtol=0, atol=1e-11)
         np.testing.assert_allclose(views["bodies.x"] - x, [[0.3, -0.2, 0.1]], rtol=0, atol=1e-11)

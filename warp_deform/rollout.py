@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .solver.guards import WatchValues
     from .solver.solver import SolverFusedXPBD
 
-__all__ = ["GripPath", "Frames", "Rollout", "rollout"]
+__all__ = ["Frames", "GripPath", "Rollout", "rollout"]
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -46,7 +46,9 @@ class GripPath:
         if len(times) < 2 or times[0] != 0 or (np.diff(times) < 0).any():
             raise InputError("the times of a grip path must start at 0 and ascend, at least two")
         if np.shape(self.positions) != (len(times), 3) or not np.isfinite(self.positions).all():
-            raise InputError(f"a path of {len(times)} knots needs finite positions ({len(times)}, 3)")
+            raise InputError(
+                f"a path of {len(times)} knots needs finite positions ({len(times)}, 3)"
+            )
 
 
 @dataclass(frozen=True, eq=False)

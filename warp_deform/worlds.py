@@ -6,8 +6,8 @@ episode's bits depend on its seed and its actions only, not on its neighbours or
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import newton
 import numpy as np
@@ -137,9 +137,7 @@ class Worlds:
 
     # -- starting
 
-    def reset(
-        self, seeds: Mapping[int, int], *, goals: Mapping[int, Goal] | None = None
-    ) -> None:
+    def reset(self, seeds: Mapping[int, int], *, goals: Mapping[int, Goal] | None = None) -> None:
         """Start an episode with the given seed in every named slot.
 
         A goal-conditioned task gets the goal from `goals`, or constructs one from the seed.
@@ -160,7 +158,9 @@ class Worlds:
             layouts = {s: self.task.sample(rngs[s], self._space) for s in waiting}
             made = {s: goals[s] for s in waiting if s in goals}
             if self.task.goal_conditioned:
-                made |= self._construct_goals({s: layouts[s] for s in waiting if s not in made}, seeds)
+                made |= self._construct_goals(
+                    {s: layouts[s] for s in waiting if s not in made}, seeds
+                )
                 layouts = {s: l.with_targets(made[s].targets) for s, l in layouts.items()}
             self._start(layouts, seeds, made)
             again = []
@@ -259,7 +259,9 @@ class Worlds:
         carry_joints = dict(
             zip(carries, solve_joints(self.robot, list(carries.values())), strict=True)
         )
-        paths = {s: p for s, p in paths.items() if carry_joints[s] is not None and joints[s] is not None}
+        paths = {
+            s: p for s, p in paths.items() if carry_joints[s] is not None and joints[s] is not None
+        }
         after = self._run_paths(paths, record) if paths else {}
         reports = {}
         for slot in actions:

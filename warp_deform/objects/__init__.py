@@ -2,8 +2,10 @@
 
 from .box import Box, BoxConfig, BoxPart, add_box, l_block
 from .cable import Cable, CableConfig, RingConfig, add_cable, cable_line, cable_ring
+from .push import Push
 from .zone import Zone, ring_zone, segment_zone, square_zone
 
-__all__ = ["Box", "BoxConfig", "BoxPart", "Cable", "CableConfig", "RingConfig", "Zone", "add_box",
+__all__ = ["Box", "BoxConfig", "BoxPart", "Cable", "CableConfig", "Push", "RingConfig", "Zone",
+           "add_box",
            "add_cable", "cable_line", "cable_ring", "l_block", "ring_zone", "segment_zone",
            "square_zone"]  # fmt: skip

@@ -18,7 +18,7 @@ from .colors import RED, Color
 if TYPE_CHECKING:
     import newton
 
-__all__ = ["Box", "BoxConfig", "BoxPart", "add_box", "l_block"]
+__all__: list[str] = []  # `warp_deform.objects` is the import path of what is here
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from .colors import BLUE, WHITE, YELLOW, Color
 if TYPE_CHECKING:
     import newton
 
-__all__ = ["Cable", "CableConfig", "RingConfig", "add_cable", "cable_line", "cable_ring"]
+__all__: list[str] = []  # `warp_deform.objects` is the import path of what is here
 
 
 @dataclass(frozen=True, kw_only=True)

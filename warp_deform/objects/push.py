@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+__all__: list[str] = []  # `warp_deform.objects` is the import path of what is here
+
 
 @dataclass(frozen=True, eq=False)
 class Push:

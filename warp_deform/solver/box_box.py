@@ -24,7 +24,8 @@ POINTS = 12
 @functools.cache
 def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
     """`list_boxes(c, sa, a, sb, b, ...)`: adds the contacts of shape sa of body a with shape sb of
-    body b to the list, from number c on, and returns the next number."""
+    body b to the list, from number c on, and returns the next number.
+    """
     t = structures(scalar, lanes)
     S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
     Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
@@ -50,7 +51,8 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
         mu: S, push: S, bodies: Bodies, contacts: Contacts,
     ):  # fmt: skip
         """Contacts between the face of box a with outward normal n (its axis `axis`) and the side of
-        box b that faces it: the corners of their common area. Returns the next number."""
+        box b that faces it: the corners of their common area. Returns the next number.
+        """
         u = column(aa, (axis + 1) % 3)
         v = column(aa, (axis + 2) % 3)
         hu = ha[(axis + 1) % 3]
@@ -164,7 +166,21 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
                     )
                 elif kind < 6:
                     c = list_face(
-                        c, b, a, kind - 3, -normal, cb, ab, hb, ca, aa, ha, mu, push, bodies, contacts
+                        c,
+                        b,
+                        a,
+                        kind - 3,
+                        -normal,
+                        cb,
+                        ab,
+                        hb,
+                        ca,
+                        aa,
+                        ha,
+                        mu,
+                        push,
+                        bodies,
+                        contacts,
                     )
                 else:
                     ea = (kind - 6) // 3

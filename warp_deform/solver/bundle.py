@@ -67,7 +67,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     try:
         with zipfile.ZipFile(path) as archive:
             names = [name.removesuffix(".npy") for name in archive.namelist()]
-            values = {n: np.load(BytesIO(archive.read(f"{n}.npy")), allow_pickle=False) for n in names}
+            values = {
+                n: np.load(BytesIO(archive.read(f"{n}.npy")), allow_pickle=False) for n in names
+            }
         header = json.loads(values.pop("header").tobytes())
         known = set(header) == _HEADER and set(header["settings"]) == set(_SETTINGS)
     except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:

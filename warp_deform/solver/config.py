@@ -44,4 +44,6 @@ class SolverConfig:
                 raise InputError(f"SolverConfig.{name} must be positive, got {getattr(self, name)}")
         for name in ("damping", "table_friction", "contact_friction", "recovery", "rest_seconds"):
             if not getattr(self, name) >= 0:
-                raise InputError(f"SolverConfig.{name} must not be negative, got {getattr(self, name)}")
+                raise InputError(
+                    f"SolverConfig.{name} must not be negative, got {getattr(self, name)}"
+                )

@@ -25,7 +25,9 @@ _NUMPY = {wp.float32: np.float32, wp.float64: np.float64}
 class Mirrored:
     """A Warp array with a NumPy view of its scalars; on the CPU the view is the array itself."""
 
-    def __init__(self, count: int, dtype: Any, device: Any, scalar: Any, shape: tuple[int, ...]) -> None:
+    def __init__(
+        self, count: int, dtype: Any, device: Any, scalar: Any, shape: tuple[int, ...]
+    ) -> None:
         self._host = wp.zeros(max(count, 1), dtype=dtype, device="cpu")
         self.array = self._host if device.is_cpu else wp.zeros_like(self._host, device=device)
         shape = (max(count, 1), *shape)
@@ -106,7 +108,9 @@ class SolverData:
         self.has_bodies = self.group_body[-1] > 0
         self.has_particles = self.group_particle[-1] > 0
 
-    def _add(self, name: str, count: int, dtype: Any, shape: tuple[int, ...], number: Any) -> np.ndarray:
+    def _add(
+        self, name: str, count: int, dtype: Any, shape: tuple[int, ...], number: Any
+    ) -> np.ndarray:
         self.arrays[name] = Mirrored(count, dtype, self.device, number, shape)
         return self.arrays[name].view
 
@@ -141,7 +145,11 @@ class SolverData:
         for name in ("springs.length", "springs.compliance", "springs.limit", "pairs.distance",
                      "shapes.friction"):  # fmt: skip
             self._constant(name, joined(_field(name)), t.S, number)
-        for name, dtype in (("shapes.center", t.R3), ("shapes.half", t.R3), ("shapes.rotation", t.Q)):
+        for name, dtype in (
+            ("shapes.center", t.R3),
+            ("shapes.half", t.R3),
+            ("shapes.rotation", t.Q),
+        ):
             self._constant(name, joined(_field(name)), dtype, number)
         groups, L = self.group_count, self.lanes
         capacity = [
@@ -203,11 +211,22 @@ class SolverData:
                 ids, rows = self.body_ids[w], self.body_rows(w)
                 self.views["bodies.w0"][rows] = self.model.body_inv_mass.numpy()[ids]
                 self.views["bodies.inertia"][rows] = self.model.body_inertia.numpy()[ids]
-                self.views["bodies.inverse_inertia"][rows] = self.model.body_inv_inertia.numpy()[ids]
+                self.views["bodies.inverse_inertia"][rows] = self.model.body_inv_inertia.numpy()[
+                    ids
+                ]
 
     def _fill_grips(self) -> None:
         t, number, slots = self.types, self.number, self.group_count * self.lanes
-        for name in ("particle", "body", "tick", "knot", "knot_start", "knot_end", "push", "push_steps"):
+        for name in (
+            "particle",
+            "body",
+            "tick",
+            "knot",
+            "knot_start",
+            "knot_end",
+            "push",
+            "push_steps",
+        ):
             self._add(f"grips.{name}", slots, wp.int32, (), np.int32)
         for name, dtype, shape in (
             ("offset", t.R3, (3,)), ("turn", t.Q, (4,)), ("lower_start", t.S, ()),

@@ -91,7 +91,9 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                 x = q.x[p0 + i]
                 d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
                 if wp.dot(d, d) < (far + radius) * (far + radius):
-                    project_box_particle(p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies)
+                    project_box_particle(
+                        p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
+                    )
         for b in range(b0, b0 + count):
             begin_body(b, bodies)
         start = group.contact_start[g]
@@ -105,9 +107,7 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                     c = list_boxes(c, sa, a, sb, b, pair_mu, push, shapes, bodies, contacts)
         for b in range(count):
             if bodies.w[b0 + b] > S(0.0):
-                c = list_table(
-                    c, b0 + b, b, first, last, tv[lane], push, shapes, bodies, contacts
-                )
+                c = list_table(c, b0 + b, b, first, last, tv[lane], push, shapes, bodies, contacts)
         solve_contacts(start, c, bodies, contacts)
         for b in range(b0, b0 + count):
             end_body(b, bodies)

@@ -69,7 +69,10 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
             for shape in range(first, last):
                 if shapes.body[shape] == grips.body[w]:
                     for c in range(8):
-                        z = bodies.x[b][2] + wp.quat_rotate(bodies.q[b], corner(shape, c, shapes))[2]
+                        z = (
+                            bodies.x[b][2]
+                            + wp.quat_rotate(bodies.q[b], corner(shape, c, shapes))[2]
+                        )
                         if z < S(CONTACT):
                             hit = True
         return hit

@@ -81,7 +81,11 @@ class PhysicsError(WarpDeformError):
     """A guard fired. `problems` names every cause; `bundle` reproduces it, when one was written."""
 
     def __init__(self, problems: tuple[Problem, ...], bundle: Path | None = None) -> None:
-        where = f"; reproduce it with warp_deform.solver.replay_bundle({str(bundle)!r})" if bundle else ""
+        where = (
+            f"; reproduce it with warp_deform.solver.replay_bundle({str(bundle)!r})"
+            if bundle
+            else ""
+        )
         super().__init__("; ".join(map(str, problems)) + where)
         self.problems = problems
         self.bundle = bundle

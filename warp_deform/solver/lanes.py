@@ -20,9 +20,25 @@ import warp as wp
 
 from ..errors import InputError
 
-__all__ = ["KERNEL_OPTIONS", "LANES", "PRECISIONS", "add", "any_less", "cross", "div", "dot",
-           "largest", "length", "less", "lane_types", "mul", "nonfinite", "root", "select",
-           "sub"]  # fmt: skip
+__all__ = [
+    "KERNEL_OPTIONS",
+    "LANES",
+    "PRECISIONS",
+    "add",
+    "any_less",
+    "cross",
+    "div",
+    "dot",
+    "lane_types",
+    "largest",
+    "length",
+    "less",
+    "mul",
+    "nonfinite",
+    "root",
+    "select",
+    "sub",
+]  # fmt: skip
 
 LANES = (1, 4, 8, 16)
 PRECISIONS = (wp.float32, wp.float64)
@@ -69,9 +85,7 @@ def _overloads(scalar: Any, lanes: int) -> tuple[SimpleNamespace, dict[str, list
     @wp.func_native(f"{c_type} r = a.c[0]; {each} r = a.c[i] > r ? a.c[i] : r; return r;")
     def largest(a: vector) -> scalar: ...
 
-    @wp.func_native(
-        f"{c_vector} r; {each} r.c[i] = (a.c[i] - a.c[i]) == 0 ? 0 : 1; return r;"
-    )
+    @wp.func_native(f"{c_vector} r; {each} r.c[i] = (a.c[i] - a.c[i]) == 0 ? 0 : 1; return r;")
     def nonfinite(a: vector) -> vector: ...
 
     @wp.func

@@ -85,7 +85,8 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def finish_body(b: int, dt: S, fastest: S, bodies: Bodies):
         """Velocities from the substep; returns the squared step of the centre of mass [m^2], with
-        the turning counted at 2 cm from it."""
+        the turning counted at 2 cm from it.
+        """
         d = bodies.x[b] - bodies.xp[b]
         # the inverse of `turned`, which turns by twice the arc tangent of half the vector's length
         turn = bodies.q[b] * wp.quat_inverse(bodies.qp[b])

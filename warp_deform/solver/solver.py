@@ -123,7 +123,12 @@ class SolverFusedXPBD(SolverBase):
             self.data.per_world(f"group.{name}", world)[:] = value
 
     def set_duration(
-        self, least: float | np.ndarray, most: float | np.ndarray, *, calm: float = 0.0, calm_after: float = 0.0
+        self,
+        least: float | np.ndarray,
+        most: float | np.ndarray,
+        *,
+        calm: float = 0.0,
+        calm_after: float = 0.0,
     ) -> None:
         """Substeps that worlds run at least after their path, and at most in all, in the next launch.
 
@@ -236,9 +241,7 @@ class SolverFusedXPBD(SolverBase):
 
     def check(self, values: list[WatchValues]) -> None:
         """Raise `PhysicsError` if a guard fired in any world, writing a bundle if asked for."""
-        problems = tuple(
-            p for w, v in enumerate(values) for p in v.problems(w, self.config.limits)
-        )
+        problems = tuple(p for w, v in enumerate(values) for p in v.problems(w, self.config.limits))
         if problems:
             raise PhysicsError(problems, self._write_bundle())
 

@@ -74,9 +74,7 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         return n
 
     @wp.func
-    def project_contact(
-        k: int, p0: int, mu: V, push: S, q: Particles, pairs: Pairs, near: Near
-    ):
+    def project_contact(k: int, p0: int, mu: V, push: S, q: Particles, pairs: Pairs, near: Near):
         pair = near.pair[k]
         ij = pairs.ij[pair]
         h = pairs.distance[pair]
@@ -107,7 +105,14 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def touches(
-        particle: int, lane: int, p0: int, start: int, n: int, q: Particles, pairs: Pairs, near: Near
+        particle: int,
+        lane: int,
+        p0: int,
+        start: int,
+        n: int,
+        q: Particles,
+        pairs: Pairs,
+        near: Near,
     ):
         """Whether a particle of one lane touches another that is not its neighbour along the chain."""
         hit = bool(False)

@@ -32,7 +32,9 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         q.x[i] = x + (q.v[i] + fall) * (kept * free)
 
     @wp.func
-    def finish(i: int, radius: S, inverse_dt: S, mu: V, fastest: V, all_on: bool, on: V, q: Particles):
+    def finish(
+        i: int, radius: S, inverse_dt: S, mu: V, fastest: V, all_on: bool, on: V, q: Particles
+    ):
         x = q.x[i]
         o = q.xp[i]
         zero = V(S(0.0))

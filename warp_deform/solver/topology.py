@@ -67,7 +67,9 @@ def _slices(worlds: np.ndarray, count: int, what: str) -> list[np.ndarray]:
     return [np.flatnonzero(worlds == w) for w in range(count)]
 
 
-def read_worlds(model: newton.Model) -> tuple[list[WorldTopology], list[np.ndarray], list[np.ndarray]]:
+def read_worlds(
+    model: newton.Model,
+) -> tuple[list[WorldTopology], list[np.ndarray], list[np.ndarray]]:
     """Topology, particle numbers and body numbers of every world of `model`.
 
     Raises:
