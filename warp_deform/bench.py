@@ -2,8 +2,8 @@
 
 Process CPU time, kernels compiled before. Every start is different: a figure is the median over
 starts for the lone world, and of repeated launches for the 64 worlds in lanes. "Falling" is the
-time from the start, "rest" the time after two simulated seconds; a peer is timed in the same run, on
-the same starts, and ratios compare like with like.
+time from the start, "rest" the time after two simulated seconds; a peer is timed in the same run,
+on the same starts, and ratios compare like with like.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def run(
     """Time `scene` ("cable", "heap", "ring" or "block"), and `peer` on it when one is named.
 
     Returns times in process CPU milliseconds per simulated second and world, `ratio` and
-    `ratio_lanes` (peer's time over ours, falling) and `same_bits`: whether the worlds in lanes ended
-    in the very states they end in alone.
+    `ratio_lanes` (peer's time over ours, falling) and `same_bits`: whether the worlds in lanes
+    ended in the very states they end in alone.
 
     Raises:
         InputError: no such scene or peer, or the peer is not installed.

@@ -75,6 +75,7 @@ class Collection:
             text = ledger.read()
             if text and not text.endswith(b"\n"):
                 ledger.write(b"\n")  # a kill tore the last line: keep the next one whole
+                ledger.flush()
             self._restore_surplus()
             self.attempts = self._known(text)
             yield self

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 from .errors import InputError
 from .rendering.scene_view import ArmMeshes, SceneView
 from .reset_options import check_options, goal_for, next_seed
+from .running import DEMONSTRATOR_STREAM, episode_rng
 from .spaces import action_space, check_action, information, observation, observation_space
 from .tasks.task import Action, Task
-from .worlds import DEMONSTRATOR_STREAM, Worlds, episode_rng
+from .worlds import Worlds
 
 __all__ = ["PickPlaceEnv", "WorldsView"]
 

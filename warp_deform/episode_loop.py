@@ -14,7 +14,8 @@ import numpy as np
 
 from .episodes import Goal
 from .errors import InputError, WarpDeformError
-from .worlds import DEMONSTRATOR_STREAM, Worlds, episode_rng
+from .running import DEMONSTRATOR_STREAM, episode_rng
+from .worlds import Worlds
 
 __all__ = ["SOLVED", "Act", "Run", "demonstrate", "play", "worlds_for"]
 

@@ -15,8 +15,9 @@ from .rendering.caption import annotate
 from .rendering.scene_view import ArmMeshes, SceneView
 from .rendering.video import VideoWriter
 from .replay import Recording
+from .running import StepReport
 from .workers import single_threaded
-from .worlds import StepReport, Worlds
+from .worlds import Worlds
 
 __all__ = ["check_video", "film"]
 

@@ -26,7 +26,7 @@ class GripPath:
 
     times (K,) [s] ascending from 0; positions (K, 3) [m] and rotations (K, 4) quat_xyzw of the tip
     particle or body: local number of what is held
-    offset (3,) [m], turn (4,): pose of what is held in the tip's frame (a body: of its centre of mass)
+    offset (3,) [m], turn (4,): pose of what is held (a body: its centre of mass) in the tip's frame
     lower: between these two times contact ends the descent, and the rest of the path stays there
     """
 
@@ -85,7 +85,8 @@ def rollout(
     """Run `worlds` until each has followed its path and come to rest; others keep their state.
 
     least: a world runs at least so long after its path [s]; most: and at most so long in all [s]
-    calm: speeds are clamped to `calm_speed` for so long from the start, `calm_after`: after a release
+    calm: speeds are clamped to `calm_speed` for so long from the start, `calm_after`: after a
+    release
     record: interval of recorded frames [s]; 0 records nothing
 
     A world's result does not depend on which other worlds run with it.

@@ -6,8 +6,7 @@ episode's bits depend on its seed and its actions only, not on its neighbours or
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 
 import newton
 import numpy as np
@@ -21,6 +20,7 @@ from .rendering.pixels import BOUNDS
 from .rendering.topdown import TopDown
 from .robots import robot as find_robot
 from .robots.primitive import (
+    Grasp,
     Motion,
     Outcome,
     approach,
@@ -28,67 +28,24 @@ from .robots.primitive import (
     find_grasp,
     solve_joints,
 )
-from .rollout import Frames, GripPath, rollout
-from .solver.guards import Problem
+from .rollout import GripPath, rollout
+from .running import LAYOUT_STREAM, Plan, RunningEpisode, StepReport, episode_rng, join_frames
 from .solver.solver import SolverFusedXPBD
 from .tasks.free_space import FreeSpace
 from .tasks.registry import task as find_task
 from .tasks.task import Images, Layout, Snapshot, Task
 
-__all__ = ["Episode", "StepReport", "Worlds", "episode_rng"]
-
-LAYOUT_STREAM, DEMONSTRATOR_STREAM = 0, 1
-"""Random streams of an episode: where things start, and what the demonstrator draws."""
+__all__ = ["Worlds"]
 
 MOST_STARTS = 100
 """Starts that are drawn before a seed is given up; the tasks need 1 to 3."""
 REST_LIMIT = 4.0
-"""A world that does not come to rest is looked at so long after its release or settling time [s]."""
+"""A world that does not rest is looked at so long after its path or settling time [s]."""
 CALM = 0.2
-"""After a release, speeds stay under `calm_speed` for so long [s]: what the released bead's links and
-the beads under it had stored is dissipated instead of flinging it."""
+"""After a release, speeds stay under `calm_speed` for so long [s]: what the released bead's links
+and the beads under it had stored is dissipated instead of flinging it."""
 RETREAT_LEAST = 0.3
 """A world runs at least so long after a release, while the tip retreats [s]."""
-
-
-def episode_rng(seed: int, stream: int) -> np.random.Generator:
-    """Random generator of one episode for one purpose; streams do not overlap."""
-    return np.random.default_rng([int(seed), stream])
-
-
-@dataclass(eq=False)
-class Episode:
-    """One running episode."""
-
-    seed: int
-    layout: Layout
-    drawables: Drawables
-    goal: Goal | None
-    discarded_starts: int
-    sim_seconds: float = 0.0
-    actions: int = 0
-    problems: tuple[Problem, ...] = ()
-    snapshot: Snapshot = field(init=False)
-
-    @property
-    def physics_ok(self) -> bool:
-        """Whether no guard has fired since the start."""
-        return not self.problems
-
-
-@dataclass(frozen=True, eq=False)
-class StepReport:
-    """What one action did.
-
-    motions and joints: the tip's way-points and the arm's, of the approach and of the carry
-    frames: recorded states, when asked for, at times from the beginning of the action
-    """
-
-    outcome: Outcome
-    seconds: float
-    motions: tuple[Motion, ...]
-    joints: tuple[np.ndarray | None, ...]
-    frames: Frames | None
 
 
 class Worlds:
@@ -99,8 +56,8 @@ class Worlds:
         reports = worlds.step({slot: action, ...})
         worlds.episodes[slot].snapshot.images.color
 
-    robot: "ur5" or "panda"; lanes: see `SolverFusedXPBD`; reject_solved: draw another start when the
-    first one already solves the task.
+    robot: "ur5" or "panda"; lanes, precision: see `SolverFusedXPBD`. Starts that already solve the
+    task, or leave the table, are drawn again and counted.
     """
 
     def __init__(
@@ -125,7 +82,7 @@ class Worlds:
         self.solver = SolverFusedXPBD(
             self.model, self.task.solver, lanes=lanes, precision=precision
         )
-        self.episodes: dict[int, Episode] = {}
+        self.episodes: dict[int, RunningEpisode] = {}
         self._topdown = TopDown()
         self._space = FreeSpace(reach=self._reach())
 
@@ -134,6 +91,11 @@ class Worlds:
         heights = [0.01, *(stage.lift for stage in self.task.stages)]
         radii = [self.robot.reach(z) for z in heights]
         return max(r[0] for r in radii), min(r[1] for r in radii)
+
+    def _waiting_tip(self) -> np.ndarray:
+        """Above the middle of the table (4,) x, y, z [m], yaw [rad]."""
+        x, y = 0.5, 0.0
+        return np.array([x, y, self.robot.hover_height(x, y, self.task.primitive.hover), 0.0])
 
     # -- starting
 
@@ -200,10 +162,17 @@ class Worlds:
         )
         for slot, layout in layouts.items():
             drawables = Drawables.of(self.task.drawn(layout, self.objects))
-            episode = Episode(seeds[slot], layout, drawables, goals.get(slot), 0)
-            episode.sim_seconds = results[slot].seconds
-            episode.problems = results[slot].watch.problems(slot, self.solver.config.limits)
-            self.episodes[slot] = episode
+            limits = self.solver.config.limits
+            self.episodes[slot] = RunningEpisode(
+                seed=seeds[slot],
+                layout=layout,
+                drawables=drawables,
+                goal=goals.get(slot),
+                discarded_starts=0,
+                sim_seconds=results[slot].seconds,
+                problems=results[slot].watch.problems(slot, limits),
+                tip=self._waiting_tip(),
+            )
             self._look(slot)
 
     def _construct_goals(
@@ -222,7 +191,7 @@ class Worlds:
         images = snapshot.images
         return Goal(images.color, images.height, targets, kind, self.episodes[slot].seed)
 
-    def _acceptable(self, episode: Episode) -> bool:
+    def _acceptable(self, episode: RunningEpisode) -> bool:
         """Whether a start is valid: trusted physics, everything on the table, not solved yet."""
         if not episode.physics_ok:
             return False
@@ -242,102 +211,114 @@ class Worlds:
         actions: (7,) each, pick x, y [m], yaw [rad], place x, y, yaw, lift [m]; finite.
         record: interval of recorded frames [s]; 0 records nothing.
         """
-        actions = {s: np.asarray(a, dtype=float) for s, a in actions.items()}
-        for slot, action in actions.items():
-            if action.shape != (7,) or not np.isfinite(action).all():
-                raise InputError(f"an action needs 7 finite numbers, got {action}")
-            if slot not in self.episodes:
-                raise InputError(f"slot {slot} has no episode: reset it first")
-        grasps, approaches, joints = self._plan_approach(actions)
-        waits = {s: m.seconds for s, m in approaches.items()}
-        before = rollout(self.solver, list(actions), least=1e3, most=waits, record=record)
-        carries: dict[int, Motion] = {}
-        paths: dict[int, GripPath] = {}
-        for slot, grasp in grasps.items():
-            if grasp is not None:
-                carries[slot], paths[slot] = self._plan_carry(slot, actions[slot], grasp)
-        carry_joints = dict(
-            zip(carries, solve_joints(self.robot, list(carries.values())), strict=True)
-        )
-        paths = {
-            s: p for s, p in paths.items() if carry_joints[s] is not None and joints[s] is not None
-        }
-        after = self._run_paths(paths, record) if paths else {}
+        plans = {slot: self._checked(slot, action) for slot, action in actions.items()}
+        self._approach(plans, record)
+        self._carry(plans, record)
+        limits = self.solver.config.limits
         reports = {}
-        for slot in actions:
+        for slot, plan in plans.items():
             episode = self.episodes[slot]
-            runs = [before[slot], *([after[slot]] if slot in after else [])]
-            limits = self.solver.config.limits
-            for run in runs:
+            for run in plan.runs:
                 episode.sim_seconds += run.seconds
                 episode.problems += run.watch.problems(slot, limits)
             episode.actions += 1
             self._look(slot)
-            motions = (approaches[slot], *([carries[slot]] if slot in carries else []))
+            seconds = [run.seconds for run in plan.runs]
             reports[slot] = StepReport(
-                outcome=self._outcome(episode, slot, paths, joints, carry_joints),
-                seconds=sum(run.seconds for run in runs),
-                motions=motions,
-                joints=(joints[slot], *([carry_joints[slot]] if slot in carries else [])),
-                frames=_join([run.frames for run in runs], [run.seconds for run in runs]),
+                outcome=plan.outcome if episode.physics_ok else Outcome.INVALID,
+                seconds=sum(seconds),
+                motions=tuple(plan.motions),
+                joints=tuple(plan.joints),
+                frames=join_frames([run.frames for run in plan.runs], seconds),
             )
         return reports
 
-    def _plan_approach(self, actions: Mapping[int, np.ndarray]) -> tuple[dict, dict, dict]:
-        """What the tip will meet, its motion there, and the arm's way-points (None: unreachable)."""
+    def _checked(self, slot: int, action: np.ndarray) -> Plan:
+        action = np.asarray(action, dtype=float)
+        if action.shape != (7,) or not np.isfinite(action).all():
+            raise InputError(f"an action needs 7 finite numbers, got {action}")
+        if slot not in self.episodes:
+            raise InputError(f"slot {slot} has no episode: reset it first")
+        return Plan(action)
+
+    def _approach(self, plans: Mapping[int, Plan], record: float) -> None:
+        """Move the tips over the pick points and down to what they meet there."""
         config = self.task.primitive
-        grasps, motions = {}, {}
-        for slot, action in actions.items():
-            snapshot = self.episodes[slot].snapshot
-            pick = action[:3]
-            grasps[slot] = find_grasp(
-                pick, self.objects, snapshot.particle_q, snapshot.body_q, config
-            )
+        motions = {}
+        for slot, plan in plans.items():
+            pick, grasp = plan.action[:3], self._grasp(slot, plan)
             hover = self.robot.hover_height(pick[0], pick[1], config.hover)
-            height = grasps[slot].height if grasps[slot] else 0.0
-            start = self._tip(slot)
-            motions[slot] = approach(start, pick, hover, height, config)
-        joints = dict(zip(motions, solve_joints(self.robot, list(motions.values())), strict=True))
-        return grasps, motions, joints
+            height = grasp.height if grasp else 0.0
+            motions[slot] = approach(self.episodes[slot].tip, pick, hover, height, config)
+        moving = self._reachable(plans, motions)
+        waits = {slot: motions[slot].seconds for slot in moving}
+        runs = rollout(self.solver, moving, least=1e3, most=waits, record=record)
+        for slot in moving:
+            plan = plans[slot]
+            plan.runs.append(runs[slot])
+            plan.outcome = Outcome.MISSED
+            above = motions[slot].way_points[-2]
+            self.episodes[slot].tip = above
+            self._look(slot)
 
-    def _plan_carry(self, slot: int, action: np.ndarray, grasp) -> tuple[Motion, GripPath]:
-        snapshot = self.episodes[slot].snapshot
-        speed = self.task.speed(float(action[6]))
-        if grasp.particle is not None:
-            radius = next(o for o in self.objects if isinstance(o, Cable)).config.radius
-            lowest = float(snapshot.particle_q[grasp.particle, 2]) - radius
-        else:
-            box = next(o for o in self.objects if isinstance(o, Box) and o.body == grasp.body)
-            lowest = float(snapshot.body_q[grasp.body, 2]) + box.config.lowest
-        floor = grasp.height - lowest
-        hover = self.robot.hover_height(action[3], action[4], self.task.primitive.hover)
-        return carry(action, grasp, speed, floor, hover, self.task.primitive)
-
-    def _run_paths(self, paths: Mapping[int, GripPath], record: float):
-        most = {s: float(p.times[-1]) + REST_LIMIT for s, p in paths.items()}
-        return rollout(
+    def _carry(self, plans: Mapping[int, Plan], record: float) -> None:
+        """Lift, carry and let go what the tips hold, and let the worlds come to rest."""
+        motions, paths = {}, {}
+        for slot, plan in plans.items():
+            grasp = self._grasp(slot, plan) if plan.outcome is Outcome.MISSED else None
+            if grasp is not None:
+                motions[slot], paths[slot] = self._carry_path(slot, plan.action, grasp)
+        moving = self._reachable(plans, motions)
+        if not moving:
+            return
+        runs = rollout(
             self.solver,
-            list(paths),
-            paths=paths,
+            moving,
+            paths={slot: paths[slot] for slot in moving},
             least=RETREAT_LEAST,
-            most=most,
+            most={slot: float(paths[slot].times[-1]) + REST_LIMIT for slot in moving},
             calm_after=CALM,
             record=record,
         )
+        for slot in moving:
+            plans[slot].runs.append(runs[slot])
+            plans[slot].outcome = Outcome.PLACED
+            self.episodes[slot].tip = motions[slot].way_points[-1]
 
-    def _tip(self, slot: int) -> np.ndarray:
-        """Where the tip waits: above the middle of the table."""
-        x, y = 0.5, 0.0
-        return np.array([x, y, self.robot.hover_height(x, y, self.task.primitive.hover), 0.0])
+    def _reachable(self, plans: Mapping[int, Plan], motions: Mapping[int, Motion]) -> list[int]:
+        """Slots whose motion the arm can make; notes motions, joints and what is out of reach."""
+        joints = solve_joints(self.robot, list(motions.values()))
+        for (slot, motion), q in zip(motions.items(), joints, strict=True):
+            plans[slot].motions.append(motion)
+            plans[slot].joints.append(q)
+            if q is None:
+                plans[slot].outcome = Outcome.UNREACHABLE
+        return [slot for slot, q in zip(motions, joints, strict=True) if q is not None]
 
-    def _outcome(self, episode: Episode, slot: int, paths, joints, carry_joints) -> Outcome:
-        if not episode.physics_ok:
-            return Outcome.INVALID
-        if slot in paths:
-            return Outcome.PLACED
-        if joints[slot] is None or carry_joints.get(slot, ()) is None:
-            return Outcome.UNREACHABLE
-        return Outcome.MISSED
+    def _grasp(self, slot: int, plan: Plan) -> Grasp | None:
+        """What the tip meets when it descends at the pick point now."""
+        snapshot = self.episodes[slot].snapshot
+        return find_grasp(
+            plan.action[:3],
+            self.objects,
+            snapshot.particle_q,
+            snapshot.body_q,
+            self.task.primitive,
+        )
+
+    def _carry_path(self, slot: int, action: np.ndarray, grasp: Grasp) -> tuple[Motion, GripPath]:
+        """Motion of the loaded tip, down to where what it holds would rest on the table."""
+        snapshot = self.episodes[slot].snapshot
+        if grasp.particle is not None:
+            radius = self.solver.data.topologies[0].particle_radius[grasp.particle]
+            lowest = snapshot.particle_q[grasp.particle, 2] - radius
+        else:
+            box = next(o for o in self.objects if isinstance(o, Box) and o.body == grasp.body)
+            lowest = snapshot.body_q[box.body, 2] + box.config.lowest
+        hover = self.robot.hover_height(action[3], action[4], self.task.primitive.hover)
+        speed = self.task.speed(float(action[6]))
+        floor = grasp.height - float(lowest)
+        return carry(action, grasp, speed, floor, hover, self.task.primitive)
 
     # -- looking
 
@@ -374,16 +355,3 @@ class Worlds:
         """Hash of a slot's positions and velocities."""
         s = self.episodes[slot].snapshot
         return state_hash(s.particle_q, s.particle_qd, s.body_q, s.body_qd)
-
-
-def _join(frames: Sequence[Frames | None], seconds: Sequence[float]) -> Frames | None:
-    """Frames of consecutive rollouts as one recording."""
-    begins = np.concatenate([[0.0], np.cumsum(seconds)])
-    there = [(f, b) for f, b in zip(frames, begins, strict=False) if f is not None]
-    if not there:
-        return None
-    return Frames(
-        np.concatenate([f.times + b for f, b in there]),
-        np.concatenate([f.particle_q for f, _ in there]),
-        np.concatenate([f.body_q for f, _ in there]),
-    )

@@ -65,9 +65,9 @@ class PeerScene:
 def peer_scene(name: str, *, seed: int = 0) -> PeerScene:
     """A start above the table; `seed` draws its small noise and its heading.
 
-    The cable lies crumpled within 8 cm and drops by 1 cm, as it lies between two actions; the heap is
-    the same cable as a vertical stack that falls into the tightest tangle there is; the ring stands
-    upright on its edge; the L-block hangs flat 5 cm above the table.
+    The cable lies crumpled within 8 cm and drops by 1 cm, as it lies between two actions; the heap
+    is the same cable as a vertical stack that falls into the tightest tangle there is; the ring
+    stands upright on its edge; the L-block hangs flat 5 cm above the table.
 
     Raises:
         InputError: there is no scene of that name.
@@ -94,7 +94,7 @@ def peer_scene(name: str, *, seed: int = 0) -> PeerScene:
 
 
 def _crumple(cable: CableConfig, rng: np.random.Generator) -> np.ndarray:
-    """A self-avoiding walk of exact links within a disc; a walk that runs into itself starts anew."""
+    """A self-avoiding walk of exact links within a disc; one that gets stuck starts anew."""
     while True:
         beads = [np.array([*_CENTRE, 0.0])]
         heading = rng.uniform(0, 2 * np.pi)
@@ -113,7 +113,7 @@ def _crumple(cable: CableConfig, rng: np.random.Generator) -> np.ndarray:
                 heading = turned
             if len(beads) == cable.beads:
                 walk = np.array(beads)
-                return walk + [0, 0, cable.radius + _FALL - walk[:, 2].min()]
+                return walk + np.array([0, 0, cable.radius + _FALL - walk[:, 2].min()])
 
 
 def _stack(cable: CableConfig, rng: np.random.Generator) -> np.ndarray:

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,7 +28,7 @@ __all__ = ["Grasp", "Motion", "Outcome", "PrimitiveConfig", "approach", "carry",
            "solve_joints"]  # fmt: skip
 
 
-class Outcome(str, Enum):
+class Outcome(StrEnum):
     """What became of an action."""
 
     PLACED = "placed"
@@ -91,8 +92,8 @@ def find_grasp(
 ) -> Grasp | None:
     """What a tip that descends at x, y (with a yaw) meets first above the table, or None.
 
-    Beads count with their visual radius: the paper's beads are 1 cm cubes, whose corners reach as far.
-    particle_q (P, 3); body_q (B, 7).
+    Beads count with their visual radius: the paper's beads are 1 cm cubes, whose corners reach as
+    far. particle_q (P, 3); body_q (B, 7).
     """
     x, y, yaw = xy_yaw
     best: tuple[float, int | None, int | None] | None = None
@@ -179,23 +180,20 @@ def carry(
 
 
 def solve_joints(robot: Robot, motions: Sequence[Motion]) -> list[np.ndarray | None]:
-    """Joint way-points (K, dof) of every motion, all solved in one batch; None where unreachable."""
+    """Joint way-points (K, dof) of every motion, solved in one batch; None: out of reach."""
     if not motions:
         return []
     lengths = [len(m.way_points) for m in motions]
     points = np.concatenate([m.way_points for m in motions])
     result = robot.trajectory(points, lengths=lengths)
     starts = np.concatenate([[0], np.cumsum(lengths)])
-    return [
-        result.q[a:b] if result.reached[a:b].all() else None
-        for a, b in zip(starts[:-1], starts[1:], strict=True)
-    ]
+    return [result.q[a:b] if result.reached[a:b].all() else None for a, b in pairwise(starts)]
 
 
 def _straight(points: Sequence[np.ndarray], speed: float, config: PrimitiveConfig) -> Motion:
     """Way-points along straight lines at constant speed [m/s]; a turn on the spot takes no time."""
     times, way_points = [0.0], [points[0]]
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in pairwise(points):
         distance = float(np.linalg.norm(b[:3] - a[:3]))
         pieces = max(1, int(np.ceil(distance / config.spacing)))
         for k in range(1, pieces + 1):

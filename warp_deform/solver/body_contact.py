@@ -1,10 +1,10 @@
 """Contacts of rigid bodies with each other and with the table: listed first, then solved together.
 
-Projected Gauss-Seidel with accumulated impulses: a later pass may take back what an earlier one gave
-too much, so the result hardly depends on the order of the corners, boxes rest without rocking, and
-stacks stand. Within a substep the corrections are small, so they are linear in the impulses: arms and
-inertia stay those of the predicted pose. Source: Catto, "Iterative Dynamics with Temporal Coherence",
-2005, with positional impulses as in Mueller et al., 2020.
+Projected Gauss-Seidel with accumulated impulses: a later pass may take back what an earlier one
+gave too much, so the result hardly depends on the order of the corners, boxes rest without rocking,
+and stacks stand. Within a substep the corrections are small, so they are linear in the impulses:
+arms and inertia stay those of the predicted pose. Source: Catto, "Iterative Dynamics with Temporal
+Coherence", 2005, with positional impulses as in Mueller et al., 2020.
 """
 
 import functools
@@ -22,6 +22,9 @@ PASSES = 6
 """Passes over the contacts at most."""
 EXACT = 1.0e-7
 """When no impulse of a pass moved its contact by more than this [m], the passes end."""
+GIVEN_BACK = 0.2
+"""Share of an overlap that a substep undoes: all at once, it would become speed and rock the
+box."""
 AHEAD = 1.0e-4
 """Points this far apart are listed: the solution itself may bring them together [m]."""
 
@@ -69,7 +72,7 @@ def body_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     ):  # fmt: skip
         """Contact c: point pb of body b stays ahead of point pa of body a (-1: the table) along n.
 
-        An overlap that the substep began with is given back at most by `push`.
+        Of an overlap that the substep began with, a share is given back, at most `push`.
         """
         contacts.a[c] = a
         contacts.b[c] = b
@@ -93,9 +96,9 @@ def body_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             pair_weight(c, n, bodies, contacts), pair_weight(c, u, bodies, contacts),
             pair_weight(c, v, bodies, contacts),
         )  # fmt: skip
-        contacts.steps[c] = R3(
-            gap + wp.max(-before - push, S(0.0)), wp.dot(slip, u), wp.dot(slip, v)
-        )
+        overlap = wp.max(-before, S(0.0))
+        kept = wp.max(overlap - push, overlap * S(1.0 - GIVEN_BACK))
+        contacts.steps[c] = R3(gap + kept, wp.dot(slip, u), wp.dot(slip, v))
         contacts.impulse[c] = R3()
         contacts.mu[c] = mu
 

@@ -50,7 +50,8 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
         c: int, a: int, b: int, axis: int, n: R3, ca: R3, aa: M33, ha: R3, cb: R3, ab: M33, hb: R3,
         mu: S, push: S, bodies: Bodies, contacts: Contacts,
     ):  # fmt: skip
-        """Contacts between the face of box a with outward normal n (its axis `axis`) and the side of
+        """Contacts between the face of box a with outward normal n (its axis `axis`) and the side
+        of
         box b that faces it: the corners of their common area. Returns the next number.
         """
         u = column(aa, (axis + 1) % 3)

@@ -15,7 +15,8 @@ from .topology import WorldTopology, read_worlds
 
 __all__ = ["KERNEL_ARGUMENTS", "Mirrored", "SolverData"]
 
-KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near", "bodies",
+KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near",
+                    "bodies",
                     "contacts", "grips", "watch")  # fmt: skip
 """The kernel's structs, after the settings, in the order of its arguments."""
 
@@ -312,7 +313,7 @@ class SolverData:
             self.arrays[f"grips.{name}"].view[:] = -1
 
     def set_bodies(self, world: int, body_q: np.ndarray, body_qd: np.ndarray | None = None) -> None:
-        """Poses (B, 7) and twists (B, 6: linear of the centre of mass, angular) of one world's bodies."""
+        """Set poses (B, 7) and twists (B, 6: linear at the centre of mass, angular) of a world."""
         rows = self.body_rows(world)
         com = self.topologies[self.world_topology[world]].body_com
         views = self.views
@@ -333,7 +334,7 @@ class SolverData:
 
     @staticmethod
     def frame_poses(x: np.ndarray, quat: np.ndarray, com: np.ndarray) -> np.ndarray:
-        """Poses (B, 7) of body frames from centres of mass x (B, 3), rotations and offsets (B, 3)."""
+        """Poses (B, 7) of body frames from centres of mass x (B, 3), turns and offsets (B, 3)."""
         return np.column_stack([x - _rotate(quat, com), quat])
 
 

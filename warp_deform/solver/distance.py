@@ -1,8 +1,8 @@
 """Distance constraints: links, fold limits, tension-only diagonals, bending across a joint.
 
-Source: Macklin, Mueller, Chentanez, "XPBD", 2016, equation 18 with one iteration a substep. A spring
-of stiffness k has compliance 1 / k, so it converges to Hooke's law as the substep shrinks. Bending
-is a soft spring between second neighbours (or across a shared edge).
+Source: Macklin, Mueller, Chentanez, "XPBD", 2016, equation 18 with one iteration a substep. A
+spring of stiffness k has compliance 1 / k, so it converges to Hooke's law as the substep shrinks.
+Bending is a soft spring between second neighbours (or across a shared edge).
 """
 
 import functools
@@ -23,8 +23,8 @@ def distance(scalar: Any, lanes: int) -> SimpleNamespace:
 
     For a two-sided spring (mode 0) of length l, rest length L and compliance a,
     ``lambda = (l - L) / (wi + wj + a / dt^2)`` moves both ends along the spring. AT_LEAST (mode 1)
-    acts only when l < L, AT_MOST (mode 2) only when l > L. With a strain limit X the correction is at
-    least the rigid one for l > X, in the same solve.
+    acts only when l < L, AT_MOST (mode 2) only when l > L. With a strain limit X the correction is
+    at least the rigid one for l > X, in the same solve.
     """
     t = structures(scalar, lanes)
     S, V, Particles, Springs = t.S, t.V, t.Particles, t.Springs

@@ -47,7 +47,7 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
     `with_bodies` False leaves the code of rigid bodies out, which halves the compile time.
     """
     t = structures(scalar, lanes)
-    S, V, V3, R3, L = t.S, t.V, t.V3, t.R3, t.L
+    S, V, R3, L = t.S, t.V, t.R3, t.L
     predict, finish = (getattr(table_contact(scalar, lanes), n) for n in ("predict", "finish"))
     project_distance = distance(scalar, lanes).project_distance
     contact = sphere_contact(scalar, lanes)

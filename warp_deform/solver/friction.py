@@ -18,9 +18,9 @@ def friction(scalar: Any, lanes: int) -> SimpleNamespace:
 
     With d the length of the tangential relative step and b the budget (friction coefficient times
     normal correction), the share is ``b / (d^4 + b^4)^(1/4)``: all of it while d is well below b
-    (stick), exactly the Coulomb amount ``b / d`` once d is well above (slide), and differentiable in
-    between. The sharper power 4 is used because with power 2 a body at 90 % of the friction angle
-    would creep at 5 mm/s; with power 4 it creeps at 1 mm/s there and at 0.5 mm/s at 80 %.
+    (stick), exactly the Coulomb amount ``b / d`` once d is well above (slide), and differentiable
+    in between. The sharper power 4 is used because with power 2 a body at 90 % of the friction
+    angle would creep at 5 mm/s; with power 4 it creeps at 1 mm/s there, at 80 % at 0.5 mm/s.
 
     `coulomb_soft` is the form with power 2, a third cheaper, for contacts between particles, where
     nothing has to hold on a slope.

@@ -49,7 +49,8 @@ KERNEL_OPTIONS: dict[str, Any] = {
     "enable_backward": False,
     # loops stay loops: unrolled corner and axis loops would take long to compile
     "max_unroll": 1,
-    # native: wide registers; inlining: a function that stays a call copies its structs (3 times slower)
+    # native: wide registers; inlining: a function that stays a call copies its structs (3 times
+    # slower)
     "cpu_compiler_flags": "-march=native -mllvm -inline-threshold=20000",
 }
 

@@ -29,7 +29,8 @@ class SolverFusedXPBD(SolverBase):
     """XPBD in one fused kernel: a launch runs many substeps, a thread runs L worlds in SIMD lanes.
 
     References: Macklin et al., "XPBD", 2016; Macklin et al., "Small Steps in Physics Simulation",
-    2019; Mueller et al., "Detailed Rigid Body Simulation with Extended Position Based Dynamics", 2020.
+    2019; Mueller et al., "Detailed Rigid Body Simulation with Extended Position Based Dynamics",
+    2020.
 
     Simulates particles joined by springs (two-sided, minimum, maximum, strain-limited), contact and
     friction between particles, with the table z = 0 and with rigid bodies made of boxes, and grips.
@@ -114,7 +115,7 @@ class SolverFusedXPBD(SolverBase):
     # -- parameters
 
     def set_world(self, world: int, **parameters: float) -> None:
-        """Set damping [1/s], table_friction, contact_friction or stiffness (a factor) of one world."""
+        """Set damping [1/s], table_friction, contact_friction or stiffness of one world."""
         for name, value in parameters.items():
             if name not in ("damping", "table_friction", "contact_friction", "stiffness"):
                 raise InputError(f"a world has no parameter {name!r}")
@@ -130,7 +131,7 @@ class SolverFusedXPBD(SolverBase):
         calm: float = 0.0,
         calm_after: float = 0.0,
     ) -> None:
-        """Substeps that worlds run at least after their path, and at most in all, in the next launch.
+        """Substeps that worlds run at least after their path, and at most in all, when launched.
 
         `calm`, `calm_after`: substeps clamped to `calm_speed` from the start and after a release.
         """
@@ -165,7 +166,7 @@ class SolverFusedXPBD(SolverBase):
     # -- running
 
     def run(self, max_steps: int, *, record_every: int = 0) -> list[WatchValues]:
-        """Launch up to `max_steps` substeps on the working arrays; returns the guards' values by world.
+        """Launch up to `max_steps` substeps; returns the guards' values by world.
 
         Worlds stop early as `set_duration` says. Nothing is raised: see `check`.
         """

@@ -38,13 +38,14 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     already separates it: an overlap that takes many substeps to undo does not gather speed.
     """
     t = structures(scalar, lanes)
-    S, V, L = t.S, t.V, t.L
+    S, V = t.S, t.V
     Pairs, Particles, Near, Watch = t.Pairs, t.Particles, t.Near, t.Watch
     coulomb_soft = friction(scalar, lanes).coulomb_soft
 
     @wp.func
     def list_near(
-        g: int, p0: int, start: int, capacity: int, first: int, last: int, margin: S, stale: V, on: V,
+        g: int, p0: int, start: int, capacity: int, first: int, last: int, margin: S, stale: V,
+        on: V,
         q: Particles, pairs: Pairs, near: Near, watch: Watch, count: int,
     ):  # fmt: skip
         for i in range(p0, p0 + count):
@@ -114,7 +115,7 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         pairs: Pairs,
         near: Near,
     ):
-        """Whether a particle of one lane touches another that is not its neighbour along the chain."""
+        """Whether a particle of one lane touches another that it is not exempt from."""
         hit = bool(False)
         for k in range(start, start + n):
             pair = near.pair[k]

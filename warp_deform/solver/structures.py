@@ -141,7 +141,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.struct
     class Contacts:
-        """Scratch per group, for one lane at a time: where bodies touch each other and the table."""
+        """Scratch per group, for one lane at a time: where bodies touch things and the table."""
 
         a: wp.array(dtype=int)  # body row, -1: the table
         b: wp.array(dtype=int)

@@ -59,7 +59,7 @@ class WorldTopology:
 
 
 def _slices(worlds: np.ndarray, count: int, what: str) -> list[np.ndarray]:
-    """Element numbers of every world; elements of the global world (-1) are only in a lone world."""
+    """Element numbers of every world; only a lone world may have global elements (-1)."""
     if count == 1:
         return [np.arange(len(worlds))]
     if (worlds < 0).any():
@@ -77,8 +77,8 @@ def read_worlds(
     """
     if not hasattr(model, NAMESPACE):
         raise InputError(
-            "the model lacks warp_deform's attributes: build it with add_cable, add_box, ... or call "
-            "SolverFusedXPBD.register_custom_attributes(builder) first"
+            "the model lacks warp_deform's attributes: build it with add_cable, add_box, ... or "
+            "call SolverFusedXPBD.register_custom_attributes(builder) first"
         )
     _refuse_unsupported(model)
     ours = getattr(model, NAMESPACE)
@@ -126,7 +126,7 @@ def _refuse_unsupported(model: newton.Model) -> None:
             raise InputError(f"SolverFusedXPBD simulates boxes only, the model has a {name}{hint}")
         if (model.shape_body.numpy() < 0).any():
             raise InputError(
-                "SolverFusedXPBD has no fixed boxes: give the box a body (of mass 0 if it is to stay)"
+                "SolverFusedXPBD has no fixed boxes: give the box a body (of mass 0 to fix it)"
             )
     if model.joint_count:
         for kind in set(model.joint_type.numpy().tolist()) - {int(newton.JointType.FREE)}:

@@ -8,8 +8,8 @@ from .task import Stage
 __all__ = ["CABLE_SOLVER", "CABLE_STAGE"]
 
 CABLE_SOLVER = SolverConfig(table_friction=0.5, contact_friction=0.1)
-"""Friction between beads is low: at 0.3 a pull tightens about one heap in a hundred into a knot that
-holds for ever, where the original's links give way; at 0.1 none of 800 did."""
+"""Friction between beads is low: at 0.3 a pull tightens about one heap in a hundred into a knot
+that holds for ever, where the original's links give way; at 0.1 none of 800 did."""
 
 CABLE_STAGE = Stage(lift=0.04, speed=0.15)
 """Low and slow, as in the original, so that the cable follows on the table."""

@@ -1,0 +1,87 @@
+"""An episode while it runs: its state, the plan of its present action, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .episodes import Goal
+from .rendering.drawables import Drawables
+from .robots.primitive import Motion, Outcome
+from .rollout import Frames, Rollout
+from .solver.guards import Problem
+from .tasks.task import Layout, Snapshot
+
+__all__ = ["DEMONSTRATOR_STREAM", "LAYOUT_STREAM", "Plan", "RunningEpisode", "StepReport",
+           "episode_rng", "join_frames"]  # fmt: skip
+
+LAYOUT_STREAM, DEMONSTRATOR_STREAM = 0, 1
+"""Random streams of an episode: where things start, and what the demonstrator draws."""
+
+
+def episode_rng(seed: int, stream: int) -> np.random.Generator:
+    """Random generator of one episode for one purpose; streams do not overlap."""
+    return np.random.default_rng([int(seed), stream])
+
+
+@dataclass(eq=False, kw_only=True)
+class RunningEpisode:
+    """One running episode."""
+
+    seed: int
+    layout: Layout
+    drawables: Drawables
+    goal: Goal | None
+    discarded_starts: int
+    sim_seconds: float = 0.0
+    actions: int = 0
+    problems: tuple[Problem, ...] = ()
+    tip: np.ndarray
+    """Where the tip waits: x, y, z [m], yaw [rad]."""
+    snapshot: Snapshot = field(init=False)
+
+    @property
+    def physics_ok(self) -> bool:
+        """Whether no guard has fired since the start."""
+        return not self.problems
+
+
+@dataclass(frozen=True, eq=False)
+class StepReport:
+    """What one action did.
+
+    motions and joints: the tip's way-points and the arm's, of the approach and of the carry
+    frames: recorded states, when asked for, at times from the beginning of the action
+    """
+
+    outcome: Outcome
+    seconds: float
+    motions: tuple[Motion, ...]
+    joints: tuple[np.ndarray | None, ...]
+    frames: Frames | None
+
+
+@dataclass(eq=False)
+class Plan:
+    """What becomes of one action while it is carried out."""
+
+    action: np.ndarray
+    outcome: Outcome = Outcome.UNREACHABLE
+    motions: list[Motion] = field(default_factory=list)
+    joints: list[np.ndarray | None] = field(default_factory=list)
+    runs: list[Rollout] = field(default_factory=list)
+
+
+def join_frames(frames: Sequence[Frames | None], seconds: Sequence[float]) -> Frames | None:
+    """Frames of consecutive rollouts as one recording."""
+    begins = np.concatenate([[0.0], np.cumsum(seconds)])
+    there = [(f, b) for f, b in zip(frames, begins, strict=False) if f is not None]
+    if not there:
+        return None
+    return Frames(
+        np.concatenate([f.times + b for f, b in there]),
+        np.concatenate([f.particle_q for f, _ in there]),
+        np.concatenate([f.body_q for f, _ in there]),
+    )
