@@ -125,7 +125,7 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def let_go(w: int, lane: int, p0: int, b0: int, q: Particles, bodies: Bodies, grips: Grips):
-        """What was gripped is free again, and at rest."""
+        """What was gripped is free again, and at rest: its step of this substep does not count."""
         particle = grips.particle[w]
         if particle >= 0:
             i = p0 + particle
@@ -138,9 +138,17 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
             v.y[lane] = S(0.0)
             v.z[lane] = S(0.0)
             q.v[i] = v
+            x = q.x[i]
+            start = q.xp[i]
+            start.x[lane] = x.x[lane]
+            start.y[lane] = x.y[lane]
+            start.z[lane] = x.z[lane]
+            q.xp[i] = start
         else:
             b = b0 + grips.body[w]
             bodies.w[b] = bodies.w0[b]
+            bodies.xp[b] = bodies.x[b]
+            bodies.qp[b] = bodies.q[b]
             bodies.v[b] = R3()
             bodies.omega[b] = R3()
         grips.particle[w] = -1
