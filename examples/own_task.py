@@ -13,8 +13,7 @@ import argparse
 import numpy as np
 
 from warp_deform import PickPlaceEnv
-from warp_deform.objects.cable import CableConfig, add_cable, cable_line
-from warp_deform.objects.zone import ring_zone
+from warp_deform.objects import CableConfig, add_cable, cable_line, ring_zone
 from warp_deform.quiet import quiet_warp
 from warp_deform.tasks.demonstrators import pick_place
 from warp_deform.tasks.task import Layout, Stage, Task

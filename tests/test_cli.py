@@ -127,7 +127,7 @@ def test_every_verb_explains_itself(name: str, capsys: pytest.CaptureFixture[str
         (["replay", "no-such-folder", "--json"], "no folder 'no-such-folder'"),
         (["inspect", "no-such-folder"], "no folder 'no-such-folder'"),
         (["inspect", ".", "--sheets", "-1"], "--sheets is -1"),
-        (["bench", "--scene", "rope"], "'cable', 'ring', 'cloth', 'bag'"),
+        (["bench", "--scene", "rope"], "'cable', 'heap', 'ring', 'block'"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

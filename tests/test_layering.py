@@ -28,7 +28,11 @@ OPTIONAL = {
     "pybullet", "pybullet_data", "ray", "viser", "rerun", "tensorboard", "h5py", "panda_py",
     "franky", "frankapy", "pyrealsense2",
 }  # fmt: skip
-COMPUTED_IMPORTS = {"warp_deform/__init__.py", "warp_deform/cli.py"}
+COMPUTED_IMPORTS = {
+    "warp_deform/__init__.py",
+    "warp_deform/cli.py",
+    "warp_deform/solver/__init__.py",
+}
 FILES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
 
 

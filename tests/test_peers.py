@@ -97,7 +97,7 @@ def test_senseless_measurements_are_refused(options):
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(InputError, match="cable, ring, block"):
+    with pytest.raises(InputError, match="cable, heap, ring, block"):
         peer_scene("rope")
     with pytest.raises(InputError, match="vbd, vbd-bodies, xpbd"):
         time_newton("cable", "mujoco")
@@ -133,7 +133,7 @@ def _check_settled(scene, beads, *, contact):
 
 
 @needs_pybullet
-@pytest.mark.parametrize("name", ["cable", "ring"])
+@pytest.mark.parametrize("name", ["heap", "ring"])
 def test_pybullet_lets_the_scene_fall_into_a_heap(name):
     scene = peer_scene(name)
     _check_settled(scene, _heap(PyBulletWorld(scene)), contact=True)
@@ -141,7 +141,7 @@ def test_pybullet_lets_the_scene_fall_into_a_heap(name):
 
 @pytest.mark.parametrize("solver", NEWTON_SOLVERS)
 def test_newton_lets_the_cable_fall_into_a_heap(solver):
-    scene, settings = peer_scene("cable"), newton_settings(solver, "cable")
+    scene, settings = peer_scene("heap"), newton_settings(solver, "heap")
     beads = _heap(NewtonWorld(scene, settings))
     _check_settled(scene, beads, contact=settings.beads == "bodies")
 

@@ -17,6 +17,7 @@ import importlib
 import io
 import json
 import os
+import re
 import sys
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -160,10 +161,12 @@ def _parse(
 
 def _essence(boxed: str) -> str:
     """What tyro's box of several paragraphs says, on one line: what is wrong and what was meant."""
-    lines = [line.strip("│ ") for line in boxed.splitlines() if not line.startswith(("╭", "╰"))]
-    wrong, *others = "\n".join(lines).split("─\n")
+    # the title stands in the frame's upper edge or, on a terminal without frames, is underlined
+    text = "\n".join(line.strip("│╭╰ ") for line in boxed.splitlines())
+    _, *paragraphs = re.split(r"^.*[─-]{3,}.*$", text, flags=re.MULTILINE)
+    wrong, *others = (" ".join(part.split()) for part in paragraphs)
     meant = [part for part in others if part.startswith("Perhaps you meant")]
-    return " ".join(" ".join([wrong, *meant]).replace("─", " ").split()).rstrip(".")
+    return " ".join([wrong, *meant]).rstrip(".")
 
 
 @contextlib.contextmanager

@@ -47,7 +47,7 @@ class CollectConfig:
     goals: folder of goals (see `make_goals`) that the attempts aim at in turn; None constructs one
         from every seed
     workers: processes; None takes one per core, but not for a handful of episodes
-    ray: address of a Ray cluster whose machines share the folder
+    ray: address of a Ray cluster whose machines share the folder; workers defaults to its cores
     video: MP4 of the first kept episodes
     """
 
@@ -119,9 +119,11 @@ def collect(config: CollectConfig) -> CollectReport:
 
         check_video(config.video)
     config = replace(config, out=Path(config.out).resolve())
-    count = worker_count(config.workers, config.episodes)
+    on_cluster = config.ray is not None and config.workers is None
+    count = None if on_cluster else worker_count(config.workers, config.episodes)
+    workers = Workers(count, ray=config.ray)
     with Collection(config.out, _description(config)).owned() as collection:
-        with Workers(count, ray=config.ray) as workers:
+        with workers:
             _attempt_all(config, collection.attempts, workers)
         kept, attempts = _kept(config, collection.attempts)
         collection.keep(set(kept))
@@ -237,7 +239,7 @@ def _description(config: CollectConfig) -> dict[str, object]:
 def _report(
     config: CollectConfig, kept: Sequence[int], attempts: int, seconds: float
 ) -> CollectReport:
-    infos = [EpisodeReader(config.out).info(seed) for seed in kept]
+    infos = EpisodeReader(config.out).infos() if kept else []
     if infos:
         rebuild_index(config.out)
     n = max(len(infos), 1)

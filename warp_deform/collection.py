@@ -84,10 +84,8 @@ class Collection:
         """Attempts that need not be repeated: failures of the ledger, and files that are there."""
         recorded = {a.seed: a for line in ledger.splitlines() if (a := _parse(line))}
         known = {seed: attempt for seed, attempt in recorded.items() if not attempt.success}
-        seeds = EpisodeReader(self.folder).seeds if self._has_episodes() else ()
-        for seed in seeds:
-            info = EpisodeReader(self.folder).info(seed)
-            known[seed] = Attempt(seed, info.success, info.actions, info.score, "solved")
+        for info in EpisodeReader(self.folder).infos() if self._has_episodes() else ():
+            known[info.seed] = Attempt(info.seed, True, info.actions, info.score, "solved")
         return known
 
     def _has_episodes(self) -> bool:

@@ -163,7 +163,8 @@ def _caption(episode: Episode, row: int, speed: float) -> tuple[str, ...]:
 
 def _seen(episode: Episode, row: int) -> np.ndarray:
     """What a policy sees in a row: the top-down picture, beside the goal's where there is one."""
-    pictures = [episode.steps[row].color]
-    if episode.goal is not None:
-        pictures.append(episode.goal.color)
-    return np.concatenate(pictures, axis=1)
+    color = episode.steps[row].color
+    if episode.goal is None:
+        return color
+    gap = np.full((len(color), 4, 3), 255, np.uint8)
+    return np.concatenate([color, gap, episode.goal.color], axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -20,6 +21,8 @@ Result = TypeVar("Result")
 
 LEAST_EPISODES = 64
 """A process takes seconds to start: by default each gets at least so many episodes."""
+
+_CONNECT_SECONDS = 5.0
 
 
 def worker_count(asked: int | None, episodes: int) -> int:
@@ -54,6 +57,7 @@ class Workers:
             for result in workers.run(function, chunks):
                 ...
 
+    count: processes; None takes the cluster's cores, or one process without a cluster
     `function` is an iterator of results and is importable from its module.
     ray: address of a Ray cluster ("auto" for the one this machine belongs to). Functions and chunks
     travel by joblib, files do not: a cluster needs a folder that all its machines share.
@@ -62,12 +66,11 @@ class Workers:
         InputError: Ray is asked for and not installed, or its cluster does not answer.
     """
 
-    def __init__(self, count: int, *, ray: str | None = None) -> None:
-        self.count = count
+    def __init__(self, count: int | None, *, ray: str | None = None) -> None:
         self._ray = ray is not None
         self._starting: Any = None
-        if ray is not None:
-            _connect(ray)
+        cores = 1 if ray is None else _connect(ray)
+        self.count = count or cores
 
     @property
     def apart(self) -> bool:
@@ -155,7 +158,8 @@ def _call(
         return list(function(chunk))
 
 
-def _connect(address: str) -> None:
+def _connect(address: str) -> int:
+    """Join a Ray cluster; the number of its cores."""
     try:
         import ray
         from ray.util.joblib import register_ray
@@ -163,8 +167,12 @@ def _connect(address: str) -> None:
         raise InputError(
             "Ray is not installed; run: pip install 'warp-deform[ray]', or leave out --ray"
         ) from error
+    host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
+        if host and port.isdecimal():  # Ray itself would go on trying for many minutes
+            socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS).close()
         ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
-    except (ConnectionError, ValueError) as error:
+    except (OSError, OverflowError, ValueError) as error:
         raise InputError(f"no Ray cluster answers at {address!r}: {error}") from error
     register_ray()
+    return int(ray.cluster_resources().get("CPU", 1))

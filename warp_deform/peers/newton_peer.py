@@ -19,7 +19,7 @@ from ..objects.box import add_box, l_block
 from .scene import PeerScene
 from .timing import FRAME_RATE, PeerTiming, measure
 
-__all__ = ["NEWTON_SOLVERS", "NewtonSettings", "NewtonWorld", "newton_settings", "time_newton"]
+__all__ = ["NewtonWorld"]  # the rest is imported from `warp_deform.peers`
 
 _FRICTION = 0.5
 

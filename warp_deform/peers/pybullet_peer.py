@@ -17,7 +17,7 @@ from ..objects.box import l_block
 from .scene import PeerScene
 from .timing import FRAME_RATE, PeerTiming, measure
 
-__all__ = ["PyBulletWorld", "time_pybullet"]
+__all__ = ["PyBulletWorld"]  # the rest is imported from `warp_deform.peers`
 
 HZ = 240
 _MAX_FORCE = 100.0  # [N]

@@ -10,7 +10,7 @@ from .newton_peer import NEWTON_SOLVERS, time_newton
 from .pybullet_peer import time_pybullet
 from .timing import PeerTiming
 
-__all__ = ["PEERS", "time_peer"]
+__all__: list[str] = []  # `warp_deform.peers` is the import path of what is here
 
 PEERS: dict[str, Callable[..., PeerTiming]] = {
     "pybullet": time_pybullet,

@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import InputError
 from ..objects.cable import CableConfig, RingConfig, cable_ring
 
-__all__ = ["PEER_SCENES", "PeerScene", "SceneName", "peer_scene"]
+__all__ = ["SceneName"]  # the rest is imported from `warp_deform.peers`
 
 SceneName = Literal["cable", "heap", "ring", "block"]
 PEER_SCENES: tuple[str, ...] = get_args(SceneName)

@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError, WarpDeformError
 from .scene import PeerScene, peer_scene
 
-__all__ = ["FRAME_RATE", "PeerTiming", "PeerWorld", "measure"]
+__all__ = ["FRAME_RATE", "PeerWorld", "measure"]
 
 FRAME_RATE = 60
 """Frames per simulated second; positions are read once a frame, outside the timed part."""

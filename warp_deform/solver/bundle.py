@@ -33,23 +33,22 @@ def write_bundle(folder: Path, solver: SolverFusedXPBD) -> Path:
     """Write all inputs of the solver's last launch to an .npz file named after their hash."""
     folder.mkdir(parents=True, exist_ok=True)
     arrays, settings = solver._bundle or {}, solver._last
-    digest = _digest(arrays)
     header = {
-        "digest": digest,
         "lanes": solver.data.lanes,
         "precision": np.dtype(solver.data.number).name,
         "bodies": bool(solver.data.has_bodies),
         "groups": solver.data.group_count,
         "settings": {name: getattr(settings, name) for name in _SETTINGS},
     }
+    header["digest"] = digest = _digest(header, arrays)
     path = folder / f"launch_{digest}.npz"
     np.savez(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
     return path
 
 
-def _digest(arrays: dict[str, np.ndarray]) -> str:
-    """Hash of the arrays' names, shapes, types and bytes."""
-    digest = hashlib.blake2b(digest_size=8)
+def _digest(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
+    """Hash of the header and of the arrays' names, shapes, types and bytes."""
+    digest = hashlib.blake2b(json.dumps(header, sort_keys=True).encode(), digest_size=8)
     for name in sorted(arrays):
         values = arrays[name]
         digest.update(f"{name} {values.shape} {values.dtype.str}".encode())
@@ -74,7 +73,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         known = set(header) == _HEADER and set(header["settings"]) == set(_SETTINGS)
     except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(f"{path} is not a bundle of a launch: {error}") from error
-    if not known or header["digest"] != _digest(values):
+    if not known or header.pop("digest") != _digest(header, values):
         raise InputError(f"{path} is not a bundle of this version, or it was changed")
     return header, values
 

@@ -318,7 +318,9 @@ class SolverData:
         com = self.topologies[self.world_topology[world]].body_com
         views = self.views
         quat = np.asarray(body_q)[:, 3:]
-        quat = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+        # a unit quaternion stays as it is, so that steps through a Newton state lose no bits
+        norm = np.linalg.norm(quat, axis=1, keepdims=True)
+        quat = np.where(np.abs(norm - 1.0) > 1e-6, quat / norm, quat)
         views["bodies.x"][rows] = np.asarray(body_q)[:, :3] + _rotate(quat, com)
         views["bodies.q"][rows] = quat
         views["bodies.v"][rows] = 0.0 if body_qd is None else np.asarray(body_qd)[:, :3]

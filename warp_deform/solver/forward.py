@@ -188,6 +188,8 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                     take(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
                 if grips.push[w0 + lane] >= 0:
                     longest_push = wp.max(longest_push, grips.push_steps[w0 + lane])
+        # the table hides at once that a particle started under it
+        watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
         substep = int(0)
         while substep < st.max_steps and any_less(zero - on, S(0.0)):
             all_on = not any_less(on, S(0.5))

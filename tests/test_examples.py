@@ -1,0 +1,43 @@
+"""Every example runs as a user would run it; each ends with an assertion of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+ARGUMENTS = {"read_dataset": ["{dataset}", "--sheet", "{out}"]}
+"""Arguments of the examples that need any."""
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from warp_deform.collect import CollectConfig, collect
+
+    folder = tmp_path_factory.mktemp("examples") / "block"
+    collect(CollectConfig(task="block-notarget", episodes=2, seed=0, out=folder, workers=1))
+    return folder
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_example_runs(example: Path, dataset: Path, tmp_path: Path) -> None:
+    places = {"dataset": str(dataset), "out": str(tmp_path / "out.png")}
+    arguments = [word.format(**places) for word in ARGUMENTS.get(example.stem, [])]
+    done = subprocess.run(
+        [sys.executable, str(example), *arguments],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_examples_are_short() -> None:
+    assert len(EXAMPLES) >= 5
+    for example in EXAMPLES:
+        assert len(example.read_text().splitlines()) <= 80, example.name
