@@ -1,4 +1,4 @@
-"""Small scenes for the solver's tests: particles, links and boxes straight from Newton's builder."""
+"""Small scenes for the solver's tests: particles, links, boxes straight from Newton's builder."""
 
 from __future__ import annotations
 

@@ -30,8 +30,7 @@ DT, RADIUS = 1 / 1200, 0.005
 
 
 def test_a_sliding_bead_stops_after_v2_over_2_mu_g():
-    # s = v^2 / (2 mu g); the table acts from the first substep on, so s is short by at most v dt, and
-    # sticking is smooth below mu g dt, which lets the bead run on by a few (mu g dt^2)
+    # s = v^2 / (2 mu g); s is short by at most v dt: the table acts in the first substep
     for mu, speed in ((0.2, 0.5), (0.5, 1.0), (0.8, 0.6)):
         builder = new_builder()
         add_particles(builder, [(0, 0, RADIUS)], velocities=[(speed, 0, 0)])
@@ -143,7 +142,6 @@ def test_a_falling_heap_never_gains_energy(seed):
         solver.run(30)
         levels.append(energy(solver))
     rise = np.max(np.array(levels[1:]) - np.minimum.accumulate(levels)[:-1])
-    print("rise", rise / levels[0])
     assert rise < 1e-3 * levels[0]
 
 
@@ -193,7 +191,7 @@ def test_a_bead_on_a_bead_column_carries_no_hidden_overlap():
 
 
 def test_a_bead_slides_over_a_row_of_beads_with_coulomb_friction():
-    # a row so dense that it is nearly flat: speed falls by mu g t, less what the bumps take at mu = 0
+    # a row so dense that it is nearly flat: the speed falls by mu g t more than without friction
     seconds, speeds = 0.05, {}
     for mu in (0.0, 0.3, 0.6):
         builder = new_builder()
@@ -205,7 +203,6 @@ def test_a_bead_slides_over_a_row_of_beads_with_coulomb_friction():
         solver = finalize(builder, ideal(contact_friction=mu, table_friction=0.0))
         solver.run(round(seconds / DT))
         speeds[mu] = velocities(solver)[-1, 0]
-    print(speeds)
     for mu in (0.3, 0.6):
         assert speeds[0.0] - speeds[mu] == pytest.approx(mu * G * seconds, rel=0.1), speeds
 
@@ -217,7 +214,7 @@ def test_a_dragged_ring_keeps_its_perimeter():
     solver = finalize(builder, SolverConfig(), precision="float32")
     times = np.array([0.0, 2.0, 2.2])
     start = positions(solver)[0]
-    path = np.array([start, start + [0.0, 0.3, 0.0], start + [0.0, 0.3, 0.0]])
+    path = np.array([start, start + np.array([0.0, 0.3, 0.0]), start + np.array([0.0, 0.3, 0.0])])
     result = rollout(
         solver, [0], paths={0: GripPath(times, path, particle=0)}, record=0.05, most=5.0
     )
@@ -235,12 +232,12 @@ def test_a_dragged_cable_trails_behind_the_tip():
     add_cable(builder, config, cable_line(config, (0.3, 0.0), (0.7, 0.0)))
     solver = finalize(builder, SolverConfig(), precision="float32")
     start = positions(solver)[-1]
-    path = np.array([start, start + [0.3, 0.0, 0.0]])
+    path = np.array([start, start + np.array([0.3, 0.0, 0.0])])
     result = rollout(
         solver, [0], paths={0: GripPath(np.array([0.0, 2.0]), path, particle=23)}, most=5.0
     )
     x = positions(solver)
-    np.testing.assert_allclose(x[-1], start + [0.3, 0, 0], atol=2e-3)
+    np.testing.assert_allclose(x[-1], np.add(start, [0.3, 0, 0]), atol=2e-3)
     assert np.abs(x[:, 1]).max() < 1e-3
     assert result[0].watch.stretch < 1.05
 

@@ -107,10 +107,10 @@ def test_a_contact_list_that_is_too_short_is_an_error():
 
 def test_a_list_that_overflows_is_the_fault_of_the_world_that_filled_it():
     builder = new_builder()
-    for spread in (0.01, 5.0):
+    for _ in range(2):
         world = new_builder()
         rng = np.random.default_rng(1)
-        add_particles(world, [0, 0, 0.1] + rng.uniform(0, 0.01, (20, 3)), colliding=True)
+        add_particles(world, np.add(rng.uniform(0, 0.01, (20, 3)), (0, 0, 0.1)), colliding=True)
         builder.add_world(world)
     solver = finalize(builder, SolverConfig(), lanes=8, pairs_per_particle=2)
     solver.data.lane("particles.x", 1)[:, 0] = np.arange(20.0)
@@ -132,7 +132,9 @@ def test_a_grip_that_dives_under_the_table_is_noticed():
     solver = cable_solver()
     start = positions(solver)[0]
     knots = np.array([start, [start[0], start[1], -0.05]])
-    result = rollout(solver, [0], paths={0: GripPath(np.array([0, 0.5]), knots, particle=0)}, most=0.6)
+    result = rollout(
+        solver, [0], paths={0: GripPath(np.array([0, 0.5]), knots, particle=0)}, most=0.6
+    )
     problems = result[0].watch.problems(0, solver.config.limits)
     assert ProblemKind.PENETRATION in {p.kind for p in problems}
 
@@ -157,7 +159,9 @@ def bundle(tmp_path: Path) -> tuple[SolverFusedXPBD, Path]:
     with pytest.raises(PhysicsError) as caught:
         step_with(solver, overstretched)
     path = caught.value.bundle
-    assert path is not None and path.parent == tmp_path / "faults" and str(path) in str(caught.value)
+    assert (
+        path is not None and path.parent == tmp_path / "faults" and str(path) in str(caught.value)
+    )
     return solver, path
 
 
@@ -183,9 +187,7 @@ def test_bundles_are_written_with_bodies_and_grips(tmp_path):
     builder = new_builder()
     add_cable(builder, SHORT, cable_line(SHORT, (0.4, 0), (0.6, 0)))
     add_box(builder, BoxConfig(), (0.45, 0.0, 0.06))
-    solver = SolverFusedXPBD(
-        builder.finalize(device="cpu"), precision="float64", bundles=tmp_path
-    )
+    solver = SolverFusedXPBD(builder.finalize(device="cpu"), precision="float64", bundles=tmp_path)
     start = positions(solver)[0]
     path = GripPath(np.array([0, 0.1]), np.array([start, start - [0, 0, 0.1]]), particle=0)
     result = rollout(solver, [0], paths={0: path}, most=0.2)
@@ -233,7 +235,7 @@ def test_a_bad_bundle_is_refused(bundle, kind):
 
 
 def test_a_bundle_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(InputError, match="nothing.npz"):
+    with pytest.raises(InputError, match="nothing"):
         replay_bundle(tmp_path / "nothing.npz")
 
 
@@ -263,7 +265,11 @@ def test_bad_options_of_the_solver_are_refused(options, says):
 
 @pytest.mark.parametrize(
     ("values", "says"),
-    [({"friction": 1.0}, "friction"), ({"damping": -1.0}, "damping"), ({"stiffness": 0.0}, "stiffness")],
+    [
+        ({"friction": 1.0}, "friction"),
+        ({"damping": -1.0}, "damping"),
+        ({"stiffness": 0.0}, "stiffness"),
+    ],
 )
 def test_bad_parameters_of_a_world_are_refused(values, says):
     with pytest.raises(InputError, match=says):

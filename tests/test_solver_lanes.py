@@ -46,7 +46,9 @@ def box_world() -> newton.ModelBuilder:
     return builder
 
 
-def solver_of(world: newton.ModelBuilder, count: int, lanes: int, precision: str) -> SolverFusedXPBD:
+def solver_of(
+    world: newton.ModelBuilder, count: int, lanes: int, precision: str
+) -> SolverFusedXPBD:
     builder = new_builder()
     builder.replicate(world, count)
     config = SolverConfig()
@@ -67,14 +69,14 @@ def play(solver: SolverFusedXPBD, slots: dict[int, int], seconds: float = 0.6) -
         if seed % 2:
             start = solver.data.lane("particles.x", slot)[0].astype(float)
             knots = start + np.array([[0, 0, 0], [0.03, 0.01 * seed, 0.02], [0.05, 0, -0.01]])
-            paths[slot] = GripPath(
-                np.array([0, 0.1, 0.25]), knots, particle=0, lower=(0.15, 0.25)
-            )
+            paths[slot] = GripPath(np.array([0, 0.1, 0.25]), knots, particle=0, lower=(0.15, 0.25))
         else:
             pushes[slot] = Push(6, np.array([4.0 * seed, 9.0, 20.0]), 0.05)
         least[slot] = 0.02 * seed
     most = {slot: seconds * (0.5 + 0.1 * seed) for slot, seed in slots.items()}
-    rollout(solver, list(slots), paths=paths, pushes=pushes, least=least, most=most, calm_after=0.02)
+    rollout(
+        solver, list(slots), paths=paths, pushes=pushes, least=least, most=most, calm_after=0.02
+    )
     return {seed: state_bytes(solver, slot) for slot, seed in slots.items()}
 
 
@@ -165,7 +167,9 @@ def test_finished_worlds_cost_nothing():
     # a launch ends with its last world: steps are counted by world, and the frames of a world that
     # came to rest at once end there
     solver = solver_of(cable_world(), 8, 8, "float32")
-    result = rollout(solver, range(8), least={0: 0.5} | dict.fromkeys(range(1, 8), 0.0), most=5.0, record=0.01)
+    result = rollout(
+        solver, range(8), least={0: 0.5} | dict.fromkeys(range(1, 8), 0.0), most=5.0, record=0.01
+    )
     dt = solver.config.dt
     rest = round(solver.config.rest_seconds / dt)
     steps = [result[w].watch.steps for w in range(8)]
@@ -193,7 +197,7 @@ def test_mixed_models_equal_each_world_alone():
     def ring_world() -> newton.ModelBuilder:
         builder = new_builder()
         line = cable_ring(ring, (0.5, 0.0))
-        line[:, 2] += 0.01 * np.sin(np.arange(16))**2
+        line[:, 2] += 0.01 * np.sin(np.arange(16)) ** 2
         add_cable(builder, ring, line)
         return builder
 

@@ -81,7 +81,7 @@ def test_bodies_and_particles_fall_alike(gravity):
 def spinning_web(dt: float, seconds: float) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Relative change of linear and angular momentum of a free web of links, and energies."""
     rng = np.random.default_rng(3)
-    x = rng.uniform(-0.1, 0.1, (5, 3)) + [0, 0, 10]
+    x = np.add(rng.uniform(-0.1, 0.1, (5, 3)), (0, 0, 10))
     v = rng.uniform(-0.5, 0.5, (5, 3))
     mass = rng.uniform(0.05, 0.2, 5)
     pairs = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 0), (0, 2)]
@@ -178,7 +178,8 @@ def pendulum(dt: float, seconds: float) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def test_the_pendulum_has_its_period():
-    # T = 4 sqrt(L/g) K(sin(swing / 2)), K the complete elliptic integral: 1.6 % above 2 pi sqrt(L/g)
+    # T = 4 sqrt(L/g) K(sin(swing / 2)), K the complete elliptic integral: 1.6 % above the small-
+    # swing 2 pi sqrt(L/g)
     exact = 4 * np.sqrt(LENGTH / G) * ellipk(np.sin(SWING / 2) ** 2)
     t, angle, lost = pendulum(DT, 2.5)
     k = np.flatnonzero((angle[:-1] > 0) & (angle[1:] <= 0))
@@ -256,7 +257,6 @@ def test_a_hanging_chain_is_a_catenary():
         assert np.abs(velocities(solver)).max() < 1e-3
         shape = positions(solver)[:, [0, 2]] - [0, 1]
         errors.append(np.linalg.norm(shape - chain_shape(), axis=1).max())
-    print(errors)
     # one sweep a substep leaves a stretch of order n^2 g dt^2, from the nails inwards
     assert errors[0] < 0.5 * BEADS**2 * G / 2400**2
     assert errors[1] < 0.35 * errors[0], errors

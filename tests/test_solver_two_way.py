@@ -193,7 +193,7 @@ def carry(config: BoxConfig, height: float, turn: float) -> tuple[SolverFusedXPB
     """Lift a box, carry it 30 cm, turn it, lower it until it touches, let go."""
     solver = box_solver((config, (0.3, 0, -config.lowest)), config=SOLID)
     start = x_of(solver)[0]
-    end = start + [0.3, 0.1, 0]
+    end = np.add(start, (0.3, 0.1, 0))
     times = np.array([0, 0.3, 0.9, 1.5, 1.7])
     up = np.array([0, 0, height])
     knots = np.array([start, start + up, end + up, end - [0, 0, 0.01], end - [0, 0, 0.01]])

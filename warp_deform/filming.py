@@ -24,8 +24,6 @@ __all__ = ["check_video", "film"]
 FPS = 24
 LONGEST = 20.0
 """Length of a video [s]: longer episodes are shown faster, and the picture says how much."""
-RETURN_SECONDS = 0.5
-"""Time that the drawn arm takes back to where it waits [s]; the next action starts from there."""
 STILL_SECONDS = 0.7
 """The first and the last state of an episode stay for so long in the video [s]."""
 _SLOTS = 8
@@ -95,12 +93,14 @@ def _shots(worlds: Worlds, recording: Recording, episode: Episode, speed: float)
     _check(worlds, episode, 0)
     interval = speed / FPS
     still = round(STILL_SECONDS * FPS)
+    waiting = worlds.robot.home_q
     for t, step in enumerate(episode.steps[:-1]):
         start = worlds.episodes[0].snapshot
         assert step.action is not None
         report = worlds.step({0: step.action}, record=interval)[0]
         _check(worlds, episode, t + 1)
-        arm = _ArmPath(report, worlds.robot.home_q)
+        arm = _ArmPath(report, waiting)
+        waiting = arm.at(arm.seconds)
         if t == 0:
             yield from [_Shot(start.particle_q, start.body_q, arm.at(0.0), t)] * still
         assert report.frames is not None
@@ -116,33 +116,24 @@ def _shots(worlds: Worlds, recording: Recording, episode: Episode, speed: float)
 
 
 class _ArmPath:
-    """Joint positions during one action: along its motions, then back to where it began."""
+    """Joint positions during one action: along its motions, from where the last one ended."""
 
-    def __init__(self, report: StepReport, home_q: np.ndarray) -> None:
-        self._pieces: list[tuple[float, np.ndarray, np.ndarray]] = []
-        begin, last = 0.0, None
-        for motion, joints in zip(report.motions, report.joints, strict=True):
-            if joints is None:  # out of reach: the arm stays where it is
+    def __init__(self, report: StepReport, waiting: np.ndarray) -> None:
+        times, joints = [np.zeros(1)], [waiting[None]]
+        begin = 0.0
+        for motion, q in zip(report.motions, report.joints, strict=True):
+            if q is None:  # out of reach: the arm stays where it is
                 break
-            self._pieces.append((begin, begin + motion.times, joints))
-            begin, last = begin + motion.seconds, joints[-1]
-        wait = self._pieces[0][2][0] if self._pieces else home_q
-        if last is not None:
-            times = begin + np.array([0.0, RETURN_SECONDS])
-            self._pieces.append((begin, times, np.array([last, wait])))
-        self._wait = wait
-        self.seconds = begin + (RETURN_SECONDS if last is not None else 0.0)
+            times.append(begin + motion.times)
+            joints.append(q)
+            begin += motion.seconds
+        first = 1 if len(times) > 1 else 0  # the motions begin where the arm waits
+        self._times, self._joints = np.concatenate(times[first:]), np.concatenate(joints[first:])
+        self.seconds = begin
 
     def at(self, time: float) -> np.ndarray:
         """Joint positions (dof,) [rad] at a time from the beginning of the action [s]."""
-        piece = None
-        for candidate in self._pieces:
-            if candidate[0] <= time:
-                piece = candidate
-        if piece is None:
-            return self._wait
-        _, times, joints = piece
-        return np.array([np.interp(time, times, q) for q in joints.T])
+        return np.array([np.interp(time, self._times, q) for q in self._joints.T])
 
 
 def _check(worlds: Worlds, episode: Episode, t: int) -> None:
