@@ -1,6 +1,6 @@
 """Makes the README's picture: a frame from the middle of an action, and what the policy sees.
 
-    python docs/make_picture.py docs/images/cable-shape.png
+python docs/make_picture.py docs/images/cable-shape.png
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ SIZE = (600, 1200)
 
 
 def main(path: Path) -> None:
+    """Simulate up to the action, and draw a moment of it."""
     worlds = Worlds("cable-shape")
     worlds.reset({0: SEED})
     rng = episode_rng(SEED, DEMONSTRATOR_STREAM)

@@ -11,7 +11,5 @@ from warp_deform.solver.forward import forward_kernel
 @pytest.mark.parametrize("with_bodies", [False, True])
 def test_the_solver_compiles_to_ptx(tmp_path: Path, with_bodies: bool) -> None:
     kernel = forward_kernel(wp.float32, 1, with_bodies)
-    (ptx,) = wp.compile_aot_module(
-        kernel.module, arch=80, module_dir=str(tmp_path), use_ptx=True
-    )
+    (ptx,) = wp.compile_aot_module(kernel.module, arch=80, module_dir=str(tmp_path), use_ptx=True)
     assert ".visible .entry forward" in Path(ptx).read_text()
