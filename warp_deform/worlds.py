@@ -7,6 +7,7 @@ episode's bits depend on its seed and its actions only, not on its neighbours or
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import newton
 import numpy as np
@@ -56,8 +57,8 @@ class Worlds:
         reports = worlds.step({slot: action, ...})
         worlds.episodes[slot].snapshot.images.color
 
-    robot: "ur5" or "panda"; lanes, precision: see `SolverFusedXPBD`. Starts that already solve the
-    task, or leave the table, are drawn again and counted.
+    robot: "ur5" or "panda"; lanes, precision, bundles: see `SolverFusedXPBD`. Starts that already
+    solve the task, or leave the table, are drawn again and counted.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class Worlds:
         robot: str = "ur5",
         lanes: int | None = None,
         precision: str = "float32",
+        bundles: Path | None = None,
     ) -> None:
         self.task = find_task(task) if isinstance(task, str) else task
         self.robot = find_robot(robot)
@@ -80,7 +82,7 @@ class Worlds:
         builder.replicate(one, count)
         self.model = builder.finalize(device="cpu")
         self.solver = SolverFusedXPBD(
-            self.model, self.task.solver, lanes=lanes, precision=precision
+            self.model, self.task.solver, lanes=lanes, precision=precision, bundles=bundles
         )
         self.episodes: dict[int, RunningEpisode] = {}
         self._topdown = TopDown()

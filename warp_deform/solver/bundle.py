@@ -8,18 +8,15 @@ import zipfile
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from ..errors import InputError
-from .data import KERNEL_ARGUMENTS
+from .data import KERNEL_ARGUMENTS, SolverData
 from .forward import forward_kernel
 from .structures import structures
-
-if TYPE_CHECKING:
-    from .solver import SolverFusedXPBD
 
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
@@ -29,15 +26,16 @@ _SETTINGS = ("dt", "max_steps", "recovery", "max_speed", "calm_speed", "margin",
              "body_stride")  # fmt: skip
 
 
-def write_bundle(folder: Path, solver: SolverFusedXPBD) -> Path:
-    """Write all inputs of the solver's last launch to an .npz file named after their hash."""
+def write_bundle(
+    folder: Path, data: SolverData, settings: Any, arrays: dict[str, np.ndarray]
+) -> Path:
+    """Write all inputs of a launch, `arrays` by name, to an .npz file named after their hash."""
     folder.mkdir(parents=True, exist_ok=True)
-    arrays, settings = solver._bundle or {}, solver._last
     header = {
-        "lanes": solver.data.lanes,
-        "precision": np.dtype(solver.data.number).name,
-        "bodies": bool(solver.data.has_bodies),
-        "groups": solver.data.group_count,
+        "lanes": data.lanes,
+        "precision": np.dtype(data.number).name,
+        "bodies": bool(data.has_bodies),
+        "groups": data.group_count,
         "settings": {name: getattr(settings, name) for name in _SETTINGS},
     }
     header["digest"] = digest = _digest(header, arrays)

@@ -17,7 +17,7 @@ from ..objects.attributes import NAMESPACE, register_attributes
 from .config import SolverConfig
 from .data import KERNEL_ARGUMENTS, SolverData
 from .forward import forward_kernel
-from .guards import PhysicsError, WatchValues
+from .guards import PhysicsError, Problem, WatchValues
 
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
@@ -78,6 +78,7 @@ class SolverFusedXPBD(SolverBase):
             model, scalar=scalars[precision], lanes=lanes, pairs_per_particle=pairs_per_particle
         )
         self.bundles = bundles
+        self.bundle: Path | None = None
         self._kernel = forward_kernel(scalars[precision], lanes, bool(self.data.has_bodies))
         self._launch: Any = None
         self._gravity()
@@ -168,7 +169,8 @@ class SolverFusedXPBD(SolverBase):
     def run(self, max_steps: int, *, record_every: int = 0) -> list[WatchValues]:
         """Launch up to `max_steps` substeps; returns the guards' values by world.
 
-        Worlds stop early as `set_duration` says. Nothing is raised: see `check`.
+        Worlds stop early as `set_duration` says. Nothing is raised, see `check`; but when a guard
+        fires and the solver has a folder for bundles, `bundle` is the file that reproduces it.
         """
         data = self.data
         frames = -(-max_steps // record_every) if record_every else 0
@@ -179,15 +181,23 @@ class SolverFusedXPBD(SolverBase):
         for name in ("watch.steps", "watch.nonfinite", "watch.stretch", "watch.depth",
                      "watch.clamped", "watch.overflow"):  # fmt: skip
             data.arrays[name].view[...] = 0
-        self._bundle = data_copy(data) if self.bundles is not None else None
-        self._last = settings
+        inputs = data_copy(data) if self.bundles is not None else {}
         for mirrored in data.arrays.values():
             mirrored.to_device()
         launch = self._recorded(settings)
         launch.launch()
         for mirrored in data.arrays.values():
             mirrored.to_host()
-        return self._values()
+        values = self._values()
+        if self.bundles is not None and self._problems(values):
+            from .bundle import write_bundle
+
+            self.bundle = write_bundle(self.bundles, self.data, settings, inputs)
+        return values
+
+    def _problems(self, values: list[WatchValues]) -> tuple[Problem, ...]:
+        limits = self.config.limits
+        return tuple(p for w, v in enumerate(values) for p in v.problems(w, limits))
 
     def _settings(self, max_steps: int, record_every: int) -> Any:
         c, data = self.config, self.data
@@ -241,17 +251,10 @@ class SolverFusedXPBD(SolverBase):
         return out
 
     def check(self, values: list[WatchValues]) -> None:
-        """Raise `PhysicsError` if a guard fired in any world, writing a bundle if asked for."""
-        problems = tuple(p for w, v in enumerate(values) for p in v.problems(w, self.config.limits))
+        """Raise `PhysicsError` if a guard fired in any world."""
+        problems = self._problems(values)
         if problems:
-            raise PhysicsError(problems, self._write_bundle())
-
-    def _write_bundle(self) -> Path | None:
-        if self.bundles is None or self._bundle is None:
-            return None
-        from .bundle import write_bundle
-
-        return write_bundle(self.bundles, self)
+            raise PhysicsError(problems, self.bundle)
 
     # -- Newton
 
