@@ -25,9 +25,9 @@ from warp_deform.quiet import quiet_warp
 
 PEERS = {
     "cable": ("pybullet", "newton-vbd", "newton-xpbd"),
+    "heap": ("pybullet", "newton-vbd", "newton-xpbd"),
     "ring": ("pybullet", "newton-vbd", "newton-xpbd"),
-    "cloth": (),
-    "bag": (),
+    "block": ("pybullet", "newton-xpbd"),
 }
 LANES = 8
 WORLDS = 64
@@ -35,7 +35,7 @@ WORLDS = 64
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--scenes", nargs="+", choices=PEERS, default=["cable", "ring"])
+    parser.add_argument("--scenes", nargs="+", choices=PEERS, default=list(PEERS))
     parser.add_argument("--seconds", type=float, default=1.0, help="simulated time of a repeat [s]")
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--quick", action="store_true", help="a smoke run; not for publication")

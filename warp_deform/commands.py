@@ -86,11 +86,11 @@ class DemoOptions(CommandOptions):
     demonstrator: Literal["scripted", "visible", "mpc", "planner"] = "scripted"
     """Who acts: scripted sees the simulator's state, visible only what a camera sees."""
     workers: Annotated[int | None, arg(metavar="W")] = None
-    """Processes; one per core when left out. The result does not depend on it."""
+    """Processes; left out, one per core, fewer for few episodes. The result is the same."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
     """Address of a Ray cluster to work on (needs the extra `ray`)."""
     video: _File = None
-    """MP4 of the kept episodes."""
+    """MP4 of the first two kept episodes."""
     robot: Literal["ur5", "panda"] = "ur5"
     """The arm."""
 
@@ -167,7 +167,7 @@ class ReplayOptions(CommandOptions):
     tolerance: Annotated[float | None, arg(metavar="M")] = None
     """Compare positions within this distance [m] instead of bits, for another kind of processor."""
     workers: Annotated[int | None, arg(metavar="W")] = None
-    """Processes; one per core when left out."""
+    """Processes; left out, one per core, fewer for few episodes."""
 
 
 def replay(options: ReplayOptions) -> Outcome:

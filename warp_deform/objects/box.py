@@ -37,7 +37,7 @@ class BoxConfig:
     mass: float = 0.01
     """Mass of the whole body [kg], spread evenly over the parts' volumes."""
     friction: float = 1.0
-    """Coulomb coefficient against the table and other bodies."""
+    """Factor on the solver's Coulomb coefficients, for the table, particles and bodies."""
     color: Color = RED
 
     def __post_init__(self) -> None:

@@ -40,7 +40,8 @@ class CableConfig:
     mass: float = 0.1
     """Mass of a bead [kg]."""
     link_stiffness: float = 1e6
-    """Stiffness of a link [N/m]; high enough that a link stretches by 1 % at most when dragged."""
+    """Stiffness of a link [N/m]; so high that what one iteration a substep leaves over is what a
+    dragged link stretches by."""
     fold_limit: float = 1.1
     """Smallest distance between second neighbours, in spacings. Chosen so that the scripted ring
     demonstrator needs as many actions as in the paper."""

@@ -103,7 +103,7 @@ def time_newton(
     repeats: int = 5,
     settings: NewtonSettings | None = None,
 ) -> PeerTiming:
-    """CPU cost of `scene` ("cable", "ring" or "block") in a stock Newton solver.
+    """CPU cost of `scene`, one of `PEER_SCENES`, in a stock Newton solver.
 
     Args:
         scene: What to simulate; the block is a rigid body in every solver.

@@ -28,7 +28,7 @@ _NOTE = (
 
 
 def time_pybullet(scene: str, *, seconds: float = 1.0, repeats: int = 5) -> PeerTiming:
-    """CPU cost of `scene` ("cable", "ring" or "block") in PyBullet, one process, one thread.
+    """CPU cost of `scene`, one of `PEER_SCENES`, in PyBullet, one process, one thread.
 
     Raises:
         InputError: PyBullet is not installed, or an argument is out of range.

@@ -19,7 +19,7 @@ PEERS: dict[str, Callable[..., PeerTiming]] = {
 
 
 def time_peer(peer: str, scene: str, *, seconds: float = 1.0, repeats: int = 5) -> PeerTiming:
-    """CPU cost of `scene` ("cable", "ring" or "block") in "pybullet", "newton-vbd" and so on.
+    """CPU cost of `scene`, one of `PEER_SCENES`, in "pybullet", "newton-vbd" and so on.
 
     Raises:
         InputError: an argument is unknown or out of range, or PyBullet is not installed.

@@ -58,7 +58,7 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
         w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int,
         q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
     ):  # fmt: skip
-        """Whether what is held touches the table or anything else."""
+        """Whether a held particle touches another one, or a held body the table or anything."""
         hit = bool(False)
         particle = grips.particle[w]
         if particle >= 0:

@@ -1,8 +1,8 @@
 """The arrays that the fused kernel works on, bundled so that a launch takes a handful of arguments.
 
 Worlds with the same topology share one thread in groups of L. Arrays of V or V3 are indexed by
-group, arrays of scalars by world (``group * L + lane``; the last group is padded with copies).
-Indices inside a topology are local to its world.
+group, arrays of scalars by world (``group * L + lane``; the last group is padded with worlds that
+never run). Indices inside a topology are local to its world.
 """
 
 import functools
