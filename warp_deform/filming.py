@@ -40,7 +40,12 @@ class _Shot:
 
 
 def check_video(path: Path) -> None:
-    """Raise InputError unless a video can be written to `path`."""
+    """Make the folder of `path` where it is missing; InputError unless a video can be written."""
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"no video can be written to {path}: {error.strerror}") from error
     VideoWriter(path, FPS)
 
 

@@ -18,11 +18,12 @@ NAMESPACE = "warp_deform"
 
 
 class SpringMode(IntEnum):
-    """When a spring acts on the distance between its two particles."""
+    """When a spring acts, and on which distance."""
 
     EQUAL = 0  # always: the distance is the rest length
     AT_LEAST = 1  # only when shorter than the rest length (fold limits)
     AT_MOST = 2  # only when longer than the rest length (tension-only diagonals)
+    BEND = 3  # on a third particle: its distance from the middle of the two is the rest length
 
 
 def attribute(name: str) -> str:
@@ -38,6 +39,7 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
     ========================  =========  ===================================================
     spring_mode               spring     a `SpringMode`
     spring_limit              spring     strain limit: largest length / rest length; 0 = none
+    spring_middle             spring     BEND: the particle between the two
     particle_object           particle   which object of its world a particle belongs to
     particle_rest             particle   position in the object's undeformed shape [m]
     particle_exclusion        particle   no self-contact closer than this in the rest shape [m]
@@ -48,12 +50,13 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
     import warp as wp
 
     frequency = newton.Model.AttributeFrequency
-    for name, where, dtype, default in (
-        ("spring_mode", frequency.SPRING, wp.int32, int(SpringMode.EQUAL)),
-        ("spring_limit", frequency.SPRING, wp.float32, 0.0),
-        ("particle_object", frequency.PARTICLE, wp.int32, 0),
-        ("particle_rest", frequency.PARTICLE, wp.vec3, wp.vec3(0.0, 0.0, 0.0)),
-        ("particle_exclusion", frequency.PARTICLE, wp.float32, 0.0),
+    for name, where, dtype, default, references in (
+        ("spring_mode", frequency.SPRING, wp.int32, int(SpringMode.EQUAL), None),
+        ("spring_limit", frequency.SPRING, wp.float32, 0.0, None),
+        ("spring_middle", frequency.SPRING, wp.int32, -1, frequency.PARTICLE),
+        ("particle_object", frequency.PARTICLE, wp.int32, 0, None),
+        ("particle_rest", frequency.PARTICLE, wp.vec3, wp.vec3(0.0, 0.0, 0.0), None),
+        ("particle_exclusion", frequency.PARTICLE, wp.float32, 0.0, None),
     ):
         builder.add_custom_attribute(
             newton.ModelBuilder.CustomAttribute(
@@ -61,6 +64,7 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
                 frequency=where,
                 dtype=dtype,
                 default=default,
+                references=references,
                 assignment=newton.Model.AttributeAssignment.MODEL,
                 namespace=NAMESPACE,
             )

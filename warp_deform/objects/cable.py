@@ -47,6 +47,9 @@ class CableConfig:
     demonstrator needs as many actions as in the paper."""
     fold_stiffness: float = 1e4
     """Stiffness of the fold limit [N/m]; at 1e3 it stores enough energy to make beads hop."""
+    bend_stiffness: float = 0.0
+    """Stiffness of the springs that pull a bead to the middle of its neighbours [N/m], so that the
+    cable bends like a beam with E I = bend_stiffness * spacing^3 / 4; the paper's bend freely."""
     exclusion: float = 2.5
     """Beads closer along the chain than this many spacings do not collide."""
     color: Color = BLUE
@@ -59,7 +62,10 @@ class CableConfig:
         for name in ("spacing", "radius", "visual_radius", "mass", "link_stiffness"):
             if not getattr(self, name) > 0:
                 raise InputError(f"CableConfig.{name} must be positive, got {getattr(self, name)}")
-        if self.fold_limit < 0 or self.fold_limit >= 2:
+        for name in ("fold_stiffness", "bend_stiffness", "exclusion"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"CableConfig.{name} must be 0 or more, got {getattr(self, name)}")
+        if not 0 <= self.fold_limit < 2:
             raise InputError(f"CableConfig.fold_limit must be in [0, 2), got {self.fold_limit}")
 
     @property
@@ -151,11 +157,13 @@ def add_cable(builder: newton.ModelBuilder, config: CableConfig, positions: np.n
                 attribute("particle_exclusion"): config.exclusion * config.spacing,
             },
         )
-    for step, ratio, stiffness, mode in (
-        (1, 1.0, config.link_stiffness, SpringMode.EQUAL),
-        (2, config.fold_limit, config.fold_stiffness, SpringMode.AT_LEAST),
+    offset = float(np.linalg.norm(rest[1] - (rest[0] + rest[2]) / 2))
+    for step, length, stiffness, mode in (
+        (1, config.spacing, config.link_stiffness, SpringMode.EQUAL),
+        (2, config.fold_limit * config.spacing, config.fold_stiffness, SpringMode.AT_LEAST),
+        (2, offset, config.bend_stiffness, SpringMode.BEND),
     ):
-        if ratio == 0:
+        if stiffness == 0 or (length == 0 and mode == SpringMode.AT_LEAST):
             continue
         starts = range(config.beads if config.closed else config.beads - step)
         for i in _from_both_ends(starts):
@@ -166,9 +174,12 @@ def add_cable(builder: newton.ModelBuilder, config: CableConfig, positions: np.n
                 stiffness,
                 0.0,
                 0.0,
-                custom_attributes={attribute("spring_mode"): int(mode)},
+                custom_attributes={
+                    attribute("spring_mode"): int(mode),
+                    attribute("spring_middle"): first_particle + (i + 1) % config.beads,
+                },
             )
-            builder.spring_rest_length[-1] = ratio * config.spacing
+            builder.spring_rest_length[-1] = length
     return Cable(
         config,
         range(first_particle, builder.particle_count),

@@ -137,6 +137,7 @@ class SolverData:
             ("topology.pair_start", starts("pair_ij")),
             ("topology.shape_start", starts("shape_body")),
             ("springs.mode", joined("spring_mode")),
+            ("springs.middle", joined("spring_middle")),
             ("shapes.body", joined("shape_body")),
         ):
             self._constant(name, np.asarray(values), wp.int32, np.int32)

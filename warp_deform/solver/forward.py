@@ -12,6 +12,8 @@ from typing import Any
 import warp as wp
 
 from .body_contact import body_contact
+from ..objects.attributes import SpringMode
+from .bending import bending
 from .box_box import box_box
 from .box_particle import box_particle
 from .box_table import box_table
@@ -50,6 +52,7 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
     S, V, R3, L = t.S, t.V, t.R3, t.L
     predict, finish = (getattr(table_contact(scalar, lanes), n) for n in ("predict", "finish"))
     project_distance = distance(scalar, lanes).project_distance
+    project_bend = bending(scalar, lanes).project_bend
     contact = sphere_contact(scalar, lanes)
     list_near, project_contact = contact.list_near, contact.project_contact
     grips_ = grip(scalar, lanes)
@@ -249,7 +252,10 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
             # always in the same order: sweeping backwards in every other substep makes tight heaps
             # crawl for ever, and shells jitter
             for s in range(s0, s1):
-                project_distance(s, p0, inverse_dt2, q, springs)
+                if springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                    project_bend(s, p0, inverse_dt2, q, springs)
+                else:
+                    project_distance(s, p0, inverse_dt2, q, springs)
             for c in range(near_start, near_start + near_count):
                 project_contact(c, p0, contact_mu, push, q, pairs, near)
             if wp.static(with_bodies):

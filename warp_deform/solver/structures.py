@@ -54,13 +54,14 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.struct
     class Springs:
-        """Distance constraints between particles, numbered inside their world."""
+        """Distance and bending constraints between particles, numbered inside their world."""
 
         ij: wp.array(dtype=wp.vec2i)
         length: wp.array(dtype=S)  # [m]
         compliance: wp.array(dtype=S)  # [m/N]
         limit: wp.array(dtype=S)  # longest allowed length [m]; 0: none
         mode: wp.array(dtype=int)
+        middle: wp.array(dtype=int)  # of a bending spring: the particle between the two
 
     @wp.struct
     class Pairs:

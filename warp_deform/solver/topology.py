@@ -12,7 +12,7 @@ import newton
 import numpy as np
 
 from ..errors import InputError
-from ..objects.attributes import NAMESPACE
+from ..objects.attributes import NAMESPACE, SpringMode
 
 __all__ = ["WorldTopology", "read_worlds"]
 
@@ -22,7 +22,7 @@ class WorldTopology:
     """One world as the solver sees it; all indices are local to the world.
 
     spring_ij (S, 2); spring_length (S,) [m]; spring_compliance (S,) [m/N]; spring_limit (S,) [m];
-    spring_mode (S,)
+    spring_mode (S,); spring_middle (S,): third particle of a bending spring, else -1
     pair_ij (C, 2), pair_distance (C,) [m]: particles that may collide
     particle_radius (P,) [m]
     shape_body (K,); shape_center (K, 3) relative to the centre of mass; shape_rotation (K, 4) xyzw;
@@ -35,6 +35,7 @@ class WorldTopology:
     spring_compliance: np.ndarray
     spring_limit: np.ndarray
     spring_mode: np.ndarray
+    spring_middle: np.ndarray
     pair_ij: np.ndarray
     pair_distance: np.ndarray
     particle_radius: np.ndarray
@@ -154,6 +155,8 @@ class _Springs:
             self.compliance = 1.0 / model.spring_stiffness.numpy()
             self.limit = ours.spring_limit.numpy() * self.length  # type: ignore[attr-defined]
             self.mode = ours.spring_mode.numpy()  # type: ignore[attr-defined]
+            self.middle = ours.spring_middle.numpy()  # type: ignore[attr-defined]
+            self.middle[self.mode != int(SpringMode.BEND)] = -1
 
     def of(self, ids: np.ndarray, local: np.ndarray) -> dict[str, np.ndarray]:
         if not self.count:
@@ -161,12 +164,16 @@ class _Springs:
             return {
                 "spring_ij": np.zeros((0, 2), int), "spring_length": empty,
                 "spring_compliance": empty, "spring_limit": empty, "spring_mode": empty.astype(int),
+                "spring_middle": empty.astype(int),
             }  # fmt: skip
         mine = np.isin(self.ij[:, 0], ids)
+        bent = mine & (self.mode == int(SpringMode.BEND))
+        if not np.isin(self.middle[bent], ids).all():
+            raise InputError("a BEND spring needs spring_middle, a particle of its own world")
         return {
             "spring_ij": local[self.ij[mine]], "spring_length": self.length[mine],
             "spring_compliance": self.compliance[mine], "spring_limit": self.limit[mine],
-            "spring_mode": self.mode[mine],
+            "spring_mode": self.mode[mine], "spring_middle": local[self.middle[mine]],
         }  # fmt: skip
 
 
