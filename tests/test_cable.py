@@ -8,14 +8,13 @@ from warp_deform.errors import InputError
 from warp_deform.objects import CableConfig, RingConfig, add_cable, cable_line, cable_ring
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 
-
 MASS, BEADS = 0.002, 8
 
 
 def _droop(bend_stiffness: float) -> float:
     """How far the free end of a cable clamped by its first two beads hangs down [m]."""
     config = CableConfig(beads=BEADS, mass=MASS, bend_stiffness=bend_stiffness)
-    start = cable_line(config, (0.4, 0.0), (0.5, 0.0)) + [0, 0, 0.5]
+    start = cable_line(config, (0.4, 0.0), (0.5, 0.0)) + np.array([0, 0, 0.5])
     builder = newton.ModelBuilder()
     SolverFusedXPBD.register_custom_attributes(builder)
     add_cable(builder, config, start)

@@ -1,8 +1,8 @@
 """Bending springs: a particle is pulled towards the middle of its two neighbours.
 
-The energy k / 2 (|d| - h)^2 of the offset d = x_j - (x_i + x_k) / 2 is linear in the bend angle, so a
-chain of spacing D with h = 0 is a beam of bending stiffness E I = k D^3 / 4 (a bead's offset is
-curvature times D^2 / 2). h > 0 keeps a ring round. Solved as in XPBD (see `distance`).
+The energy is k / 2 (|d| - h)^2 with the offset d = x_j - (x_i + x_k) / 2, which for slight bends is
+the curvature times D^2 / 2 in a chain of spacing D. With h = 0 the chain is a beam of bending
+stiffness E I = k D^3 / 4; h > 0 keeps a ring round. Solved as in XPBD (see `distance`).
 """
 
 import functools

@@ -11,9 +11,9 @@ from typing import Any
 
 import warp as wp
 
-from .body_contact import body_contact
 from ..objects.attributes import SpringMode
 from .bending import bending
+from .body_contact import body_contact
 from .box_box import box_box
 from .box_particle import box_particle
 from .box_table import box_table

@@ -136,8 +136,9 @@ def _refuse_unsupported(model: newton.Model) -> None:
     if model.body_count and (model.body_flags.numpy() & int(newton.BodyFlags.KINEMATIC)).any():
         raise InputError("SolverFusedXPBD has no kinematic bodies: hold the body with a grip path")
     if model.spring_count:
+        bent = getattr(model, NAMESPACE).spring_mode.numpy() == int(SpringMode.BEND)
         for what, values in (
-            ("rest length", model.spring_rest_length.numpy()),
+            ("rest length", model.spring_rest_length.numpy()[~bent]),
             ("stiffness", model.spring_stiffness.numpy()),
         ):
             if not (values > 0).all():
@@ -155,8 +156,8 @@ class _Springs:
             self.compliance = 1.0 / model.spring_stiffness.numpy()
             self.limit = ours.spring_limit.numpy() * self.length  # type: ignore[attr-defined]
             self.mode = ours.spring_mode.numpy()  # type: ignore[attr-defined]
-            self.middle = ours.spring_middle.numpy()  # type: ignore[attr-defined]
-            self.middle[self.mode != int(SpringMode.BEND)] = -1
+            middle = ours.spring_middle.numpy()  # type: ignore[attr-defined]
+            self.middle = np.where(self.mode == int(SpringMode.BEND), middle, -1)
 
     def of(self, ids: np.ndarray, local: np.ndarray) -> dict[str, np.ndarray]:
         if not self.count:
