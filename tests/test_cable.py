@@ -8,7 +8,7 @@ from warp_deform.errors import InputError
 from warp_deform.objects import CableConfig, RingConfig, add_cable, cable_line, cable_ring
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 
-MASS, BEADS = 0.002, 8
+MASS, BEADS = 0.002, 5
 
 
 def _droop(bend_stiffness: float) -> float:
@@ -19,14 +19,16 @@ def _droop(bend_stiffness: float) -> float:
     SolverFusedXPBD.register_custom_attributes(builder)
     add_cable(builder, config, start)
     builder.particle_mass[0] = builder.particle_mass[1] = 0.0
-    solver = SolverFusedXPBD(builder.finalize(device="cpu"), SolverConfig(damping=20.0))
-    solver.run(6000)
+    # one iteration a substep leaves an error of the order of dt^2 k / m, so the substep is short
+    config = SolverConfig(dt=1 / 6000, damping=20.0)
+    solver = SolverFusedXPBD(builder.finalize(device="cpu"), config)
+    solver.run(round(3 / config.dt))
     return float(start[-1, 2] - solver.data.lane("particles.x", 0)[-1, 2])
 
 
 def test_a_cantilever_droops_like_a_beam() -> None:
     # joint j bends by M_j D / (E I), M_j the moment of the beads beyond it, E I = k D^3 / 4
-    stiffness, spacing = 8e3, CableConfig().spacing
+    stiffness, spacing = 1e3, CableConfig().spacing
     place = spacing * np.arange(BEADS)
     droop = 0.0
     for j in range(1, BEADS - 1):
