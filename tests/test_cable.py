@@ -21,7 +21,7 @@ def _droop(bend_stiffness: float) -> float:
     builder.particle_mass[0] = builder.particle_mass[1] = 0.0
     # one iteration a substep leaves an error of the order of dt^2 k / m, so the substep is short
     config = SolverConfig(dt=1 / 24000, damping=20.0)
-    solver = SolverFusedXPBD(builder.finalize(device="cpu"), config)
+    solver = SolverFusedXPBD(builder.finalize(device="cpu"), config, precision="float64")
     solver.run(round(2 / config.dt))
     return float(start[-1, 2] - solver.data.lane("particles.x", 0)[-1, 2])
 
