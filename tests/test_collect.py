@@ -19,6 +19,7 @@ from warp_deform.collection import Attempt, Collection
 from warp_deform.episode_loop import SOLVED, demonstrate, play
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
+from warp_deform.filming import check_video
 from warp_deform.workers import worker_count
 from warp_deform.worlds import Worlds
 
@@ -144,7 +145,7 @@ def test_growing_and_shrinking_repeat_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"task": "cable-ring"}, "of another kind"),
+        ({"task": "cable-ring"}, f"task is {TASK} there and cable-ring here"),
         ({"seed": 8}, "seed is 7 there and 8 here"),
         ({"robot": "panda"}, "robot is ur5 there and panda here"),
     ],
@@ -168,9 +169,23 @@ def test_strange_folders_are_refused(collected: tuple[Path, CollectReport], tmp_
     (merged / "collection.json").write_text("{")
     with pytest.raises(InputError, match="damaged"):
         collect(config(merged))
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "index.json").write_text("a page's")
+    with pytest.raises(InputError, match="something else's"):
+        collect(config(foreign))
+    assert (foreign / "index.json").read_text() == "a page's"
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a file"):
         collect(config(tmp_path / "file"))
+
+
+def test_the_folder_of_a_video_is_made(tmp_path: Path) -> None:
+    check_video(tmp_path / "new" / "film.mp4")
+    assert list((tmp_path / "new").iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="no video can be written"):
+        check_video(tmp_path / "file" / "film.mp4")
 
 
 def test_two_owners_are_one_too_many(tmp_path: Path) -> None:
@@ -187,7 +202,7 @@ def test_two_owners_are_one_too_many(tmp_path: Path) -> None:
     [
         ({"demonstrator": "mpc"}, "no demonstrator 'mpc'; it has: scripted"),
         ({"episodes": 0}, "episodes is 0"),
-        ({"seed": -1}, "seed -1"),
+        ({"seed": -1}, "the seed is -1; it must be 0 to"),
         ({"workers": 0}, "workers is 0"),
         ({"robot": "r2d2"}, "ur5, panda"),
         ({"video": Path("film.avi")}, "must end with"),

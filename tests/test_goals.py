@@ -95,6 +95,9 @@ def test_wrong_requests_are_refused(constructed: Path, demonstrated: Path, tmp_p
         make_goals("cable-ring", tmp_path, count=1)
     with pytest.raises(InputError, match="kind is 'drawn'"):
         make_goals(TASK, tmp_path, count=1, kind="drawn")
+    for seed in (-1, 999_999_999):
+        with pytest.raises(InputError, match="it must be 0 to 999999998"):
+            make_goals(TASK, tmp_path, count=2, seed=seed, kind="constructed")
     with pytest.raises(InputError, match="count is 0"):
         make_goals(TASK, tmp_path, count=0)
     with pytest.raises(InputError, match="of another kind"):

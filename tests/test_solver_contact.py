@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from solver_scenes import (
@@ -180,7 +178,7 @@ def test_overlap_is_pushed_out_at_the_recovery_speed(recovery):
 
 
 def test_a_bead_on_a_bead_column_carries_no_hidden_overlap():
-    # three beads on top of each other in a groove of pinned ones: depth of order g dt^2
+    # three beads exactly on top of each other: depth of order g dt^2
     builder = new_builder()
     column = [(0, 0, RADIUS * (1 + 2 * k)) for k in range(3)]
     add_particles(builder, column, colliding=True)
@@ -248,7 +246,7 @@ def test_friction_between_worlds_is_that_of_each_world(precision):
     add_particles(one, [(0, 0, RADIUS)], velocities=[(0.5, 0, 0)])
     builder = new_builder()
     builder.replicate(one, 3)
-    solver = finalize(builder, replace(IDEAL), lanes=8, precision=precision)
+    solver = finalize(builder, IDEAL, lanes=8, precision=precision)
     mus = (0.2, 0.4, 0.8)
     for w, mu in enumerate(mus):
         solver.set_world(w, table_friction=mu)

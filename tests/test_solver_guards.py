@@ -198,6 +198,15 @@ def test_bundles_are_written_with_bodies_and_grips(tmp_path):
         assert after[name].tobytes() == values.tobytes(), name
 
 
+def test_a_world_that_takes_no_part_leaves_no_bundle(tmp_path):
+    solver = cable_solver(worlds=2, lanes=8, bundles=tmp_path)
+    solver.data.lane("particles.x", 1)[3] = np.nan
+    rollout(solver, [0], most=0.1)
+    assert solver.bundle is None and not list(tmp_path.iterdir())
+    rollout(solver, [1], most=0.1)
+    assert solver.bundle is not None
+
+
 def changed_file(path: Path, kind: str) -> None:
     data = bytearray(path.read_bytes())
     if kind == "cut":

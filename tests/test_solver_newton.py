@@ -110,7 +110,9 @@ def test_gravity_of_the_model_counts_and_may_change():
     solver.step(state, after, None, None, FRAME)
     assert after.particle_qd.numpy()[0, 2] == pytest.approx(-1.0 * FRAME, rel=1e-4)
     model.set_gravity((0.5, 0.0, 0.0))
+    solver.set_world(0, stiffness=0.5)
     solver.notify_model_changed(int(newton.ModelFlags.MODEL_PROPERTIES))
+    assert solver.data.per_world("group.stiffness", 0) == 0.5
     solver.step(state, after, None, None, FRAME)
     np.testing.assert_allclose(
         after.particle_qd.numpy()[0], [0.5 * FRAME, 0, 0], rtol=1e-3, atol=1e-7
@@ -217,6 +219,7 @@ def test_a_model_without_our_attributes_is_refused():
         lambda: GripPath(np.array([0, 1.0]), np.zeros((2, 3))),
         lambda: GripPath(np.array([0, 1.0]), np.zeros((2, 3)), particle=0, body=0),
         lambda: GripPath(np.array([1.0, 0.0]), np.zeros((2, 3)), particle=0),
+        lambda: GripPath(np.array([0, np.nan, 1.0]), np.zeros((3, 3)), particle=0),
         lambda: GripPath(np.array([0, 1.0]), np.zeros((3, 3)), particle=0),
         lambda: GripPath(np.array([0, 1.0]), np.full((2, 3), np.inf), particle=0),
     ],

@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_deform  # noqa: F401  registers the ids
+from warp_deform.registration import env_id
 from warp_deform.robots.primitive import Outcome
 from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.spaces import action_space, information, observation, observation_space
@@ -63,7 +64,7 @@ def fastest(worlds: Worlds, slot: int) -> float:
 
 @every_task
 def test_environment_follows_gymnasium(name: str) -> None:
-    env = gymnasium.make(TASKS[name].env_id())
+    env = gymnasium.make(env_id(name))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(env.unwrapped, skip_render_check=True)

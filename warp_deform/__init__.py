@@ -1,4 +1,4 @@
-"""Cables, fabrics and bags: differentiable simulation and goal-conditioned rearrangement.
+"""Rearranging deformable objects: simulation, tasks, demonstrations and data.
 
 Importing this package is quick: it registers the Gymnasium ids and loads neither Warp nor torch.
 The public names below load their modules on first use.

@@ -16,8 +16,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .collection import Attempt, Collection, append_attempt
-from .episode_loop import SOLVED, Run, demonstrate, play, worlds_for
+from .collection import Attempt, Collection, append_attempt, check_seeds
+from .episode_loop import SLOTS, SOLVED, Run, demonstrate, play, worlds_for
 from .episodes import EpisodeReader, EpisodeWriter, Goal, Step, combine_hashes, rebuild_index
 from .errors import InputError
 from .goals import load_goals
@@ -29,12 +29,9 @@ from .worlds import Worlds
 
 __all__ = ["CollectConfig", "CollectReport", "collect"]
 
-SLOTS = 8
-"""Episodes that run side by side in one process: one group of SIMD lanes."""
 CHUNK = 16, 64
 """Fewest and most seeds that a process takes at once: lanes run empty at a chunk's end."""
 CHUNKS_PER_WORKER = 4
-MOST_SEED = 999_999_999
 FILMED = 2
 """Episodes in a video."""
 
@@ -44,8 +41,8 @@ class CollectConfig:
     """What to collect.
 
     episodes: successes to keep; seed: first seed, the others follow
-    goals: folder of goals (see `make_goals`) that the attempts aim at in turn; None constructs one
-        from every seed
+    goals: folder of goals (see `make_goals`); a seed aims at the one number seed modulo their
+        count, as in the environments. None constructs a goal from every seed
     workers: processes; None takes one per core, but not for a handful of episodes
     ray: address of a Ray cluster whose machines share the folder; workers defaults to its cores
     video: MP4 of the first kept episodes
@@ -67,8 +64,7 @@ class CollectConfig:
         find_robot(self.robot)
         if self.episodes < 1:
             raise InputError(f"episodes is {self.episodes}; it must be 1 or more")
-        if not 0 <= self.seed <= MOST_SEED - most_attempts(self.episodes):
-            raise InputError(f"seed {self.seed} leaves no room below {MOST_SEED}")
+        check_seeds(self.seed, most_attempts(self.episodes))
         if self.demonstrator != "scripted":
             raise InputError(
                 f"{self.task} has no demonstrator {self.demonstrator!r}; it has: scripted"
@@ -209,9 +205,9 @@ def attempt_chunk(chunk: _Chunk) -> Iterator[Attempt]:
         return demonstrate(worlds, runs)
 
     def goal(seed: int) -> Goal | None:
-        return goals[(seed - config.seed) % len(goals)] if goals else None
+        return goals[seed % len(goals)] if goals else None
 
-    worlds = worlds_for(config.task, config.robot, SLOTS)
+    worlds = worlds_for(config.task, config.robot)
     for slot, run in play(worlds, chunk.seeds, act=act, look=observe, goals=goal):
         success = run.ended == SOLVED
         if success:

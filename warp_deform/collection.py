@@ -20,10 +20,13 @@ from typing import Any
 from .episodes import EpisodeReader, EpisodeWriter, episode_name, versions
 from .errors import InputError
 
-__all__ = ["Attempt", "Collection", "append_attempt"]
+__all__ = ["Attempt", "Collection", "append_attempt", "check_seeds"]
 
 _DESCRIPTION, _LEDGER, _SURPLUS = "collection.json", "attempts.jsonl", "surplus"
+_OURS = (_LEDGER, _SURPLUS, "index.json")
 _FORMAT = 1
+MOST_SEED = 999_999_999
+"""Greatest seed that the name of an episode's file holds."""
 _DECIDING = ("warp-deform", "warp-lang", "newton", "numpy", "torch")
 """Packages whose version may change an episode's bits."""
 
@@ -37,6 +40,15 @@ class Attempt:
     actions: int
     score: float
     reason: str
+
+
+def check_seeds(first: int, count: int) -> None:
+    """Raise InputError unless `count` seeds from `first` on can name episodes."""
+    most = MOST_SEED + 1 - count
+    if most < 0:
+        raise InputError(f"so many episodes would need {count} seeds; there are {MOST_SEED + 1}")
+    if not 0 <= first <= most:
+        raise InputError(f"the seed is {first}; it must be 0 to {most}")
 
 
 def append_attempt(folder: Path, attempt: Attempt) -> None:
@@ -91,6 +103,20 @@ class Collection:
     def _has_episodes(self) -> bool:
         return any(self.folder.glob("*.parquet"))
 
+    def _refuse_others(self) -> None:
+        """Raise if the folder, new to us, holds what a collection would mix with or overwrite."""
+        if self._has_episodes():
+            raise InputError(
+                f"{self.folder} holds episodes but no {_DESCRIPTION}: they were not collected "
+                "into it; choose another folder"
+            )
+        for name in _OURS:
+            if (self.folder / name).exists():
+                raise InputError(
+                    f"{self.folder} holds {name} but no {_DESCRIPTION}, so it is something else's; "
+                    "choose another folder"
+                )
+
     def _restore_surplus(self) -> None:
         for path in sorted((self.folder / _SURPLUS).glob("episode_*.parquet")):
             path.replace(self.folder / path.name)
@@ -108,11 +134,7 @@ class Collection:
         path = self.folder / _DESCRIPTION
         wanted = json.loads(json.dumps(description, allow_nan=False))
         if not path.exists():
-            if self._has_episodes():
-                raise InputError(
-                    f"{self.folder} holds episodes but no {_DESCRIPTION}: they were not collected "
-                    "into it; choose another folder"
-                )
+            self._refuse_others()
             partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
             partial.write_text(json.dumps(wanted, indent=1, sort_keys=True) + "\n")
             partial.replace(path)
@@ -141,10 +163,11 @@ def _parse(line: bytes) -> Attempt | None:
 
 
 def _difference(found: Any, wanted: Mapping[str, Any], path: str = "") -> str:
-    """The first thing in which two descriptions differ."""
+    """The first thing in which two descriptions differ; of all, what they are of."""
     if not isinstance(found, dict):
-        return f"{path} is {str(found)[:60]} there"
-    for key in sorted({*found, *wanted}):
+        return f"{path.rstrip('.')} is {str(found)[:60]} there"
+    keys = sorted({*found, *wanted}, key=lambda key: (key != "task", key))
+    for key in keys:
         here, there = wanted.get(key), found.get(key)
         if here != there:
             if isinstance(here, dict):

@@ -83,8 +83,8 @@ class DemoOptions(CommandOptions):
     """First seed. Training 0.., test 10,000.., validation 50,000.., goals 100,000.. ."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder for the episodes; complete ones that are there already are kept."""
-    demonstrator: Literal["scripted", "visible", "mpc", "planner"] = "scripted"
-    """Who acts: scripted sees the simulator's state, visible only what a camera sees."""
+    demonstrator: str = "scripted"
+    """Who acts: "scripted", the paper's, which sees the simulator's state."""
     workers: Annotated[int | None, arg(metavar="W")] = None
     """Processes; left out, one per core, fewer for few episodes. The result is the same."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
@@ -141,6 +141,10 @@ class GoalsOptions(CommandOptions):
     """Folder for the goals."""
     kind: Literal["demonstrated", "constructed"] = "demonstrated"
     """Last states of demonstrations (the paper), or objects placed at the goal and settled."""
+    workers: Annotated[int | None, arg(metavar="W")] = None
+    """Processes; one per core when left out."""
+    robot: Literal["ur5", "panda"] = "ur5"
+    """The arm."""
 
 
 def goals(options: GoalsOptions) -> Outcome:
@@ -151,9 +155,18 @@ def goals(options: GoalsOptions) -> Outcome:
 
     quiet_warp()
     report = make_goals(
-        options.task, options.out, count=options.count, seed=options.seed, kind=options.kind
+        options.task,
+        options.out,
+        count=options.count,
+        seed=options.seed,
+        kind=options.kind,
+        robot=options.robot,
+        workers=options.workers,
     )
-    return Outcome(data=report, text=_lines(report))
+    failure = None
+    if report["goals"] < options.count:
+        failure = f"{report['goals']} of {options.count} goals were made; try another --seed"
+    return Outcome(data=report, text=_lines(report), failure=failure)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,7 +226,7 @@ def inspect(options: InspectOptions) -> Outcome:
         out / reader.path(seed).with_suffix(".png").name for seed in reader.seeds[: options.sheets]
     ]
     if paths:
-        out.mkdir(parents=True, exist_ok=True)
+        _make_folder("--out", out)
     for seed, path in zip(reader.seeds, paths, strict=False):
         contact_sheet(reader.read(seed), path)
     shown = f"{len(paths)} of {len(reader)} episodes, in {out}"
@@ -266,6 +279,13 @@ def _check_positive(flag: str, value: int | None) -> None:
 def _check_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise InputError(f"no folder {str(folder)!r}; `warp-deform demo` makes one")
+
+
+def _make_folder(flag: str, folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{flag} {folder} cannot be made: {error.strerror}") from error
 
 
 def _lines(data: Mapping[str, Any]) -> str:

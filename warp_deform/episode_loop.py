@@ -17,10 +17,12 @@ from .errors import InputError, WarpDeformError
 from .running import DEMONSTRATOR_STREAM, episode_rng
 from .worlds import Worlds
 
-__all__ = ["SOLVED", "Act", "Run", "demonstrate", "play", "worlds_for"]
+__all__ = ["SLOTS", "SOLVED", "Act", "Run", "demonstrate", "play", "worlds_for"]
 
 Row = TypeVar("Row")
 
+SLOTS = 8
+"""Episodes that run side by side in one process: one group of SIMD lanes."""
 SOLVED = "solved"
 """What `Run.ended` says of an episode that reached its task's success."""
 
@@ -56,12 +58,12 @@ def demonstrate(worlds: Worlds, runs: Mapping[int, Run[Row]]) -> dict[int, np.nd
 
 
 @functools.lru_cache(maxsize=2)
-def worlds_for(task: str, robot: str, count: int) -> Worlds:
-    """This process's worlds of a task, built once and used again, in 8 lanes whatever their count.
+def worlds_for(task: str, robot: str) -> Worlds:
+    """This process's `SLOTS` worlds of a task, built once and used again.
 
-    The number of lanes changes no bit; one number means one kernel to compile.
+    Their number changes no bit; the same one for every use means one kernel to compile.
     """
-    return Worlds(task, count, robot=robot, lanes=8)
+    return Worlds(task, SLOTS, robot=robot, lanes=SLOTS)
 
 
 def play(

@@ -26,7 +26,6 @@ LONGEST = 20.0
 """Length of a video [s]: longer episodes are shown faster, and the picture says how much."""
 STILL_SECONDS = 0.7
 """The first and the last state of an episode stay for so long in the video [s]."""
-_SLOTS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +75,7 @@ def film(
     view = SceneView(size)
     with single_threaded(), VideoWriter(path, FPS) as video:
         for info in infos:
-            worlds = worlds_for(info.task, info.robot, _SLOTS)
+            worlds = worlds_for(info.task, info.robot)
             episode, robot = reader.read(info.seed), worlds.robot
             arm = ArmMeshes(robot.meshes())
             inset: tuple[int, np.ndarray | None] = -1, None

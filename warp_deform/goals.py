@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from .collection import Attempt, Collection, append_attempt
-from .episode_loop import Run, play
+from .collection import Attempt, Collection, append_attempt, check_seeds
+from .episode_loop import SLOTS, Run, play
 from .episodes import (
     Episode,
     EpisodeReader,
@@ -28,9 +28,10 @@ from .episodes import (
 )
 from .errors import InputError, WarpDeformError
 from .recording import observe, record, task_config
+from .rendering.images import Images
 from .tasks.free_space import FreeSpace
 from .tasks.registry import task as find_task
-from .tasks.task import Images, Layout, Snapshot, Task
+from .tasks.task import Layout, Snapshot, Task
 from .workers import single_threaded
 from .worlds import Worlds
 
@@ -41,7 +42,6 @@ GOAL_SEED = 100_000
 CONSTRUCTED = "constructed"
 """Kind of goal, and the demonstrator that the files of such goals name."""
 _DEMONSTRATED = "demonstrated"
-_SLOTS = 8
 _FILE = re.compile(r"episode_(\d{9})\.parquet")
 
 
@@ -74,6 +74,7 @@ def make_goals(
         raise InputError(f"count is {count}; it must be 1 or more")
     began = time.perf_counter()
     if kind == CONSTRUCTED:
+        check_seeds(seed, count)
         _construct(task, Path(out), range(seed, seed + count), robot)
         attempts = count
     elif kind == _DEMONSTRATED:
@@ -147,7 +148,7 @@ def _construct(name: str, out: Path, seeds: range, robot: str) -> None:
         single_threaded(),
     ):
         missing = [seed for seed in seeds if seed not in collection.attempts]
-        worlds = Worlds(at_goal(task), _SLOTS, robot=robot, lanes=8)
+        worlds = Worlds(at_goal(task), SLOTS, robot=robot, lanes=SLOTS)
         writer = EpisodeWriter(out, overwrite=True)
         for slot, run in play(worlds, missing, act=_rest, look=observe, until_solved=False):
             if not run.rows:

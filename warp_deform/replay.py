@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .episode_loop import Run, play, worlds_for
+from .episode_loop import SLOTS, Run, play, worlds_for
 from .episodes import Episode, EpisodeReader, Goal, Step, cpu_fingerprint, versions
 from .errors import InputError
 from .goals import CONSTRUCTED, at_goal
@@ -20,7 +20,6 @@ from .worlds import Worlds
 
 __all__ = ["Recording", "verify"]
 
-_SLOTS = 8
 _CHUNK = 32
 
 
@@ -134,9 +133,9 @@ def _compare_chunk(chunk: _Chunk) -> Iterator[tuple[int, int, float]]:
     """Number of rows, of differing rows, and the largest distance [m], for every episode."""
     recording = Recording(EpisodeReader(chunk.folder))
     if chunk.constructed:
-        worlds = Worlds(at_goal(find_task(chunk.task)), _SLOTS, robot=chunk.robot, lanes=8)
+        worlds = Worlds(at_goal(find_task(chunk.task)), SLOTS, robot=chunk.robot, lanes=SLOTS)
     else:
-        worlds = worlds_for(chunk.task, chunk.robot, _SLOTS)
+        worlds = worlds_for(chunk.task, chunk.robot)
 
     def look(worlds: Worlds, slot: int) -> _Seen:
         snapshot = worlds.episodes[slot].snapshot

@@ -43,12 +43,22 @@ class GripPath:
         if (self.particle is None) == (self.body is None):
             raise InputError("a grip path holds either a particle or a body")
         times = np.asarray(self.times, dtype=float)
-        if len(times) < 2 or times[0] != 0 or (np.diff(times) < 0).any():
+        # a time that is not a number does not ascend
+        if len(times) < 2 or times[0] != 0 or not (np.diff(times) >= 0).all():
             raise InputError("the times of a grip path must start at 0 and ascend, at least two")
         if np.shape(self.positions) != (len(times), 3) or not np.isfinite(self.positions).all():
             raise InputError(
                 f"a path of {len(times)} knots needs finite positions ({len(times)}, 3)"
             )
+        turns = self.rotations
+        if turns is not None and (
+            np.shape(turns) != (len(times), 4) or not np.isfinite(turns).all()
+        ):
+            raise InputError(
+                f"a path of {len(times)} knots needs finite rotations ({len(times)}, 4)"
+            )
+        if self.lower is not None and not 0 <= self.lower[0] <= self.lower[1] <= times[-1]:
+            raise InputError(f"lower is two ascending times within the path, not {self.lower}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +77,8 @@ class Rollout:
     seconds: float
     """Simulated time [s]."""
     watch: WatchValues
+    at_rest: bool
+    """Whether the world came to rest before its time was up."""
     frames: Frames | None
 
 
@@ -92,6 +104,9 @@ def rollout(
     A world's result does not depend on which other worlds run with it.
     """
     data, dt = solver.data, solver.config.dt
+    for w in worlds:
+        if not 0 <= w < data.world_count:
+            raise InputError(f"no world {w}: the solver has {data.world_count}")
     paths = paths or {}
     data.clear_grips()
     _write_paths(solver, paths)
@@ -112,7 +127,12 @@ def rollout(
     every = max(1, round(record / dt)) if record else 0
     watch = solver.run(longest, record_every=every)
     return {
-        w: Rollout(watch[w].steps * dt, watch[w], _frames(solver, w, watch[w].steps, every))
+        w: Rollout(
+            seconds=watch[w].steps * dt,
+            watch=watch[w],
+            at_rest=watch[w].steps < round(_of(most, w) / dt),
+            frames=_frames(solver, w, watch[w].steps, every),
+        )
         for w in worlds
     }
 
@@ -142,7 +162,6 @@ def _write_paths(solver: SolverFusedXPBD, paths: Mapping[int, GripPath]) -> None
         views["grips.tick"][slot] = 0
         views["grips.shift"][slot] = 0.0
         views["grips.knot"][slot] = k
-        views["grips.knot_start"][slot] = k
         views["grips.knot_end"][slot] = k + n
         lower = path.lower or (0.0, 0.0)
         views["grips.lower_start"][slot], views["grips.lower_end"][slot] = lower

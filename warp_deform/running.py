@@ -38,8 +38,12 @@ class RunningEpisode:
     sim_seconds: float = 0.0
     actions: int = 0
     problems: tuple[Problem, ...] = ()
+    at_rest: bool
+    """Whether everything came to rest after the last motion before its time was up."""
     tip: np.ndarray
     """Where the tip waits: x, y, z [m], yaw [rad]."""
+    posture: np.ndarray
+    """Joint positions (dof,) [rad] from which the arm's next motion sets out."""
     snapshot: Snapshot = field(init=False)
 
     @property

@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 
 from .episodes import MAX_HEIGHT
 from .errors import InputError
+from .rendering.images import Images
 from .rendering.pixels import BOUNDS, SHAPE
 from .robots.primitive import Outcome
-from .tasks.task import Images, Task
+from .tasks.task import Task
 from .worlds import Worlds
 
 __all__ = ["action_space", "check_action", "information", "observation", "observation_space"]
@@ -83,9 +84,10 @@ def information(
     """What is known about a slot's episode beyond the observation; not for policies.
 
     success and is_success (both spellings are in use), score in [0, 1], physics_ok, problems (why
-    the physics cannot be trusted, "" when it can), state_hash, sim_seconds [s], seed,
-    discarded_starts, actions so far, outcome of the last one ("" after a reset),
-    stage_rule (who chose the lift), ground_truth (D,) float32, segmentation (320, 160) uint8.
+    the physics cannot be trusted, "" when it can), state_hash, sim_seconds [s], at_rest (whether
+    things came to rest after the last motion), seed, discarded_starts, actions so far, outcome of
+    the last one ("" after a reset), stage_rule (who chose the lift), ground_truth (D,) float32,
+    segmentation (320, 160) uint8.
     """
     episode = worlds.episodes[slot]
     success = bool(worlds.solved(slot))
@@ -97,6 +99,7 @@ def information(
         "problems": "; ".join(map(str, episode.problems)),
         "state_hash": worlds.hash(slot),
         "sim_seconds": float(episode.sim_seconds),
+        "at_rest": bool(episode.at_rest),
         "seed": int(episode.seed),
         "discarded_starts": int(episode.discarded_starts),
         "actions": int(episode.actions),

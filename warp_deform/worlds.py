@@ -17,6 +17,7 @@ from .errors import InputError, WarpDeformError
 from .objects.box import Box
 from .objects.cable import Cable
 from .rendering.drawables import Drawables
+from .rendering.images import Images
 from .rendering.pixels import BOUNDS
 from .rendering.topdown import TopDown
 from .robots import robot as find_robot
@@ -34,7 +35,7 @@ from .running import LAYOUT_STREAM, Plan, RunningEpisode, StepReport, episode_rn
 from .solver.solver import SolverFusedXPBD
 from .tasks.free_space import FreeSpace
 from .tasks.registry import task as find_task
-from .tasks.task import Images, Layout, Snapshot, Task
+from .tasks.task import Layout, Snapshot, Task
 
 __all__ = ["Worlds"]
 
@@ -73,6 +74,8 @@ class Worlds:
     ) -> None:
         self.task = find_task(task) if isinstance(task, str) else task
         self.robot = find_robot(robot)
+        if count < 1:
+            raise InputError(f"count is {count}; there must be 1 world or more")
         self.count = count
         one = newton.ModelBuilder()
         SolverFusedXPBD.register_custom_attributes(one)
@@ -125,12 +128,12 @@ class Worlds:
                 made |= self._construct_goals(
                     {s: layouts[s] for s in waiting if s not in made}, seeds
                 )
-                layouts = {s: l.with_targets(made[s].targets) for s, l in layouts.items()}
+                layouts = {s: layouts[s].with_targets(goal.targets) for s, goal in made.items()}
             self._start(layouts, seeds, made)
             again = []
             for s in waiting:
                 self.episodes[s].discarded_starts = discarded[s]
-                if not self._acceptable(self.episodes[s]):
+                if s not in layouts or not self._acceptable(self.episodes[s]):
                     discarded[s] += 1
                     again.append(s)
             waiting = again
@@ -173,18 +176,21 @@ class Worlds:
                 discarded_starts=0,
                 sim_seconds=results[slot].seconds,
                 problems=results[slot].watch.problems(slot, limits),
+                at_rest=results[slot].at_rest,
                 tip=self._waiting_tip(),
+                posture=self.robot.home_q,
             )
             self._look(slot)
 
     def _construct_goals(
         self, layouts: Mapping[int, Layout], seeds: Mapping[int, int]
     ) -> dict[int, Goal]:
-        """Goals with the objects placed at the sampled targets and settled."""
+        """Goals with the objects placed at the sampled targets and settled; those to be trusted."""
         if not layouts:
             return {}
         self._start({s: self.task.goal_layout(l) for s, l in layouts.items()}, seeds, {})
-        return {s: self.as_goal(s, kind="constructed") for s in layouts}
+        trusted = [s for s in layouts if self.episodes[s].physics_ok]
+        return {s: self.as_goal(s, kind="constructed") for s in trusted}
 
     def as_goal(self, slot: int, *, kind: str) -> Goal:
         """The present state of a slot as a goal; kind: "constructed" or "demonstrated"."""
@@ -285,16 +291,20 @@ class Worlds:
         for slot in moving:
             plans[slot].runs.append(runs[slot])
             plans[slot].outcome = Outcome.PLACED
+            self.episodes[slot].at_rest = runs[slot].at_rest
             self.episodes[slot].tip = motions[slot].way_points[-1]
 
     def _reachable(self, plans: Mapping[int, Plan], motions: Mapping[int, Motion]) -> list[int]:
         """Slots whose motion the arm can make; notes motions, joints and what is out of reach."""
-        joints = solve_joints(self.robot, list(motions.values()))
+        postures = [self.episodes[slot].posture for slot in motions]
+        joints = solve_joints(self.robot, list(motions.values()), postures)
         for (slot, motion), q in zip(motions.items(), joints, strict=True):
             plans[slot].motions.append(motion)
             plans[slot].joints.append(q)
             if q is None:
                 plans[slot].outcome = Outcome.UNREACHABLE
+            else:
+                self.episodes[slot].posture = q[-1]
         return [slot for slot, q in zip(motions, joints, strict=True) if q is not None]
 
     def _grasp(self, slot: int, plan: Plan) -> Grasp | None:

@@ -129,9 +129,9 @@ def _check(action: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
 
 def _mark(infos: dict[str, Any]) -> dict[str, Any]:
     """The infos with the rule that was used, also in those of episodes that ended."""
-    for name in ("stage_rule", "final_info"):
-        if name == "stage_rule" and name in infos:
-            infos[name] = np.where(infos[f"_{name}"], _RULE, infos[name]).astype(object)
-        elif name in infos:
-            _mark(infos[name])
+    if "stage_rule" in infos:
+        marked = np.where(infos["_stage_rule"], _RULE, infos["stage_rule"])
+        infos["stage_rule"] = marked.astype(object)
+    if "final_info" in infos:
+        _mark(infos["final_info"])
     return infos

@@ -54,7 +54,7 @@ class EpisodeWriter:
         overwrite: replace an episode of the same seed instead of refusing.
 
     Raises:
-        InputError: `folder` is something else than a folder.
+        InputError: `folder` is something else than a folder, or cannot be written to.
     """
 
     def __init__(self, folder: Path, *, overwrite: bool = False) -> None:
@@ -64,6 +64,12 @@ class EpisodeWriter:
             self._folder.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
             raise InputError(f"{folder} is a file; name a folder for the episodes") from error
+        except OSError as error:
+            raise InputError(
+                f"{folder} cannot be made: {error.strerror}; choose another place"
+            ) from error
+        if not os.access(self._folder, os.W_OK):
+            raise InputError(f"the folder {folder} is not writable; choose another place")
         _remove_stale(self._folder)
 
     def write(self, episode: Episode) -> Path:

@@ -87,7 +87,7 @@ class EpisodeInfo:
     sim_seconds: float
     """Simulated time [s]."""
     discarded_starts: int
-    """Start states that were already solved, and were drawn again."""
+    """Starts that were drawn again: solved already, off the table, or not to be trusted."""
     config: dict[str, Any]
     """The task's full configuration, JSON types."""
     versions: dict[str, Any]

@@ -6,6 +6,5 @@ from .push import Push
 from .zone import Zone, ring_zone, segment_zone, square_zone
 
 __all__ = ["Box", "BoxConfig", "BoxPart", "Cable", "CableConfig", "Push", "RingConfig", "Zone",
-           "add_box",
-           "add_cable", "cable_line", "cable_ring", "l_block", "ring_zone", "segment_zone",
-           "square_zone"]  # fmt: skip
+           "add_box", "add_cable", "cable_line", "cable_ring", "l_block", "ring_zone",
+           "segment_zone", "square_zone"]  # fmt: skip

@@ -192,7 +192,7 @@ def _from_both_ends(starts: range) -> list[int]:
 
     A sweep carries a pull from either end to the middle, and the processor works on two independent
     chains at once. Solved strictly in order, a lone world takes a third longer; even links first,
-    then odd ones, a dragged cable stretches by up to 50 % instead of 5 to 10 %.
+    then odd ones, a dragged cable stretches by up to 50 % instead of 10 to 20 %.
     """
     half = len(starts) // 2
     pairs = zip_longest(starts[:half], reversed(starts[half:]))

@@ -8,7 +8,6 @@ are read there, colour is a tent filter over the sample and its eight neighbours
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,10 +16,8 @@ import warp as wp
 from ..objects.colors import TABLE
 from .drawables import WORKSPACE_SEGMENT, Drawables
 from .geometry import Geometry, HostArray, Scene
+from .images import Images
 from .pixels import BOUNDS, PIXEL_SIZE, SHAPE
-
-if TYPE_CHECKING:
-    from ..tasks.task import Images
 
 __all__ = ["TopDown"]
 
@@ -215,9 +212,6 @@ class TopDown:
         Raises:
             InputError: the state is not finite or has fewer particles or bodies than are drawn.
         """
-        # tasks.task imports what it draws, so it cannot be imported while this module is
-        from ..tasks.task import Images
-
         geometry, launches = self._scene(drawables, len(particle_q), len(body_q))
         geometry.move(particle_q, body_q)
         self._buffer.zero_()

@@ -9,6 +9,7 @@ IK way-points along them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -48,12 +49,16 @@ class PrimitiveConfig:
     """Speed of the empty tip [m/s]."""
     hover: float = 0.30
     """Height of the tip between actions, where reachable [m]."""
+    turn_speed: float = 2.5
+    """Fastest turn about the tip's axis [rad/s]; the last joints do 3.1 (UR5) and 2.6 (Panda)."""
     dwell: float = 0.2
     """Wait between lowering and letting go [s]; without it a dragged bead hops when released."""
     tip_radius: float = 0.001
     """Radius of the suction tip [m]."""
     spacing: float = 0.10
     """Largest distance between joint way-points along a straight line [m]."""
+    turn_spacing: float = 0.5
+    """Largest turn between them [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +134,11 @@ def find_grasp(
 def approach(
     start: np.ndarray, pick: np.ndarray, hover: float, height: float, config: PrimitiveConfig
 ) -> Motion:
-    """From `start` (4,) over the pick point (3,) x, y, yaw at `hover` down to `height` [m]."""
+    """From `start` (4,) over the pick point (3,) x, y, yaw at `hover` down to `height` [m].
+
+    The tip turns the short way to the pick's yaw, which it has without whole turns at the end.
+    """
+    start = np.array([*start[:3], pick[2] - _half_turn(pick[2] - start[3])])
     above = np.array([pick[0], pick[1], hover, pick[2]])
     contact = np.array([pick[0], pick[1], height, pick[2]])
     return _straight([start, above, contact], config.unloaded_speed, config)
@@ -149,8 +158,7 @@ def carry(
     The retreat to `hover` follows the release and is in the motion only.
     """
     pick, place, lift = action[:3], action[3:6], float(action[6])
-    turn = float((place[2] - pick[2] + np.pi) % (2 * np.pi) - np.pi)
-    yaw = pick[2] + turn
+    yaw = pick[2] + _half_turn(place[2] - pick[2])
     bottom = min(floor, lift)
     points = [
         np.array([pick[0], pick[1], grasp.height, pick[2]]),
@@ -160,7 +168,7 @@ def carry(
     ]
     loaded = _straight(points, speed, config)
     lowered = loaded.seconds
-    lower = lowered - abs(lift - bottom) / speed, lowered
+    lower = _straight(points[:-1], speed, config).seconds, lowered
     times = np.append(loaded.times, lowered + config.dwell)
     way_points = np.vstack([loaded.way_points, loaded.way_points[-1]])
     path = GripPath(
@@ -179,27 +187,39 @@ def carry(
     return motion, path
 
 
-def solve_joints(robot: Robot, motions: Sequence[Motion]) -> list[np.ndarray | None]:
-    """Joint way-points (K, dof) of every motion, solved in one batch; None: out of reach."""
+def solve_joints(
+    robot: Robot, motions: Sequence[Motion], postures: Sequence[np.ndarray]
+) -> list[np.ndarray | None]:
+    """Joint way-points (K, dof) of every motion, solved in one batch; None: out of reach.
+
+    postures: joint positions (dof,) [rad] from which each motion sets out
+    """
     if not motions:
         return []
     lengths = [len(m.way_points) for m in motions]
     points = np.concatenate([m.way_points for m in motions])
-    result = robot.trajectory(points, lengths=lengths)
+    result = robot.trajectory(points, lengths=lengths, seed=np.array(postures))
     starts = np.concatenate([[0], np.cumsum(lengths)])
     return [result.q[a:b] if result.reached[a:b].all() else None for a, b in pairwise(starts)]
 
 
 def _straight(points: Sequence[np.ndarray], speed: float, config: PrimitiveConfig) -> Motion:
-    """Way-points along straight lines at constant speed [m/s]; a turn on the spot takes no time."""
+    """Way-points along straight lines at `speed` [m/s], or slower where the turn takes longer."""
     times, way_points = [0.0], [points[0]]
     for a, b in pairwise(points):
         distance = float(np.linalg.norm(b[:3] - a[:3]))
-        pieces = max(1, int(np.ceil(distance / config.spacing)))
+        turn = abs(float(b[3] - a[3]))
+        seconds = max(distance / speed, turn / config.turn_speed)
+        pieces = math.ceil(max(1.0, distance / config.spacing, turn / config.turn_spacing))
         for k in range(1, pieces + 1):
-            times.append(times[-1] + distance / speed / pieces)
+            times.append(times[-1] + seconds / pieces)
             way_points.append(a + (b - a) * (k / pieces))
     return Motion(np.array(times), np.array(way_points))
+
+
+def _half_turn(angle: float) -> float:
+    """The same turn the short way round, in [-pi, pi) [rad]."""
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _box_top(x: float, y: float, box: Box, pose: np.ndarray) -> float | None:

@@ -27,7 +27,7 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
     body b to the list, from number c on, and returns the next number.
     """
     t = structures(scalar, lanes)
-    S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
+    S, R3, M33 = t.S, t.R3, t.M33
     Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
     contact = body_contact(scalar, lanes)
     list_contact, share_load = contact.list_contact, contact.share_load
@@ -51,8 +51,7 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
         mu: S, push: S, bodies: Bodies, contacts: Contacts,
     ):  # fmt: skip
         """Contacts between the face of box a with outward normal n (its axis `axis`) and the side
-        of
-        box b that faces it: the corners of their common area. Returns the next number.
+        of box b that faces it: the corners of their common area. Returns the next number.
         """
         u = column(aa, (axis + 1) % 3)
         v = column(aa, (axis + 2) % 3)
@@ -167,22 +166,9 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
                     )
                 elif kind < 6:
                     c = list_face(
-                        c,
-                        b,
-                        a,
-                        kind - 3,
-                        -normal,
-                        cb,
-                        ab,
-                        hb,
-                        ca,
-                        aa,
-                        ha,
-                        mu,
-                        push,
-                        bodies,
+                        c, b, a, kind - 3, -normal, cb, ab, hb, ca, aa, ha, mu, push, bodies,
                         contacts,
-                    )
+                    )  # fmt: skip
                 else:
                     ea = (kind - 6) // 3
                     eb = (kind - 6) % 3
@@ -207,4 +193,4 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
         share_load(start, c, bodies, contacts)
         return c
 
-    return SimpleNamespace(list_boxes=list_boxes, Q=Q)
+    return SimpleNamespace(list_boxes=list_boxes)

@@ -22,11 +22,25 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
     nearest face. Separation is limited as in `sphere_contact`.
     """
     t = structures(scalar, lanes)
-    S, R3, V = t.S, t.R3, t.V
+    S, R3 = t.S, t.R3
     Shapes, Particles, Bodies = t.Shapes, t.Particles, t.Bodies
     body = rigid(scalar, lanes)
     response, push_body, moved = body.response, body.push_body, body.moved
     coulomb_scalar = friction(scalar, lanes).coulomb_scalar
+
+    @wp.func
+    def particle_gap(p: R3, shape: int, b: int, shapes: Shapes, bodies: Bodies):
+        """Distance of a point from a box [m]; 0 inside."""
+        h = shapes.half[shape]
+        away = wp.quat_rotate_inv(bodies.q[b], p - bodies.x[b]) - shapes.center[shape]
+        at = wp.quat_rotate_inv(shapes.rotation[shape], away)
+        return wp.length(
+            R3(
+                wp.max(wp.abs(at[0]) - h[0], S(0.0)),
+                wp.max(wp.abs(at[1]) - h[1], S(0.0)),
+                wp.max(wp.abs(at[2]) - h[2], S(0.0)),
+            )
+        )
 
     @wp.func
     def project_box_particle(
@@ -80,4 +94,4 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
                 bodies.touching[b] = bodies.touching[b] + 1
                 bodies.support[b] = bodies.support[b] + 1
 
-    return SimpleNamespace(project_box_particle=project_box_particle, V=V)
+    return SimpleNamespace(project_box_particle=project_box_particle, particle_gap=particle_gap)

@@ -58,8 +58,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a bundle.
 
     Raises:
-        InputError: the file is not a bundle, or not the one that was written: the kernel trusts the
-            numbers in it, so nothing else may reach it.
+        InputError: the file is not a bundle, or damaged. The digest is no signature, and the kernel
+            trusts the numbers in the file: replay bundles of your own only.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -16,8 +16,7 @@ from .topology import WorldTopology, read_worlds
 __all__ = ["KERNEL_ARGUMENTS", "Mirrored", "SolverData"]
 
 KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near",
-                    "bodies",
-                    "contacts", "grips", "watch")  # fmt: skip
+                    "bodies", "contacts", "grips", "watch")  # fmt: skip
 """The kernel's structs, after the settings, in the order of its arguments."""
 
 _NUMPY = {wp.float32: np.float32, wp.float64: np.float64}
@@ -75,7 +74,6 @@ class SolverData:
         self._fill_particles()
         self._fill_bodies()
         self._fill_grips()
-        self.watch_frames = 0
         self.reset()
 
     # -- construction
@@ -175,7 +173,6 @@ class SolverData:
             self._add(f"group.{name}", groups, t.V, (L,), number)
         self._add("group.gravity", groups, t.V3, (3, L), number)
         total = int(near_start[-1])
-        self._add("near.count", groups, wp.int32, (), np.int32)
         self._add("near.pair", total, wp.int32, (), np.int32)
         self._add("near.mask", total, t.V, (L,), number)
         total = int(contact_start[-1])
@@ -224,7 +221,6 @@ class SolverData:
             "body",
             "tick",
             "knot",
-            "knot_start",
             "knot_end",
             "push",
             "push_steps",

@@ -24,8 +24,6 @@ from .lanes import (  # noqa: F401  (operators are found by name)
     add,
     any_less,
     div,
-    dot,
-    largest,
     length,
     less,
     mul,
@@ -232,9 +230,13 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                     if holding[lane] > S(0.0) and on[lane] > S(0.0):
                         w = w0 + lane
                         bl = b0 + lane * body_count
+                        radius = S(0.0)
+                        if grips.particle[w] >= 0:
+                            radius = top.radius[radii + grips.particle[w]]
                         if not follow_path(
                             w, lane, p0, bl, top.shape_start[k], top.shape_start[k + 1],
-                            near_start, near_count, dt, q, pairs, shapes, near, bodies, grips,
+                            near_start, near_count, radius, dt, q, pairs, shapes, near, bodies,
+                            grips,
                         ):  # fmt: skip
                             let_go(w, lane, p0, bl, q, bodies, grips)
                             holding[lane] = S(0.0)

@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from .box_particle import box_particle
 from .box_table import box_table
 from .lanes import add, mul, sub  # noqa: F401  (operators are found by name)
 from .sphere_contact import sphere_contact
@@ -26,11 +27,12 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
     dwell) is then shifted to that place. Held things are kinematic: their inverse mass is 0.
     """
     t = structures(scalar, lanes)
-    S, R3, Q = t.S, t.R3, t.Q
+    S, R3 = t.S, t.R3
     Shapes, Pairs, Particles = t.Shapes, t.Pairs, t.Particles
     Bodies, Grips, Near = t.Bodies, t.Grips, t.Near
     touches = sphere_contact(scalar, lanes).touches
     corner = box_table(scalar, lanes).corner
+    particle_gap = box_particle(scalar, lanes).particle_gap
 
     @wp.func
     def tip_position(w: int, clock: S, grips: Grips):
@@ -55,14 +57,20 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def reached(
-        w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int,
+        w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int, radius: S,
         q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
     ):  # fmt: skip
-        """Whether a held particle touches another one, or a held body the table or anything."""
+        """Whether a held particle touches another one or a box, or a held body anything."""
         hit = bool(False)
         particle = grips.particle[w]
         if particle >= 0:
             hit = touches(particle, lane, p0, start, n, q, pairs, near)
+            x = q.x[p0 + particle]
+            p = R3(x.x[lane], x.y[lane], x.z[lane])
+            for shape in range(first, last):
+                gap = particle_gap(p, shape, b0 + shapes.body[shape], shapes, bodies)
+                if gap < radius + S(CONTACT):
+                    hit = True
         else:
             b = b0 + grips.body[w]
             hit = bodies.touching[b] > 0
@@ -79,15 +87,16 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def follow_path(
-        w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int, dt: S,
-        q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
+        w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int, radius: S,
+        dt: S, q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
     ):  # fmt: skip
         tick = grips.tick[w] + 1
         clock = S(tick) * dt
         if clock > grips.lower_start[w] and clock < grips.lower_end[w]:
             if reached(
-                w, lane, p0, b0, first, last, start, n, q, pairs, shapes, near, bodies, grips
-            ):
+                w, lane, p0, b0, first, last, start, n, radius, q, pairs, shapes, near, bodies,
+                grips,
+            ):  # fmt: skip
                 set_knot(w, clock - dt, grips)
                 here = tip_position(w, clock - dt, grips)
                 tick = int(grips.lower_end[w] / dt)
@@ -154,4 +163,4 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
         grips.particle[w] = -1
         grips.body[w] = -1
 
-    return SimpleNamespace(follow_path=follow_path, take=take, let_go=let_go, Q=Q)
+    return SimpleNamespace(follow_path=follow_path, take=take, let_go=let_go)

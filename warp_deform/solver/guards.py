@@ -39,7 +39,7 @@ class GuardLimits:
     """Limits of the guards."""
 
     stretch: float = 1.5
-    """Longest two-sided spring over its rest length; cables peak at 1.17 when dragged hard."""
+    """Longest two-sided spring over its rest length; cables peak at 1.1 to 1.2 when dragged."""
     depth: float = 0.01
     """Deepest that a particle's centre may be under the table [m]."""
     clamped_steps: int = 120

@@ -30,7 +30,6 @@ __all__ = [
     "div",
     "dot",
     "lane_types",
-    "largest",
     "length",
     "less",
     "mul",
@@ -83,9 +82,6 @@ def _overloads(scalar: Any, lanes: int) -> tuple[SimpleNamespace, dict[str, list
     @wp.func_native(f"bool r = false; {each} r |= a.c[i] < s; return r;")
     def any_less(a: vector, s: scalar) -> bool: ...
 
-    @wp.func_native(f"{c_type} r = a.c[0]; {each} r = a.c[i] > r ? a.c[i] : r; return r;")
-    def largest(a: vector) -> scalar: ...
-
     @wp.func_native(f"{c_vector} r; {each} r.c[i] = (a.c[i] - a.c[i]) == 0 ? 0 : 1; return r;")
     def nonfinite(a: vector) -> vector: ...
 
@@ -135,7 +131,7 @@ def _overloads(scalar: Any, lanes: int) -> tuple[SimpleNamespace, dict[str, list
     )  # fmt: skip
     functions = {
         "root": [root], "select": [select], "less": [less], "any_less": [any_less],
-        "largest": [largest], "nonfinite": [nonfinite], "add": [add],
+        "nonfinite": [nonfinite], "add": [add],
         "sub": [sub], "mul": [mul_vector, mul_scalar, mul_lanes], "div": [div], "dot": [dot],
         "length": [length], "cross": [cross],
     }  # fmt: skip
@@ -164,7 +160,7 @@ _TYPES, _MERGED = _build()
 add, sub, mul, div = (_MERGED[name] for name in ("add", "sub", "mul", "div"))
 dot, length, cross = (_MERGED[name] for name in ("dot", "length", "cross"))
 root, select, less, any_less = (_MERGED[name] for name in ("root", "select", "less", "any_less"))
-largest, nonfinite = (_MERGED[name] for name in ("largest", "nonfinite"))
+nonfinite = _MERGED["nonfinite"]
 
 
 def lane_types(scalar: Any, lanes: int) -> SimpleNamespace:

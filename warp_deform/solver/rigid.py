@@ -27,7 +27,7 @@ SLEEP_TURN = 0.05
 def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
     """`predict_body`, `push_body`, `finish_body` and what they share."""
     t = structures(scalar, lanes)
-    S, R3, Q, M33, Bodies = t.S, t.R3, t.Q, t.M33, t.Bodies
+    S, R3, Q, Bodies = t.S, t.R3, t.Q, t.Bodies
 
     @wp.func
     def turned(q: Q, rotation: R3):
@@ -103,5 +103,5 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
 
     return SimpleNamespace(
         turned=turned, response=response, push_body=push_body, moved=moved,
-        predict_body=predict_body, finish_body=finish_body, M33=M33,
+        predict_body=predict_body, finish_body=finish_body,
     )  # fmt: skip

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +80,9 @@ class SolverFusedXPBD(SolverBase):
         self._kernel = forward_kernel(scalars[precision], lanes, bool(self.data.has_bodies))
         self._launch: Any = None
         self._gravity()
+        # padded lanes divide by their stiffness as well
+        self.data.views["group.stiffness"][:] = 1.0
+        self.activate()
         for w in range(self.data.world_count):
             self.set_world(
                 w, damping=self.config.damping, table_friction=self.config.table_friction,
@@ -155,9 +156,6 @@ class SolverFusedXPBD(SolverBase):
         gravity = self.model.gravity.numpy()
         for w in range(self.data.world_count):
             self.data.per_world("group.gravity", w)[:] = gravity[min(w, len(gravity) - 1)][:, None]
-        # padded lanes divide by their stiffness as well
-        self.data.views["group.stiffness"][:] = 1.0
-        self.activate()
 
     def notify_model_changed(self, flags: int) -> None:
         """Read gravity again; other model data are read once, at construction."""
@@ -181,7 +179,9 @@ class SolverFusedXPBD(SolverBase):
         for name in ("watch.steps", "watch.nonfinite", "watch.stretch", "watch.depth",
                      "watch.clamped", "watch.overflow"):  # fmt: skip
             data.arrays[name].view[...] = 0
-        inputs = data_copy(data) if self.bundles is not None else {}
+        inputs = {}
+        if self.bundles is not None:
+            inputs = {name: view.copy() for name, view in data.views.items()}
         for mirrored in data.arrays.values():
             mirrored.to_device()
         launch = self._recorded(settings)
@@ -196,8 +196,9 @@ class SolverFusedXPBD(SolverBase):
         return values
 
     def _problems(self, values: list[WatchValues]) -> tuple[Problem, ...]:
+        """What is wrong with the worlds that took part."""
         limits = self.config.limits
-        return tuple(p for w, v in enumerate(values) for p in v.problems(w, limits))
+        return tuple(p for w, v in enumerate(values) if v.steps for p in v.problems(w, limits))
 
     def _settings(self, max_steps: int, record_every: int) -> Any:
         c, data = self.config, self.data
@@ -295,7 +296,7 @@ class SolverFusedXPBD(SolverBase):
             start = self.data.lane("particles.x", w)[particle]
             first = 2 * slot
             for name, value in (
-                ("particle", particle), ("tick", 0), ("knot", first), ("knot_start", first),
+                ("particle", particle), ("tick", 0), ("knot", first),
                 ("knot_end", first + 2), ("offset", 0.0), ("turn", (0, 0, 0, 1)), ("shift", 0.0),
                 ("lower_start", 0.0), ("lower_end", 0.0),
             ):  # fmt: skip
@@ -338,12 +339,3 @@ class SolverFusedXPBD(SolverBase):
                 q[data.body_ids[w]], qd[data.body_ids[w]] = data.body_poses(w)
             state.body_q.assign(q)
             state.body_qd.assign(qd)
-
-    def describe(self) -> str:
-        """The configuration as JSON."""
-        return json.dumps(asdict(self.config))
-
-
-def data_copy(data: SolverData) -> dict[str, np.ndarray]:
-    """Copies of all arrays, to reproduce a launch."""
-    return {name: view.copy() for name, view in data.views.items()}

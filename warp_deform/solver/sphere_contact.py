@@ -18,7 +18,6 @@ from .lanes import (  # noqa: F401  (operators are found by name)
     any_less,
     div,
     dot,
-    largest,
     less,
     mul,
     root,
@@ -45,9 +44,12 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def list_near(
         g: int, p0: int, start: int, capacity: int, first: int, last: int, margin: S, stale: V,
-        on: V,
-        q: Particles, pairs: Pairs, near: Near, watch: Watch, count: int,
+        on: V, q: Particles, pairs: Pairs, near: Near, watch: Watch, count: int,
     ):  # fmt: skip
+        """Lists the group's near pairs anew from `start` on; returns how many.
+
+        Lanes that are not stale keep the pairs of their own last listing.
+        """
         for i in range(p0, p0 + count):
             x = q.x[i]
             r = q.xr[i]
@@ -106,15 +108,9 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def touches(
-        particle: int,
-        lane: int,
-        p0: int,
-        start: int,
-        n: int,
-        q: Particles,
-        pairs: Pairs,
+        particle: int, lane: int, p0: int, start: int, n: int, q: Particles, pairs: Pairs,
         near: Near,
-    ):
+    ):  # fmt: skip
         """Whether a particle of one lane touches another that it is not exempt from."""
         hit = bool(False)
         for k in range(start, start + n):

@@ -116,7 +116,6 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
     class Near:
         """Pairs close enough to touch soon, per group, in the order of the topology's pairs."""
 
-        count: wp.array(dtype=int)
         pair: wp.array(dtype=int)
         mask: wp.array(dtype=V)  # 1 where the pair is listed for the lane's own sake
 
@@ -166,8 +165,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         turn: wp.array(dtype=Q)  # rotation of the held body in the tip's frame
         tick: wp.array(dtype=int)  # substeps along the path
         knot: wp.array(dtype=int)  # segment that the tip is on
-        knot_start: wp.array(dtype=int)
-        knot_end: wp.array(dtype=int)
+        knot_end: wp.array(dtype=int)  # number of the knot after the path's last
         time: wp.array(dtype=S)  # of each knot [s], ascending per world
         position: wp.array(dtype=R3)
         rotation: wp.array(dtype=Q)

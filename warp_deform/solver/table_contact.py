@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from .friction import friction
-from .lanes import add, any_less, div, dot, length, less, mul, root, select, sub  # noqa: F401
+from .lanes import add, any_less, div, dot, mul, root, select, sub  # noqa: F401  (operators)
 from .structures import structures
 
 __all__ = ["table_contact"]

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from .. import registration
 from ..robots.primitive import PrimitiveConfig
 from ..solver.config import SolverConfig
 
@@ -25,9 +24,10 @@ if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     from ..objects.cable import Cable
     from ..objects.push import Push
     from ..objects.zone import Zone
+    from ..rendering.images import Images
     from .free_space import FreeSpace
 
-__all__ = ["Action", "Images", "Layout", "Snapshot", "Stage", "Task"]
+__all__ = ["Action", "Layout", "Snapshot", "Stage", "Task"]
 
 Action = np.ndarray
 """(7,) float64: pick x, y [m], yaw [rad], place x, y [m], yaw [rad], lift [m]."""
@@ -66,18 +66,6 @@ class Layout:
     def with_targets(self, targets: np.ndarray) -> Layout:
         """The same start with other targets (a goal from elsewhere)."""
         return replace(self, targets=np.array(targets, dtype=float))
-
-
-@dataclass(frozen=True, eq=False)
-class Images:
-    """Top-down views of one state: rows are y, columns are x, 3.125 mm a pixel.
-
-    color (320, 160, 3) uint8; height (320, 160) float32 [m]; segmentation (320, 160) uint8
-    """
-
-    color: np.ndarray
-    height: np.ndarray
-    segmentation: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +120,6 @@ class Task(abc.ABC):
         if len(self.stages) > 1:
             raise TypeError(f"{self.name} has {len(self.stages)} stages and no rule between them")
         return self.stages[0]
-
-    @classmethod
-    def env_id(cls) -> str:
-        """Gymnasium id of the task."""
-        return registration.env_id(cls.name)
 
     @abc.abstractmethod
     def add_objects(self, builder: newton.ModelBuilder) -> tuple[Cable | Box, ...]:
