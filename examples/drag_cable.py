@@ -40,7 +40,7 @@ def main(out: Path | None = None) -> float:
     solver = SolverFusedXPBD(builder.finalize(device="cpu"))
     rollout(solver, [0], least=0.5, most=3.0)
 
-    start = solver.data.lane("particles.x", 0)[-1].astype(float)
+    start = solver.particle_q(0)[-1].astype(float)
     goal = np.array([0.72, 0.0, start[2]])
     up = np.array([0.0, 0.0, LIFT])
     # lowered on a slope: straight down, the lifted part of the cable would fold under the tip
@@ -51,7 +51,7 @@ def main(out: Path | None = None) -> float:
     path = GripPath(np.append(times, times[-1] + 0.2), knots, particle=cable.beads - 1)
     result = rollout(solver, [0], paths={0: path}, least=0.3, most=times[-1] + 5.0)[0]
 
-    beads = solver.data.lane("particles.x", 0).copy()
+    beads = solver.particle_q(0)
     assert not result.watch.problems(0, solver.config.limits)
     assert np.linalg.norm(beads[-1] - goal) < 0.005, "the end is not where it was put"
     # straightness: distance from the end to end line, and end distance over length

@@ -35,7 +35,7 @@ def main(out: Path | None = None) -> np.ndarray:
     solver = SolverFusedXPBD(builder.finalize(device="cpu"))
     result = rollout(solver, [0], least=1.0, most=5.0)[0]
 
-    beads, (box, _) = solver.data.lane("particles.x", 0).copy(), solver.data.body_poses(0)
+    beads, box = solver.particle_q(0), solver.body_q(0)
     assert not result.watch.problems(0, solver.config.limits)
     assert result.seconds < 5.0, "the cable did not come to rest"
     # the box carries the middle, both ends reach the table, and the box has not moved

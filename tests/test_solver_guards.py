@@ -110,10 +110,10 @@ def test_a_list_that_overflows_is_the_fault_of_the_world_that_filled_it():
     for _ in range(2):
         world = new_builder()
         rng = np.random.default_rng(1)
-        add_particles(world, np.add(rng.uniform(0, 0.01, (20, 3)), (0, 0, 0.1)), colliding=True)
+        add_particles(world, np.add(rng.uniform(0, 0.01, (60, 3)), (0, 0, 0.1)), colliding=True)
         builder.add_world(world)
     solver = finalize(builder, SolverConfig(), lanes=8, pairs_per_particle=2)
-    solver.data.lane("particles.x", 1)[:, 0] = np.arange(20.0)
+    solver.data.lane("particles.x", 1)[:, 0] = np.arange(60.0)
     overflow = [v.overflow for v in solver.run(20)]
     assert overflow[0] > 0 and overflow[1] == 0
 

@@ -153,7 +153,8 @@ class SolverData:
             self._constant(name, joined(_field(name)), dtype, number)
         groups, L = self.group_count, self.lanes
         capacity = [
-            min(len(tops[k].pair_ij), pairs_per_particle * max(tops[k].particle_count, 1))
+            # a group's list holds the pairs of all its lanes, so each lane has its own share
+            min(len(tops[k].pair_ij), L * pairs_per_particle * max(tops[k].particle_count, 1))
             for k in self.group_topology
         ]
         near_start = np.concatenate([[0], np.cumsum(capacity)])

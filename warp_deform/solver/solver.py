@@ -162,6 +162,24 @@ class SolverFusedXPBD(SolverBase):
         if flags & int(newton.ModelFlags.MODEL_PROPERTIES):
             self._gravity()
 
+    # -- reading
+
+    def particle_q(self, world: int) -> np.ndarray:
+        """Positions (P, 3) [m] of one world's particles, in the solver's precision."""
+        return self.data.lane("particles.x", world).copy()
+
+    def particle_qd(self, world: int) -> np.ndarray:
+        """Velocities (P, 3) [m/s] of one world's particles."""
+        return self.data.lane("particles.v", world).copy()
+
+    def body_q(self, world: int) -> np.ndarray:
+        """Poses (B, 7) of one world's bodies: position [m] of the body's frame, quat_xyzw."""
+        return self.data.body_poses(world)[0]
+
+    def body_qd(self, world: int) -> np.ndarray:
+        """Twists (B, 6) of one world's bodies: of the centre of mass [m/s], angular [rad/s]."""
+        return self.data.body_poses(world)[1]
+
     # -- running
 
     def run(self, max_steps: int, *, record_every: int = 0) -> list[WatchValues]:
