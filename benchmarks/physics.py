@@ -28,6 +28,8 @@ PEERS = {
     "heap": ("pybullet", "newton-vbd", "newton-xpbd"),
     "ring": ("pybullet", "newton-vbd", "newton-xpbd"),
     "block": ("pybullet", "newton-xpbd"),
+    "cloth10": (),
+    "cloth25": (),
 }
 LANES = 8
 WORLDS = 64

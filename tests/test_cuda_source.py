@@ -8,8 +8,10 @@ import warp as wp
 from warp_deform.solver.forward import forward_kernel
 
 
-@pytest.mark.parametrize("with_bodies", [False, True])
-def test_the_solver_compiles_to_ptx(tmp_path: Path, with_bodies: bool) -> None:
-    kernel = forward_kernel(wp.float32, 1, with_bodies)
+@pytest.mark.parametrize(
+    ("with_bodies", "with_sheets"), [(False, False), (True, False), (True, True)]
+)
+def test_the_solver_compiles_to_ptx(tmp_path: Path, with_bodies: bool, with_sheets: bool) -> None:
+    kernel = forward_kernel(wp.float32, 1, with_bodies, with_sheets, with_sheets)
     (ptx,) = wp.compile_aot_module(kernel.module, arch=80, module_dir=str(tmp_path), use_ptx=True)
     assert ".visible .entry forward" in Path(ptx).read_text()

@@ -14,6 +14,7 @@ from typing import Any
 import newton
 import numpy as np
 
+from .bench_cloth import CLOTH_SCENES, run_cloth
 from .errors import InputError
 from .objects.box import add_box, l_block
 from .objects.cable import add_cable
@@ -38,6 +39,8 @@ def run(
 ) -> dict[str, Any]:
     """Time `scene` ("cable", "heap", "ring" or "block"), and `peer` on it when one is named.
 
+    The scenes "cloth10" and "cloth25" are those of `bench_cloth`: at most 16 worlds and no peer.
+
     Returns times in process CPU milliseconds per simulated second and world, `ratio` and
     `ratio_lanes` (peer's time over ours, falling) and `same_bits`: whether the worlds in lanes
     ended in the very states they end in alone.
@@ -46,12 +49,17 @@ def run(
         InputError: no such scene or peer, or the peer is not installed.
         PhysicsError: a guard fired.
     """
-    if scene not in PEER_SCENES:
-        raise InputError(f"no scene {scene!r} to time; choose from {', '.join(PEER_SCENES)}")
+    known = (*PEER_SCENES, *CLOTH_SCENES)
+    if scene not in known:
+        raise InputError(f"no scene {scene!r} to time; choose from {', '.join(known)}")
     if peer is not None and peer not in PEERS:
         raise InputError(f"no peer {peer!r}; choose from {', '.join(PEERS)}")
     if not (seconds > 0 and repeats > 0 and worlds > 0):
         raise InputError("seconds, repeats and worlds must be positive")
+    if scene in CLOTH_SCENES:
+        if peer is not None:
+            raise InputError(f"{scene} has no peer: leave it out")
+        return run_cloth(scene=scene, lanes=lanes, worlds=worlds, repeats=repeats)
     starts = [peer_scene(scene, seed=seed) for seed in range(worlds)]
     begin = time.process_time()
     lone, many = _solver(starts[:1], 1), _solver(starts, lanes)

@@ -240,7 +240,7 @@ def inspect(options: InspectOptions) -> Outcome:
 class BenchOptions(CommandOptions):
     """Time one simulated second of a scene; compiling is timed apart."""
 
-    scene: Literal["cable", "heap", "ring", "block"] = "cable"
+    scene: Literal["cable", "heap", "ring", "block", "cloth10", "cloth25"] = "cable"
     """What is simulated."""
     peer: Literal["pybullet", "newton-vbd", "newton-vbd-bodies", "newton-xpbd"] | None = None
     """Another simulator to time on the same scene."""

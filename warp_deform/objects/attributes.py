@@ -39,10 +39,15 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
     ========================  =========  ===================================================
     spring_mode               spring     a `SpringMode`
     spring_limit              spring     strain limit: largest length / rest length; 0 = none
+    spring_floor              spring     smallest length / rest length; 0 = none
     spring_middle             spring     BEND: the particle between the two
     particle_object           particle   which object of its world a particle belongs to
     particle_rest             particle   position in the object's undeformed shape [m]
     particle_exclusion        particle   no self-contact closer than this in the rest shape [m]
+    particle_skin             particle   its share of the distance at which particles and
+                                         triangles touch [m]; 0 = the radius
+    particle_edge_gap         particle   distance at which edges of triangles touch [m]; 0 = never
+    triangle_friction         triangle   factor on the solver's contact friction
     ========================  =========  ===================================================
     """
     # Newton takes seconds to import, and the tasks can be listed without it.
@@ -53,10 +58,14 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
     for name, where, dtype, default, references in (
         ("spring_mode", frequency.SPRING, wp.int32, int(SpringMode.EQUAL), None),
         ("spring_limit", frequency.SPRING, wp.float32, 0.0, None),
+        ("spring_floor", frequency.SPRING, wp.float32, 0.0, None),
         ("spring_middle", frequency.SPRING, wp.int32, -1, frequency.PARTICLE),
         ("particle_object", frequency.PARTICLE, wp.int32, 0, None),
         ("particle_rest", frequency.PARTICLE, wp.vec3, wp.vec3(0.0, 0.0, 0.0), None),
         ("particle_exclusion", frequency.PARTICLE, wp.float32, 0.0, None),
+        ("particle_skin", frequency.PARTICLE, wp.float32, 0.0, None),
+        ("particle_edge_gap", frequency.PARTICLE, wp.float32, 0.0, None),
+        ("triangle_friction", frequency.TRIANGLE, wp.float32, 1.0, None),
     ):
         builder.add_custom_attribute(
             newton.ModelBuilder.CustomAttribute(

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..objects.box import Box
 from ..objects.cable import Cable
+from ..objects.cloth import Cloth
 from ..objects.colors import TABLE
 from ..objects.zone import Zone
 
@@ -56,13 +57,15 @@ class Drawables:
     link_segment: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
 
     @classmethod
-    def of(cls, objects: Sequence[Cable | Box | Zone]) -> Drawables:
-        """Drawables of `objects` in creation order; every bead, body and zone gets an id."""
+    def of(cls, objects: Sequence[Cable | Box | Cloth | Zone]) -> Drawables:
+        """Drawables of `objects` in creation order; every bead, body, fabric and zone has an id."""
         spheres: list[tuple[int, float, int]] = []
         links: list[tuple[int, int, float, int]] = []
         boxes: list[tuple[int, tuple[float, ...], tuple[float, ...], int]] = []
         quads: list[np.ndarray] = []
         quad_segments: list[int] = []
+        sheets: list[np.ndarray] = []
+        sheet_segments: list[int] = []
         palette = np.zeros((256, 3), np.uint8)
         palette[WORKSPACE_SEGMENT] = TABLE
         segments: list[range] = []
@@ -87,6 +90,11 @@ class Drawables:
                     boxes.append((item.body, pose, half, segment))
                 palette[segment] = item.config.color
                 segment += 1
+            elif isinstance(item, Cloth):
+                sheets.append(item.faces)
+                sheet_segments += [segment] * len(item.faces)
+                palette[segment] = item.config.color
+                segment += 1
             else:
                 quads.append(item.corners)
                 quad_segments += [segment] * len(item.corners)
@@ -107,6 +115,8 @@ class Drawables:
             quad_segment=np.array(quad_segments, np.int32),
             palette=palette,
             segments=tuple(segments),
+            triangle_particle=np.concatenate([*sheets, np.zeros((0, 3))]).astype(np.int32),
+            triangle_segment=np.array(sheet_segments, np.int32),
             link_particle=np.array([k[:2] for k in links], np.int32).reshape(-1, 2),
             link_radius=np.array([k[2] for k in links], np.float32),
             link_segment=np.array([k[3] for k in links], np.int32),

@@ -14,13 +14,13 @@ import numpy as np
 import warp as wp
 
 from ..errors import InputError
-from .data import KERNEL_ARGUMENTS, SolverData
+from .data import KERNEL_ARGUMENTS, SolverData, alias_lanes
 from .forward import forward_kernel
 from .structures import structures
 
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
-_HEADER = {"digest", "lanes", "precision", "bodies", "groups", "settings"}
+_HEADER = {"digest", "lanes", "precision", "bodies", "sheets", "edges", "groups", "settings"}
 _SETTINGS = ("dt", "max_steps", "recovery", "max_speed", "calm_speed", "margin",
              "rest_speed", "rest_steps", "check_every", "record_every", "particle_stride",
              "body_stride")  # fmt: skip
@@ -35,6 +35,8 @@ def write_bundle(
         "lanes": data.lanes,
         "precision": np.dtype(data.number).name,
         "bodies": bool(data.has_bodies),
+        "sheets": bool(data.has_sheets),
+        "edges": bool(data.has_edges),
         "groups": data.group_count,
         "settings": {name: getattr(settings, name) for name in _SETTINGS},
     }
@@ -98,7 +100,10 @@ def replay_bundle(path: str | Path) -> dict[str, np.ndarray]:
                 held.append((key, array, values.shape, values.dtype))
                 setattr(struct, field, array)
         structs.append(struct)
-    kernel = forward_kernel(scalar, header["lanes"], header["bodies"])
+    alias_lanes(structs, scalar)
+    kernel = forward_kernel(
+        scalar, header["lanes"], header["bodies"], header["sheets"], header["edges"]
+    )
     wp.launch(kernel, dim=header["groups"], inputs=[settings, *structs], device="cpu")
     return {
         key: array.numpy().view(dtype).reshape(shape).copy() for key, array, shape, dtype in held

@@ -10,16 +10,28 @@ import numpy as np
 import warp as wp
 
 from .box_box import POINTS
+from .sheet_data import add_sheets
 from .structures import structures
 from .topology import WorldTopology, read_worlds
 
 __all__ = ["KERNEL_ARGUMENTS", "Mirrored", "SolverData"]
 
 KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near",
-                    "bodies", "contacts", "grips", "watch")  # fmt: skip
+                    "bodies", "contacts", "grips", "watch", "sheets", "cells")  # fmt: skip
 """The kernel's structs, after the settings, in the order of its arguments."""
 
 _NUMPY = {wp.float32: np.float32, wp.float64: np.float64}
+
+
+def alias_lanes(structs: list[Any], scalar: Any) -> None:
+    """Let `Cells` see the particles in lanes scalar by scalar; structs as `KERNEL_ARGUMENTS`."""
+    particles, cells = (structs[KERNEL_ARGUMENTS.index(name)] for name in ("particles", "cells"))
+    for field, array in (
+        ("x", particles.x), ("xp", particles.xp), ("w", particles.w), ("xr_flat", cells.xr),
+    ):  # fmt: skip
+        count = array.capacity // np.dtype(_NUMPY[scalar]).itemsize
+        flat = wp.array(ptr=array.ptr, dtype=scalar, shape=(count,), device=array.device)
+        setattr(cells, field, flat)
 
 
 class Mirrored:
@@ -71,6 +83,7 @@ class SolverData:
         self._group(worlds)
         self.arrays: dict[str, Mirrored] = {}
         self._fill_topologies(pairs_per_particle)
+        add_sheets(self, pairs_per_particle)
         self._fill_particles()
         self._fill_bodies()
         self._fill_grips()
@@ -106,16 +119,24 @@ class SolverData:
         self.group_body = np.concatenate([[0], np.cumsum(bodies)]).astype(int)
         self.has_bodies = self.group_body[-1] > 0
         self.has_particles = self.group_particle[-1] > 0
+        # both need the kernel with fabrics
+        self.has_sheets = any(
+            len(top.sheet_triangle) > 0 or bool((top.spring_floor > 0).any())
+            for top in self.topologies
+        )
+        self.has_edges = any(len(top.sheet_edge) > 0 for top in self.topologies)
 
-    def _add(
+    def add_array(
         self, name: str, count: int, dtype: Any, shape: tuple[int, ...], number: Any
     ) -> np.ndarray:
+        """Add the array "struct.field" of `count` elements; returns its view."""
         self.arrays[name] = Mirrored(count, dtype, self.device, number, shape)
         return self.arrays[name].view
 
-    def _constant(self, name: str, values: np.ndarray, dtype: Any, number: Any) -> None:
+    def add_constant(self, name: str, values: np.ndarray, dtype: Any, number: Any) -> None:
+        """Add an array that holds `values`."""
         values = np.asarray(values)
-        self._add(name, len(values), dtype, values.shape[1:], number)[: len(values)] = values
+        self.add_array(name, len(values), dtype, values.shape[1:], number)[: len(values)] = values
 
     def _fill_topologies(self, pairs_per_particle: int) -> None:
         t, number = self.types, self.number
@@ -138,19 +159,19 @@ class SolverData:
             ("springs.middle", joined("spring_middle")),
             ("shapes.body", joined("shape_body")),
         ):
-            self._constant(name, np.asarray(values), wp.int32, np.int32)
-        self._constant("topology.radius", joined("particle_radius"), t.S, number)
+            self.add_constant(name, np.asarray(values), wp.int32, np.int32)
+        self.add_constant("topology.radius", joined("particle_radius"), t.S, number)
         for name in ("springs.ij", "pairs.ij"):
-            self._constant(name, joined(_field(name)), wp.vec2i, np.int32)
-        for name in ("springs.length", "springs.compliance", "springs.limit", "pairs.distance",
-                     "shapes.friction"):  # fmt: skip
-            self._constant(name, joined(_field(name)), t.S, number)
+            self.add_constant(name, joined(_field(name)), wp.vec2i, np.int32)
+        for name in ("springs.length", "springs.compliance", "springs.limit", "springs.floor",
+                     "pairs.distance", "shapes.friction"):  # fmt: skip
+            self.add_constant(name, joined(_field(name)), t.S, number)
         for name, dtype in (
             ("shapes.center", t.R3),
             ("shapes.half", t.R3),
             ("shapes.rotation", t.Q),
         ):
-            self._constant(name, joined(_field(name)), dtype, number)
+            self.add_constant(name, joined(_field(name)), dtype, number)
         groups, L = self.group_count, self.lanes
         capacity = [
             # a group's list holds the pairs of all its lanes, so each lane has its own share
@@ -168,27 +189,27 @@ class SolverData:
             ("near_capacity", capacity),
             ("contact_start", contact_start[:-1]),
         ):
-            self._constant(f"group.{name}", np.asarray(values), wp.int32, np.int32)
+            self.add_constant(f"group.{name}", np.asarray(values), wp.int32, np.int32)
         for name in ("active", "damping", "table_friction", "contact_friction", "stiffness",
                      "calm_steps", "calm_after", "least_steps", "most_steps"):  # fmt: skip
-            self._add(f"group.{name}", groups, t.V, (L,), number)
-        self._add("group.gravity", groups, t.V3, (3, L), number)
+            self.add_array(f"group.{name}", groups, t.V, (L,), number)
+        self.add_array("group.gravity", groups, t.V3, (3, L), number)
         total = int(near_start[-1])
-        self._add("near.pair", total, wp.int32, (), np.int32)
-        self._add("near.mask", total, t.V, (L,), number)
+        self.add_array("near.pair", total, wp.int32, (), np.int32)
+        self.add_array("near.mask", total, t.V, (L,), number)
         total = int(contact_start[-1])
         for name in ("a", "b"):
-            self._add(f"contacts.{name}", total, wp.int32, (), np.int32)
+            self.add_array(f"contacts.{name}", total, wp.int32, (), np.int32)
         for name in ("ra", "rb", "normal", "u", "v", "weights", "steps", "impulse"):
-            self._add(f"contacts.{name}", total, t.R3, (3,), number)
-        self._add("contacts.mu", total, t.S, (), number)
+            self.add_array(f"contacts.{name}", total, t.R3, (3,), number)
+        self.add_array("contacts.mu", total, t.S, (), number)
 
     def _fill_particles(self) -> None:
         count, L = int(self.group_particle[-1]), self.lanes
         for name in ("x", "v", "xp", "xr"):
-            self._add(f"particles.{name}", count, self.types.V3, (3, L), self.number)
+            self.add_array(f"particles.{name}", count, self.types.V3, (3, L), self.number)
         for name in ("w", "w0"):
-            self._add(f"particles.{name}", count, self.types.V, (L,), self.number)
+            self.add_array(f"particles.{name}", count, self.types.V, (L,), self.number)
         if self.has_particles:
             inverse = self.model.particle_inv_mass.numpy()
             for w in range(self.world_count):
@@ -202,9 +223,9 @@ class SolverData:
             ("inertia", t.M33, (3, 3)), ("inverse_inertia", t.M33, (3, 3)),
             ("dx", t.R3, (3,)), ("dr", t.R3, (3,)), ("spread", t.M33, (3, 3)),
         ):  # fmt: skip
-            self._add(f"bodies.{name}", count, dtype, shape, number)
+            self.add_array(f"bodies.{name}", count, dtype, shape, number)
         for name in ("touching", "support"):
-            self._add(f"bodies.{name}", count, wp.int32, (), np.int32)
+            self.add_array(f"bodies.{name}", count, wp.int32, (), np.int32)
         self.views["bodies.q"][:, 3] = 1.0
         if self.has_bodies:
             for w in range(self.world_count):
@@ -226,15 +247,15 @@ class SolverData:
             "push",
             "push_steps",
         ):
-            self._add(f"grips.{name}", slots, wp.int32, (), np.int32)
+            self.add_array(f"grips.{name}", slots, wp.int32, (), np.int32)
         for name, dtype, shape in (
             ("offset", t.R3, (3,)), ("turn", t.Q, (4,)), ("lower_start", t.S, ()),
             ("lower_end", t.S, ()), ("shift", t.R3, (3,)), ("push_acceleration", t.R3, (3,)),
         ):  # fmt: skip
-            self._add(f"grips.{name}", slots, dtype, shape, number)
+            self.add_array(f"grips.{name}", slots, dtype, shape, number)
         self.reserve_knots(slots * 16)
         for name in ("steps", "nonfinite", "stretch", "depth", "clamped", "overflow"):
-            self._add(f"watch.{name}", self.group_count, t.V, (self.lanes,), number)
+            self.add_array(f"watch.{name}", self.group_count, t.V, (self.lanes,), number)
         self.reserve_frames(0)
 
     def reserve_knots(self, count: int) -> None:
@@ -244,16 +265,16 @@ class SolverData:
         for name, dtype, shape in (
             ("time", t.S, ()), ("position", t.R3, (3,)), ("rotation", t.Q, (4,))
         ):  # fmt: skip
-            self._add(f"grips.{name}", count, dtype, shape, number)
+            self.add_array(f"grips.{name}", count, dtype, shape, number)
 
     def reserve_frames(self, frames: int) -> None:
         """Make room for `frames` recorded frames."""
         t, number = self.types, self.number
         self.frame_room = frames
         particles, bodies = int(self.group_particle[-1]), int(self.group_body[-1])
-        self._add("watch.frame_x", frames * particles, t.V3, (3, self.lanes), number)
-        self._add("watch.frame_body_x", frames * bodies, t.R3, (3,), number)
-        self._add("watch.frame_body_q", frames * bodies, t.Q, (4,), number)
+        self.add_array("watch.frame_x", frames * particles, t.V3, (3, self.lanes), number)
+        self.add_array("watch.frame_body_x", frames * bodies, t.R3, (3,), number)
+        self.add_array("watch.frame_body_q", frames * bodies, t.Q, (4,), number)
 
     # -- access
 
@@ -270,6 +291,12 @@ class SolverData:
             if owner == name:
                 setattr(value, field, mirrored.array)
         return value
+
+    def structs(self) -> list[Any]:
+        """All structs of the kernel, in the order of `KERNEL_ARGUMENTS`."""
+        out = [self.struct(name) for name in KERNEL_ARGUMENTS]
+        alias_lanes(out, self.scalar)
+        return out
 
     def lane(self, name: str, world: int) -> np.ndarray:
         """Writable view of one world's particles in an array of V3 -> (P, 3) or V -> (P,)."""

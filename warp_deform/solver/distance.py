@@ -18,13 +18,14 @@ __all__ = ["distance"]
 
 
 @functools.cache
-def distance(scalar: Any, lanes: int) -> SimpleNamespace:
+def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamespace:
     """`project_distance(k, p0, inverse_dt2, q, springs)`: solve spring `k`.
 
     For a two-sided spring (mode 0) of length l, rest length L and compliance a,
     ``lambda = (l - L) / (wi + wj + a / dt^2)`` moves both ends along the spring. AT_LEAST (mode 1)
     acts only when l < L, AT_MOST (mode 2) only when l > L. With a strain limit X the correction is
-    at least the rigid one for l > X, in the same solve.
+    at least the rigid one for l > X, in the same solve; with a floor (and `with_floors`), it is so
+    for l < floor as well, whatever the mode.
     """
     t = structures(scalar, lanes)
     S, V, Particles, Springs = t.S, t.V, t.Particles, t.Springs
@@ -40,7 +41,12 @@ def distance(scalar: Any, lanes: int) -> SimpleNamespace:
         xj = q.x[j]
         d = xi - xj
         l2 = dot(d, d)
-        if mode != 1 or any_less(l2, rest * rest):
+        acts = mode == 0 or (mode == 1 and any_less(l2, rest * rest))
+        if mode == 2:
+            acts = any_less(V(rest * rest) - l2, S(0.0))
+            if wp.static(with_floors):
+                acts = acts or any_less(l2, springs.floor[k] * springs.floor[k])
+        if acts:
             zero = V(S(0.0))
             tiny = V(S(1.0e-9))
             l = root(l2)
@@ -55,8 +61,12 @@ def distance(scalar: Any, lanes: int) -> SimpleNamespace:
             safe = wp.max(l, tiny)
             s = c / ((w + inverse_dt2 * springs.compliance[k]) * safe)
             limit = springs.limit[k]
-            if limit > S(0.0):
+            if limit > S(0.0) and any_less(V(limit * limit) - l2, S(0.0)):
                 s = wp.max(s, (l - V(limit)) / (w * safe))
+            if wp.static(with_floors):
+                floor = springs.floor[k]
+                if any_less(l2, floor * floor):
+                    s = wp.min(s, (l - V(floor)) / (w * safe))
             q.x[i] = xi - d * (s * wi)
             q.x[j] = xj + d * (s * wj)
 

@@ -17,7 +17,10 @@ from .body_contact import body_contact
 from .box_box import box_box
 from .box_particle import box_particle
 from .box_table import box_table
+from .box_triangle import box_triangle
+from .cell_list import cell_list
 from .distance import distance
+from .edge_contact import edge_contact
 from .grip import grip
 from .lanes import (  # noqa: F401  (operators are found by name)
     KERNEL_OPTIONS,
@@ -36,29 +39,43 @@ from .rigid import rigid
 from .sphere_contact import sphere_contact
 from .structures import structures
 from .table_contact import table_contact
+from .triangle_contact import triangle_contact
 
 __all__ = ["forward_kernel"]
 
 
 @functools.cache
-def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
+def forward_kernel(
+    scalar: Any,
+    lanes: int,
+    with_bodies: bool,
+    with_sheets: bool = False,
+    with_edges: bool = False,
+) -> Any:
     """The kernel for a precision and a width; launch it with one thread per group.
 
-    `with_bodies` False leaves the code of rigid bodies out, which halves the compile time.
+    `with_bodies` False leaves the code of rigid bodies out, which halves the compile time;
+    `with_sheets` False that of triangles, `with_edges` False that of their edges.
     """
     t = structures(scalar, lanes)
     S, V, R3, L = t.S, t.V, t.R3, t.L
     predict, finish = (getattr(table_contact(scalar, lanes), n) for n in ("predict", "finish"))
-    project_distance = distance(scalar, lanes).project_distance
+    project_distance = distance(scalar, lanes, with_sheets).project_distance
     project_bend = bending(scalar, lanes).project_bend
     contact = sphere_contact(scalar, lanes)
     list_near, project_contact = contact.list_near, contact.project_contact
+    cells_ = cell_list(scalar, lanes)
+    moved_since, list_triangles = cells_.moved_since, cells_.list_triangles
+    project_triangles = triangle_contact(scalar, lanes).project_triangles
+    edges_ = edge_contact(scalar, lanes)
+    list_edges, project_edges = edges_.list_edges, edges_.project_edges
     grips_ = grip(scalar, lanes)
     follow_path, take, let_go = grips_.follow_path, grips_.take, grips_.let_go
     body = rigid(scalar, lanes)
     predict_body, finish_body = body.predict_body, body.finish_body
     list_table = box_table(scalar, lanes).list_table
     project_box_particle = box_particle(scalar, lanes).project_box_particle
+    project_box_triangle = box_triangle(scalar, lanes).project_box_triangle
     list_boxes = box_box(scalar, lanes).list_boxes
     bodies_ = body_contact(scalar, lanes)
     begin_body, solve_contacts, end_body = (
@@ -67,11 +84,12 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
     Settings, Topology, Group, Particles = t.Settings, t.Topology, t.Group, t.Particles
     Springs, Pairs, Shapes, Near = t.Springs, t.Pairs, t.Shapes, t.Near
     Bodies, Contacts, Grips, Watch = t.Bodies, t.Contacts, t.Grips, t.Watch
+    Sheets, Cells = t.Sheets, t.Cells
 
     @wp.func
     def solve_bodies(
         g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
-        q: Particles, bodies: Bodies, contacts: Contacts,
+        q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets, cells: Cells,
     ):  # fmt: skip
         """Contacts of one lane's bodies with particles, each other and the table."""
         p0 = group.particle_start[g]
@@ -95,6 +113,13 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                     project_box_particle(
                         p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
                     )
+            if wp.static(with_sheets):
+                for f in range(sheets.first[k], sheets.first[k + 1]):
+                    tri = sheets.triangle[f]
+                    project_box_triangle(
+                        f, lane, p0, top.radius[radii + tri[0]], shape, b, mu, push, shapes,
+                        bodies, sheets, cells,
+                    )  # fmt: skip
         for b in range(b0, b0 + count):
             begin_body(b, bodies)
         start = group.contact_start[g]
@@ -146,6 +171,7 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
     def forward(
         st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
         q: Particles, near: Near, bodies: Bodies, contacts: Contacts, grips: Grips, watch: Watch,
+        sheets: Sheets, cells: Cells,
     ):  # fmt: skip
         g = wp.tid()
         k = group.topology[g]
@@ -178,11 +204,14 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
         holding = zero
         calm = group.calm_steps[g]
         stale = on
+        fresh = zero  # lanes whose triangles have been listed in this launch
         travel = zero
         clamped = zero
         frame = int(0)
         longest_push = int(0)
         for lane in range(wp.static(L)):
+            if wp.static(with_sheets):
+                cells.met[w0 + lane] = 0
             if on[lane] > S(0.0):
                 if grips.particle[w0 + lane] >= 0 or grips.body[w0 + lane] >= 0:
                     holding[lane] = S(1.0)
@@ -233,8 +262,11 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                         radius = S(0.0)
                         if grips.particle[w] >= 0:
                             radius = top.radius[radii + grips.particle[w]]
+                        met = bool(False)
+                        if wp.static(with_sheets):
+                            met = cells.met[w] > 0
                         if not follow_path(
-                            w, lane, p0, bl, top.shape_start[k], top.shape_start[k + 1],
+                            met, w, lane, p0, bl, top.shape_start[k], top.shape_start[k + 1],
                             near_start, near_count, radius, dt, q, pairs, shapes, near, bodies,
                             grips,
                         ):  # fmt: skip
@@ -250,6 +282,21 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                     top.pair_start[k + 1], st.margin, stale, on, q, pairs, near, watch, n,
                 )  # fmt: skip
                 travel = select(stale, zero, travel)
+            if wp.static(with_sheets):
+                if sheets.first[k + 1] > sheets.first[k]:
+                    way2 = moved_since(p0, n, q, cells)
+                    half2 = S(0.25) * st.margin * st.margin
+                    for lane in range(wp.static(L)):
+                        if on[lane] > S(0.0) and (fresh[lane] < S(0.5) or way2[lane] > half2):
+                            fresh[lane] = S(1.0)
+                            left = list_triangles(g, lane, k, p0, st.margin, top, sheets, cells)
+                            if wp.static(with_edges):
+                                left += list_edges(
+                                    g, lane, k, p0, st.margin, top, sheets, cells
+                                )  # fmt: skip
+                            over = watch.overflow[g]
+                            over[lane] = wp.max(over[lane], S(left))
+                            watch.overflow[g] = over
             # constraints
             # always in the same order: sweeping backwards in every other substep makes tight heaps
             # crawl for ever, and shells jitter
@@ -260,13 +307,27 @@ def forward_kernel(scalar: Any, lanes: int, with_bodies: bool) -> Any:
                     project_distance(s, p0, inverse_dt2, q, springs)
             for c in range(near_start, near_start + near_count):
                 project_contact(c, p0, contact_mu, push, q, pairs, near)
+            if wp.static(with_sheets):
+                if sheets.first[k + 1] > sheets.first[k]:
+                    for lane in range(wp.static(L)):
+                        if on[lane] > S(0.0):
+                            hit = project_triangles(
+                                g, lane, p0, grips.particle[w0 + lane], contact_mu[lane], push,
+                                sheets, cells,
+                            )  # fmt: skip
+                            cells.met[w0 + lane] = wp.where(hit, 1, 0)
+                            if wp.static(with_edges):
+                                project_edges(g, lane, p0, push, sheets, cells)
             if wp.static(with_bodies):
                 for lane in range(wp.static(L)):
                     if on[lane] > S(0.0):
                         for b in range(body_count):
                             bodies.touching[b0 + lane * body_count + b] = 0
                             bodies.support[b0 + lane * body_count + b] = 0
-                        solve_bodies(g, lane, k, push, top, shapes, group, q, bodies, contacts)
+                        solve_bodies(
+                            g, lane, k, push, top, shapes, group, q, bodies, contacts, sheets,
+                            cells,
+                        )  # fmt: skip
             # table, velocities
             fastest = select(calm, V(st.calm_speed * dt), V(st.max_speed * dt))
             moved2 = zero

@@ -20,7 +20,8 @@ CONTACT = 1.0e-4
 
 @functools.cache
 def grip(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`follow_path` moves what one lane holds by one substep and returns whether it still holds it.
+    """`follow_path` moves what one lane holds by one substep and returns whether it still holds it;
+    `met` says that what it holds has met a triangle.
 
     Positions are linear between knots, rotations normalised linear. Between `lower_start` and
     `lower_end` the descent ends where the held thing meets anything; the rest of the path (the
@@ -87,13 +88,14 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def follow_path(
-        w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int, radius: S,
-        dt: S, q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
+        met: bool, w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int,
+        radius: S, dt: S, q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies,
+        grips: Grips,
     ):  # fmt: skip
         tick = grips.tick[w] + 1
         clock = S(tick) * dt
         if clock > grips.lower_start[w] and clock < grips.lower_end[w]:
-            if reached(
+            if met or reached(
                 w, lane, p0, b0, first, last, start, n, radius, q, pairs, shapes, near, bodies,
                 grips,
             ):  # fmt: skip

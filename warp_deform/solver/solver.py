@@ -13,7 +13,7 @@ from newton.solvers import SolverBase
 from ..errors import InputError
 from ..objects.attributes import NAMESPACE, register_attributes
 from .config import SolverConfig
-from .data import KERNEL_ARGUMENTS, SolverData
+from .data import SolverData
 from .forward import forward_kernel
 from .guards import PhysicsError, Problem, WatchValues
 
@@ -31,12 +31,13 @@ class SolverFusedXPBD(SolverBase):
     2020.
 
     Simulates particles joined by springs (two-sided, minimum, maximum, strain-limited), contact and
-    friction between particles, with the table z = 0 and with rigid bodies made of boxes, and grips.
+    friction between particles, with triangles, with the table z = 0 and with rigid bodies made of
+    boxes, and grips.
     Worlds of equal topology share lanes; mixed models are grouped by topology.
 
-    Limitations: no joints, no triangles, no shapes other than boxes; the only ground is z = 0;
-    `Contacts` are ignored, contacts are found in the kernel. The state in `newton.State` is float32
-    whatever the solver's precision.
+    Limitations: no joints, no shapes other than boxes; the only ground is z = 0; `Contacts` are
+    ignored, contacts are found in the kernel. The state in `newton.State` is float32 whatever the
+    solver's precision.
 
     Example:
         builder = newton.ModelBuilder()
@@ -77,7 +78,13 @@ class SolverFusedXPBD(SolverBase):
         )
         self.bundles = bundles
         self.bundle: Path | None = None
-        self._kernel = forward_kernel(scalars[precision], lanes, bool(self.data.has_bodies))
+        self._kernel = forward_kernel(
+            scalars[precision],
+            lanes,
+            bool(self.data.has_bodies),
+            self.data.has_sheets,
+            self.data.has_edges,
+        )
         self._launch: Any = None
         self._gravity()
         # padded lanes divide by their stiffness as well
@@ -241,7 +248,7 @@ class SolverFusedXPBD(SolverBase):
             self._launch = wp.launch(
                 self._kernel,
                 dim=self.data.group_count,
-                inputs=[settings, *(self.data.struct(name) for name in KERNEL_ARGUMENTS)],
+                inputs=[settings, *self.data.structs()],
                 device=self.model.device,
                 record_cmd=True,
             )

@@ -60,6 +60,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         length: wp.array(dtype=S)  # [m]
         compliance: wp.array(dtype=S)  # [m/N]
         limit: wp.array(dtype=S)  # longest allowed length [m]; 0: none
+        floor: wp.array(dtype=S)  # shortest allowed length [m]; 0: none
         mode: wp.array(dtype=int)
         middle: wp.array(dtype=int)  # of a bending spring: the particle between the two
 
@@ -118,6 +119,55 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
 
         pair: wp.array(dtype=int)
         mask: wp.array(dtype=V)  # 1 where the pair is listed for the lane's own sake
+
+    @wp.struct
+    class Sheets:
+        """Triangles of fabrics, numbered inside their world, and their particles at rest.
+
+        Per topology: first (topologies + 1,), grid, cell, widest. Per particle as
+        `Topology.radius`: skin, rest, owner, exclusion.
+        """
+
+        first: wp.array(dtype=int)
+        grid: wp.array(dtype=int)  # cells of the list along a side
+        cell: wp.array(dtype=S)  # least side of a cell [m]
+        widest: wp.array(dtype=S)  # largest skin [m]
+        triangle: wp.array(dtype=wp.vec3i)
+        friction: wp.array(dtype=S)  # of a triangle, factor on the contact friction
+        skin: wp.array(dtype=S)  # a particle's share of the distance at which things touch [m]
+        rest: wp.array(dtype=R3)  # [m]
+        owner: wp.array(dtype=int)  # number of the object
+        exclusion: wp.array(dtype=S)  # no self-contact closer than this in the rest shape [m]
+        edge_first: wp.array(dtype=int)  # per topology, as `first`
+        edge: wp.array(dtype=wp.vec2i)
+        edge_gap: wp.array(dtype=S)  # per particle: distance at which its edges touch others [m]
+
+    @wp.struct
+    class Cells:
+        """Particles near triangles, per group and lane, and the cells that find them."""
+
+        head_start: wp.array(dtype=int)
+        list_start: wp.array(dtype=int)
+        capacity: wp.array(dtype=int)  # pairs of one lane at most
+        head: wp.array(dtype=int)  # first particle of a cell or -1
+        next: wp.array(dtype=int)  # the particle after this one in its cell or -1
+        count: wp.array(dtype=int)  # pairs, by group * L + lane
+        particle: wp.array(dtype=int)
+        face: wp.array(dtype=int)
+        gap: wp.array(dtype=S)  # distance at which they touch, negative below the triangle [m]
+        link_start: wp.array(dtype=int)
+        edge_next: wp.array(dtype=int)  # the edge after this one in its cell or -1
+        edge_count: wp.array(dtype=int)  # pairs of edges, as `count`
+        edge_a: wp.array(dtype=int)
+        edge_b: wp.array(dtype=int)
+        edge_gap: wp.array(dtype=S)  # as `gap`
+        met: wp.array(dtype=int)  # whether what the grip holds touched a triangle, as `count`
+        xr: wp.array(dtype=V3)  # positions at the last listing
+        # the same memory as arrays of V3 and V, scalar by scalar (see `lane_access`)
+        xr_flat: wp.array(dtype=S)
+        x: wp.array(dtype=S)
+        xp: wp.array(dtype=S)
+        w: wp.array(dtype=S)
 
     @wp.struct
     class Bodies:
@@ -193,5 +243,5 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
     return SimpleNamespace(
         **vars(t), Settings=Settings, Topology=Topology, Springs=Springs, Pairs=Pairs,
         Shapes=Shapes, Group=Group, Particles=Particles, Near=Near, Bodies=Bodies, Grips=Grips,
-        Watch=Watch, Contacts=Contacts,
+        Watch=Watch, Contacts=Contacts, Sheets=Sheets, Cells=Cells,
     )  # fmt: skip

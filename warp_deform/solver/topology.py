@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..objects.attributes import NAMESPACE, SpringMode
+from .sheets import Sheets
 
 __all__ = ["WorldTopology", "read_worlds"]
 
@@ -22,18 +23,24 @@ class WorldTopology:
     """One world as the solver sees it; all indices are local to the world.
 
     spring_ij (S, 2); spring_length (S,) [m]; spring_compliance (S,) [m/N]; spring_limit (S,) [m];
-    spring_mode (S,); spring_middle (S,): third particle of a bending spring, else -1
+    spring_floor (S,) [m]; spring_mode (S,)
+    spring_middle (S,): third particle of a bending spring, else -1
     pair_ij (C, 2), pair_distance (C,) [m]: particles that may collide
     particle_radius (P,) [m]
     shape_body (K,); shape_center (K, 3) relative to the centre of mass; shape_rotation (K, 4) xyzw;
     shape_half (K, 3) [m]; shape_friction (K,)
     body_com (B, 3): centre of mass in the body's frame [m]
+    sheet_triangle (T, 3), sheet_friction (T,); where there are triangles, for every particle:
+    sheet_skin (P,) [m], sheet_rest (P, 3) [m], sheet_owner (P,), sheet_exclusion (P,) [m],
+    sheet_edge_gap (P,) [m]; sheet_edge (E, 2): edges that meet each other;
+    sheet_cell: least side of a cell of their contact list [m]
     """
 
     spring_ij: np.ndarray
     spring_length: np.ndarray
     spring_compliance: np.ndarray
     spring_limit: np.ndarray
+    spring_floor: np.ndarray
     spring_mode: np.ndarray
     spring_middle: np.ndarray
     pair_ij: np.ndarray
@@ -45,6 +52,15 @@ class WorldTopology:
     shape_half: np.ndarray
     shape_friction: np.ndarray
     body_com: np.ndarray
+    sheet_triangle: np.ndarray
+    sheet_friction: np.ndarray
+    sheet_skin: np.ndarray
+    sheet_rest: np.ndarray
+    sheet_owner: np.ndarray
+    sheet_exclusion: np.ndarray
+    sheet_edge: np.ndarray
+    sheet_edge_gap: np.ndarray
+    sheet_cell: float
 
     @property
     def particle_count(self) -> int:
@@ -92,11 +108,14 @@ def read_worlds(
     )
     springs = _Springs(model, ours)
     shapes = _Shapes(model)
+    sheets = Sheets(model)
     topologies = []
     for ids, body_ids in zip(particles, bodies, strict=True):
         local = np.full(model.particle_count + 1, -1)
         local[ids] = np.arange(len(ids))
-        pair_ij, pair_distance = _pairs(ids, ours, radius) if len(ids) else _no_pairs()
+        sheet = sheets.of(ids, local)
+        fabric = sheet["sheet_triangle"]
+        pair_ij, pair_distance = _pairs(ids, ours, radius, fabric) if len(ids) else _no_pairs()
         topologies.append(
             WorldTopology(
                 **springs.of(ids, local),
@@ -105,6 +124,7 @@ def read_worlds(
                 particle_radius=radius[ids],
                 **shapes.of(body_ids),
                 body_com=model.body_com.numpy()[body_ids] if len(body_ids) else np.zeros((0, 3)),
+                **sheet,
             )
         )
     return topologies, particles, bodies
@@ -113,7 +133,7 @@ def read_worlds(
 def _refuse_unsupported(model: newton.Model) -> None:
     """Raise for content that would otherwise be left out without a word."""
     for what, amount in (
-        ("tetrahedra", model.tet_count), ("triangles", model.tri_count),
+        ("tetrahedra", model.tet_count),
         ("bending edges", model.edge_count), ("muscles", model.muscle_count),
         ("tendons", model.tendon_count),
         ("particles attached to bodies", model.attachment_particle_body_count),
@@ -155,6 +175,7 @@ class _Springs:
             self.length = model.spring_rest_length.numpy()
             self.compliance = 1.0 / model.spring_stiffness.numpy()
             self.limit = ours.spring_limit.numpy() * self.length  # type: ignore[attr-defined]
+            self.floor = ours.spring_floor.numpy() * self.length  # type: ignore[attr-defined]
             self.mode = ours.spring_mode.numpy()  # type: ignore[attr-defined]
             middle = ours.spring_middle.numpy()  # type: ignore[attr-defined]
             self.middle = np.where(self.mode == int(SpringMode.BEND), middle, -1)
@@ -164,7 +185,8 @@ class _Springs:
             empty = np.zeros(0)
             return {
                 "spring_ij": np.zeros((0, 2), int), "spring_length": empty,
-                "spring_compliance": empty, "spring_limit": empty, "spring_mode": empty.astype(int),
+                "spring_compliance": empty, "spring_limit": empty, "spring_floor": empty,
+                "spring_mode": empty.astype(int),
                 "spring_middle": empty.astype(int),
             }  # fmt: skip
         mine = np.isin(self.ij[:, 0], ids)
@@ -174,6 +196,7 @@ class _Springs:
         return {
             "spring_ij": local[self.ij[mine]], "spring_length": self.length[mine],
             "spring_compliance": self.compliance[mine], "spring_limit": self.limit[mine],
+            "spring_floor": self.floor[mine],
             "spring_mode": self.mode[mine], "spring_middle": local[self.middle[mine]],
         }  # fmt: skip
 
@@ -208,13 +231,20 @@ def _no_pairs() -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((0, 2), int), np.zeros(0)
 
 
-def _pairs(ids: np.ndarray, ours: object, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs i < j that may collide: of different objects, or far enough apart in the rest shape."""
+def _pairs(
+    ids: np.ndarray, ours: object, radius: np.ndarray, fabric: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs i < j that may collide: of different objects, or far enough apart in the rest shape.
+
+    Corners of the triangles `fabric` are left out: particles meet the triangles instead.
+    """
     i, j = np.triu_indices(len(ids), 1)
     owner = ours.particle_object.numpy()[ids]  # type: ignore[attr-defined]
     rest = ours.particle_rest.numpy()[ids]  # type: ignore[attr-defined]
     exclusion = ours.particle_exclusion.numpy()[ids]  # type: ignore[attr-defined]
     apart = np.linalg.norm(rest[i] - rest[j], axis=1) > np.minimum(exclusion[i], exclusion[j])
-    keep = (owner[i] != owner[j]) | apart
+    free = np.ones(len(ids), bool)
+    free[fabric.ravel()] = False
+    keep = ((owner[i] != owner[j]) | apart) & free[i] & free[j]
     pairs = np.column_stack([i, j])[keep]
     return pairs, radius[ids][pairs].sum(axis=1)

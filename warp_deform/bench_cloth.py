@@ -1,0 +1,109 @@
+"""What a simulated second of folding a fabric costs: settling, one fold, and lying folded.
+
+Process CPU time, kernels compiled before. Every world folds another way. There is no peer: other
+engines' fabrics are made of other springs and other contacts.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import newton
+import numpy as np
+
+from .errors import InputError
+from .objects.cloth import ClothConfig, add_cloth, cloth_sheet
+from .rollout import GripPath, rollout
+from .solver.solver import SolverFusedXPBD
+from .tasks.cloth_physics import CLOTH_SOLVER
+
+__all__ = ["CLOTH_SCENES", "run_cloth"]
+
+CLOTH_SCENES = {"cloth10": 10, "cloth25": 25}
+"""Rows and columns of the sheet of each scene; its side is 0.2 m."""
+
+_MOST_WORLDS = 16  # a launch of more would take minutes
+_DROP = 0.03  # [m]
+_SETTLE, _FOLD, _LIE = 0.8, 1.3, 1.2  # [s]
+
+
+def run_cloth(*, scene: str, lanes: int = 8, worlds: int = 8, repeats: int = 3) -> dict[str, Any]:
+    """Time `scene` ("cloth10" or "cloth25"); returns what `bench.run` does, without a peer.
+
+    `ms_per_sim_second` is the mean over all of it, `rest_ms_per_sim_second` that of lying folded.
+
+    Raises:
+        InputError: no such scene.
+    """
+    if scene not in CLOTH_SCENES:
+        raise InputError(f"no scene {scene!r} to time; choose from {', '.join(CLOTH_SCENES)}")
+    config = ClothConfig(rows=CLOTH_SCENES[scene], columns=CLOTH_SCENES[scene])
+    worlds = min(worlds, _MOST_WORLDS)
+    begin = time.process_time()
+    lone, many = _solver(config, 1, 1), _solver(config, worlds, lanes)
+    for solver in (lone, many):
+        solver.run(20)
+    start_up = time.process_time() - begin
+    alone = [_play(lone, [seed]) for seed in range(repeats)]
+    together = [_play(many, list(range(worlds))) for _ in range(repeats)]
+    same = all(
+        np.array_equal(end, together[0][3][seed])
+        for seed, (_, _, _, (end,)) in enumerate(alone[:worlds])
+    )
+    return {
+        "scene": scene,
+        **_percentiles("ms_per_sim_second", [t[0] for t in alone], 1),
+        **_percentiles("rest_ms_per_sim_second", [t[1] for t in alone], 1),
+        **_percentiles("ms_per_sim_second_lanes", [t[0] for t in together], worlds),
+        **_percentiles("rest_ms_per_sim_second_lanes", [t[1] for t in together], worlds),
+        "lanes": lanes,
+        "worlds": worlds,
+        "dt": lone.config.dt,
+        "substeps": round(1 / 60 / lone.config.dt),
+        "particles": int(lone.model.particle_count),
+        "stretch": max(t[2] for t in alone),
+        "same_bits": same,
+        "start_up_seconds": start_up,
+    }
+
+
+def _solver(config: ClothConfig, worlds: int, lanes: int) -> SolverFusedXPBD:
+    one, builder = newton.ModelBuilder(), newton.ModelBuilder()
+    for part in (one, builder):
+        SolverFusedXPBD.register_custom_attributes(part)
+    add_cloth(one, config, cloth_sheet(config, (0.5, 0.0), height=_DROP))
+    builder.replicate(one, worlds)
+    return SolverFusedXPBD(builder.finalize(device="cpu"), CLOTH_SOLVER, lanes=lanes)
+
+
+def _play(
+    solver: SolverFusedXPBD, seeds: list[int]
+) -> tuple[float, float, float, list[np.ndarray]]:
+    """CPU ms per simulated second in all and lying folded, the largest stretch, and the ends."""
+    data = solver.data
+    data.reset()
+    worlds = range(len(seeds))
+    begin = time.process_time()
+    done = [rollout(solver, worlds, least=_SETTLE, most=_SETTLE)]
+    paths = {}
+    for w, seed in enumerate(seeds):
+        way = np.random.default_rng(seed).uniform(0.08, 0.16, 2)
+        start = data.lane("particles.x", w)[0].astype(float)
+        knots = start + np.array([[0, 0, 0], [0, 0, 0.08], [*way, 0.08], [*way, 0.01]])
+        paths[w] = GripPath(np.array([0, 0.3, 1.0, _FOLD]), knots, particle=0)
+    done.append(rollout(solver, worlds, paths=paths, most=_FOLD))
+    middle = time.process_time()
+    done.append(rollout(solver, worlds, least=_LIE, most=_LIE))
+    end = time.process_time()
+    stretch = max(result.watch.stretch for part in done for result in part.values())
+    ends = [data.lane("particles.x", w).copy() for w in worlds]
+    total = _SETTLE + _FOLD + _LIE
+    return 1e3 * (end - begin) / total, 1e3 * (end - middle) / _LIE, stretch, ends
+
+
+def _percentiles(name: str, times: list[float], worlds: int) -> dict[str, float]:
+    return {
+        name: float(np.median(times)) / worlds,
+        f"{name}_p95": float(np.percentile(times, 95)) / worlds,
+    }
