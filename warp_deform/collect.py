@@ -12,20 +12,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .collection import Attempt, Collection, append_attempt, check_seeds
-from .episode_loop import SLOTS, SOLVED, Run, demonstrate, play, worlds_for
-from .episodes import EpisodeReader, EpisodeWriter, Goal, Step, combine_hashes, rebuild_index
+from .episode_loop import SLOTS, SOLVED, demonstrate, play, worlds_for
+from .episodes import EpisodeReader, EpisodeWriter, Goal, combine_hashes, rebuild_index
 from .errors import InputError
 from .goals import load_goals
 from .recording import observe, record, task_config
 from .robots import robot as find_robot
 from .tasks.registry import task as find_task
-from .workers import Workers, stop_if_orphaned, worker_count
-from .worlds import Worlds
+from .workers import Workers, worker_count
 
 __all__ = ["CollectConfig", "CollectReport", "collect"]
 
@@ -200,15 +198,11 @@ def attempt_chunk(chunk: _Chunk) -> Iterator[Attempt]:
     writer = EpisodeWriter(config.out, overwrite=True)  # by the same episode, if at all
     goals = [] if config.goals is None else load_goals(config.goals)
 
-    def act(worlds: Worlds, runs: Mapping[int, Run[Step]]) -> Mapping[int, np.ndarray | None]:
-        stop_if_orphaned()
-        return demonstrate(worlds, runs)
-
     def goal(seed: int) -> Goal | None:
         return goals[seed % len(goals)] if goals else None
 
     worlds = worlds_for(config.task, config.robot)
-    for slot, run in play(worlds, chunk.seeds, act=act, look=observe, goals=goal):
+    for slot, run in play(worlds, chunk.seeds, act=demonstrate, look=observe, goals=goal):
         success = run.ended == SOLVED
         if success:
             writer.write(record(worlds, slot, run, demonstrator=config.demonstrator))

@@ -15,7 +15,7 @@ from .episodes import Episode, EpisodeReader, Goal, Step, cpu_fingerprint, versi
 from .errors import InputError
 from .goals import CONSTRUCTED, at_goal
 from .tasks.registry import task as find_task
-from .workers import Workers, stop_if_orphaned, worker_count
+from .workers import Workers, worker_count
 from .worlds import Worlds
 
 __all__ = ["Recording", "verify"]
@@ -93,7 +93,6 @@ class Recording:
 
     def act(self, worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, np.ndarray | None]:
         """The recorded actions, one after the other."""
-        stop_if_orphaned()
         return {
             slot: self._episode(run.seed).steps[len(run.actions)].action
             for slot, run in runs.items()

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import threading
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import joblib
@@ -14,7 +18,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from .errors import InputError, WarpDeformError
 from .quiet import quiet_warp
 
-__all__ = ["Workers", "single_threaded", "stop_if_orphaned", "worker_count"]
+__all__ = ["Workers", "single_threaded", "worker_count"]
 
 Chunk = TypeVar("Chunk")
 Result = TypeVar("Result")
@@ -23,6 +27,7 @@ LEAST_EPISODES = 64
 """A process takes seconds to start: by default each gets at least so many episodes."""
 
 _CONNECT_SECONDS = 5.0
+_LOOK_SECONDS = 0.5
 
 
 def worker_count(asked: int | None, episodes: int) -> int:
@@ -80,12 +85,12 @@ class Workers:
     def __enter__(self) -> Workers:
         """Let the processes start and import while the caller does something else."""
         if self.apart and not self._ray:
-            self._starting = self._loky()(joblib.delayed(_import)() for _ in range(self.count))
+            self._starting = self._loky(joblib.delayed(_import)() for _ in range(self.count))
         return self
 
     def __exit__(self, *error: object) -> None:
         if self._starting is not None:
-            self._starting.close()
+            _close(self._starting)
 
     def run(
         self, function: Callable[[Chunk], Iterable[Result]], chunks: Sequence[Chunk]
@@ -100,16 +105,19 @@ class Workers:
                 for chunk in chunks:
                     yield from function(chunk)
             return
-        owner = None if self._ray else os.getpid()
-        calls = (joblib.delayed(_call)(function, chunk, owner) for chunk in chunks)
+        calls = (joblib.delayed(_call)(function, chunk) for chunk in chunks)
         try:
             if self._starting is not None:
                 for _ in self._starting:
                     pass
                 self._starting = None
             if not self._ray:
-                for results in self._loky()(calls):
-                    yield from results
+                done = self._loky(calls)
+                try:
+                    for results in done:
+                        yield from results
+                finally:
+                    _close(done)
                 return
             with joblib.parallel_config(backend="ray", n_jobs=self.count):
                 for results in joblib.Parallel(batch_size=1)(calls):
@@ -120,23 +128,42 @@ class Workers:
                 "kept: run the same command again to go on, with fewer --workers"
             ) from error
 
-    def _loky(self) -> joblib.Parallel:
-        return joblib.Parallel(
-            n_jobs=self.count, backend="loky", batch_size=1, return_as="generator_unordered"
+    def _loky(self, calls: Iterable[Any]) -> Generator[Any, None, None]:
+        parallel = joblib.Parallel(
+            n_jobs=self.count,
+            backend="loky",
+            batch_size=1,
+            return_as="generator_unordered",
+            initializer=_serve,
+            initargs=(os.getpid(),),
         )
+        # Ctrl-C reaches every process of a terminal. Workers, which inherit this mask, leave it to
+        # their owner, also while they still import; to this process it comes when they have begun.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            done: Generator[Any, None, None] = parallel(calls)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        return done
 
 
-def stop_if_orphaned() -> None:
-    """End a worker process whose owner was killed: nobody waits for its results any more.
-
-    At once, without cleaning up, as the owner ended; files appear whole or not at all.
-    """
-    if _owner is not None and os.getppid() != _owner:
-        os._exit(1)
+def _close(results: Generator[Any, None, None]) -> None:
+    """End what still runs, without joblib's warning that results are left behind."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        results.close()
 
 
-_owner: int | None = None
-"""The process that this one works for, if that one started it."""
+def _serve(owner: int) -> None:
+    """Work in this process as long as the one that started it lives, even if that is killed."""
+    threading.Thread(target=_leave_with, args=(owner,), daemon=True).start()
+
+
+def _leave_with(owner: int) -> None:
+    """End this process when `owner` has: at once, for files appear whole or not at all."""
+    while os.getppid() == owner:
+        time.sleep(_LOOK_SECONDS)
+    os._exit(1)
 
 
 def _import() -> None:
@@ -148,11 +175,7 @@ def _import() -> None:
     quiet_warp()
 
 
-def _call(
-    function: Callable[[Chunk], Iterable[Result]], chunk: Chunk, owner: int | None
-) -> list[Result]:
-    global _owner
-    _owner = owner
+def _call(function: Callable[[Chunk], Iterable[Result]], chunk: Chunk) -> list[Result]:
     quiet_warp()
     with single_threaded():
         return list(function(chunk))
