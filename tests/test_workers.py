@@ -29,10 +29,8 @@ def gone(pid: int) -> bool:
         return True
 
 
-def test_idle_workers_end_with_an_owner_that_was_killed(tmp_path: Path) -> None:
-    script = tmp_path / "waiting.py"
-    script.write_text(WAITING)
-    owner = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+def test_idle_workers_end_with_an_owner_that_was_killed() -> None:
+    owner = subprocess.Popen([sys.executable, "-c", WAITING], stdout=subprocess.PIPE, text=True)
     assert owner.stdout is not None
     pids = {int(pid) for pid in owner.stdout.readline().split()} - {owner.pid}
     assert pids and not any(map(gone, pids))
@@ -51,6 +49,8 @@ def test_an_interrupted_start_is_one_line(tmp_path: Path) -> None:
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # a test runner in the background ignores Ctrl-C, and would hand that on
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     until = time.monotonic() + 120
     while not (tmp_path / "attempts.jsonl").exists():  # from now on workers are started

@@ -10,6 +10,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 import joblib
@@ -139,6 +140,7 @@ class Workers:
         )
         # Ctrl-C reaches every process of a terminal. Workers, which inherit this mask, leave it to
         # their owner, also while they still import; to this process it comes when they have begun.
+        resource_tracker.ensure_running()  # it would lift the mask
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             done: Generator[Any, None, None] = parallel(calls)
