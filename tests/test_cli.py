@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -258,3 +260,20 @@ def test_doctor_finds_a_package_that_hides_ours(
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     assert any("hardware" in line for line in doctor.report()["warnings"])
+
+
+@pytest.mark.parametrize(("closed", "code"), [(">&-", 0), ("<&- >&- 2>&-", 0), (">/dev/full", 1)])
+def test_streams_that_take_nothing(closed: str, code: int) -> None:
+    command = f"{sys.executable} -m warp_deform list {closed}"
+    run = subprocess.run(["sh", "-c", command], capture_output=True, text=True)
+    said = "warp-deform: [Errno 28] No space left on device\n" if code else ""
+    assert (run.returncode, run.stdout, run.stderr) == (code, "", said)
+
+
+def test_a_home_that_cannot_be_written_to_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    environment = {"HOME": str(tmp_path / "file"), "PATH": os.environ["PATH"]}
+    command = [sys.executable, "-m", "warp_deform", "doctor"]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (run.returncode, run.stdout) == (1, "")
+    assert single_line(run.stderr) and "WARP_CACHE_PATH" in run.stderr

@@ -27,7 +27,7 @@ from warp_deform.episodes import (
     read_index,
     rebuild_index,
 )
-from warp_deform.errors import InputError
+from warp_deform.errors import InputError, WarpDeformError
 
 # Half a unit, and the rounding of float32 at 0.65 m.
 HEIGHT_TOLERANCE = 0.5 * HEIGHT_UNIT + 3e-8
@@ -86,7 +86,7 @@ def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monke
 
     writer = EpisodeWriter(tmp_path)
     monkeypatch.setattr(os, "fsync", disk_full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(WarpDeformError, match="No space left"):
         writer.write(make_episode())
     assert os.listdir(tmp_path) == []
 

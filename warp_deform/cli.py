@@ -73,6 +73,7 @@ class Outcome:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with the arguments `argv` (default: the process's); returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    _open_closed_streams()
     try:
         return _dispatch(arguments)
     except InputError as error:
@@ -82,11 +83,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _complain("interrupted; episodes already written are complete", code=130)
     except BrokenPipeError:
-        # The reader went away (`| head`): nothing is left to tell it, also not at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_stdout()  # the reader went away (`| head`)
         return 1
     except OSError as error:
-        return _complain(error, code=1)
+        code = _complain(error, code=1)
+        try:
+            sys.stdout.flush()
+        except OSError:  # stdout itself is a file on a full disk
+            _discard_stdout()
+        return code
+
+
+def _open_closed_streams() -> None:
+    """Where the caller closed stdin, stdout or stderr (`>&-`), read and write nothing instead.
+
+    A file that is opened later would get the stream's number and then what is printed.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    sys.stdout = sys.stdout or open(1, "w", closefd=False)
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)
+
+
+def _discard_stdout() -> None:
+    """Let what is still to be printed go nowhere, so that Python does not complain at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _dispatch(arguments: list[str]) -> int:

@@ -6,6 +6,8 @@ import os
 import sys
 import tempfile
 
+from .errors import WarpDeformError
+
 __all__ = ["quiet_warp"]
 
 _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
@@ -17,6 +19,9 @@ def quiet_warp() -> None:
     Left out are its greeting, its notes on compiled modules, and that there is no CUDA driver: no
     news on a laptop, but its native code says so in every process, whatever the log level.
     `warp-deform doctor` tells which devices there are.
+
+    Raises:
+        WarpDeformError: Warp cannot make the folder in which it keeps compiled kernels.
     """
     import warp
 
@@ -27,6 +32,11 @@ def quiet_warp() -> None:
         os.dup2(said.fileno(), 2)
         try:
             warp.init()
+        except OSError as error:
+            raise WarpDeformError(
+                f"Warp cannot start: {error}; it keeps compiled kernels in a folder that it "
+                "must be able to write to: set WARP_CACHE_PATH to one"
+            ) from error
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)

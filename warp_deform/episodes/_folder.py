@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
+from ..errors import InputError, WarpDeformError
 from ._provenance import combine_hashes
 from ._records import MAX_SEED, Episode, EpisodeInfo, Goal, Step
 
@@ -263,6 +263,10 @@ def _publish(path: Path, data: bytes, *, overwrite: bool) -> None:
             _link(temporary, path)
     except FileExistsError as error:
         raise InputError(refused) from error
+    except OSError as error:
+        raise WarpDeformError(
+            f"{path} cannot be written: {error.strerror}; what is complete is kept"
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
     _sync_folder(path.parent)
