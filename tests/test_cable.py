@@ -1,5 +1,7 @@
 """Cables as objects: what their springs do, and what is refused."""
 
+import math
+
 import newton
 import numpy as np
 import pytest
@@ -57,6 +59,9 @@ def test_a_ring_with_bending_springs_is_at_rest_when_round() -> None:
     ("change", "named"),
     [
         ({"beads": 2}, "3 beads"),
+        ({"beads": 24.5}, "whole number"),
+        ({"mass": math.inf}, "mass"),
+        ({"radius": math.nan}, "radius"),
         ({"spacing": 0.0}, "spacing"),
         ({"fold_limit": 2.0}, "fold_limit"),
         ({"bend_stiffness": -1.0}, "bend_stiffness"),

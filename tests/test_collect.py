@@ -204,6 +204,7 @@ def test_two_owners_are_one_too_many(tmp_path: Path) -> None:
         ({"episodes": 0}, "episodes is 0"),
         ({"seed": -1}, "the seed is -1; it must be 0 to"),
         ({"workers": 0}, "workers is 0"),
+        ({"workers": 100_000}, "workers is 100000, more than"),
         ({"robot": "r2d2"}, "ur5, panda"),
         ({"video": Path("film.avi")}, "must end with"),
     ],

@@ -211,6 +211,8 @@ def test_a_model_without_our_attributes_is_refused():
         lambda: CableConfig(fold_limit=2.0),
         lambda: RingConfig(mass=-1.0),
         lambda: BoxConfig(mass=0.0),
+        lambda: BoxConfig(mass=float("inf")),
+        lambda: BoxConfig(friction=-1.0),
         lambda: BoxConfig(parts=()),
         lambda: cable_line(SHORT, (0, 0), (0, 0)),
         lambda: add_cable(new_builder(), SHORT, np.zeros((7, 3))),

@@ -27,6 +27,9 @@ Result = TypeVar("Result")
 LEAST_EPISODES = 64
 """A process takes seconds to start: by default each gets at least so many episodes."""
 
+MOST_A_CORE = 8
+"""More processes than this a core are taken for a mistake, which could use up the memory."""
+
 _CONNECT_SECONDS = 5.0
 _LOOK_SECONDS = 0.5
 
@@ -36,6 +39,12 @@ def worker_count(asked: int | None, episodes: int) -> int:
     if asked is not None:
         if asked < 1:
             raise InputError(f"workers is {asked}; it must be 1 or more")
+        cores = int(joblib.cpu_count())
+        if asked > MOST_A_CORE * cores:
+            raise InputError(
+                f"workers is {asked}, more than {MOST_A_CORE} for each of {cores} cores; a process "
+                "takes half a gigabyte, and more than one a core gains nothing"
+            )
         return asked
     return max(1, min(int(joblib.cpu_count()), episodes // LEAST_EPISODES))
 

@@ -6,6 +6,7 @@ placeholder inertia; here it is that of the solid boxes.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -41,10 +42,14 @@ class BoxConfig:
     color: Color = RED
 
     def __post_init__(self) -> None:
-        if not self.parts or any(not s > 0 for part in self.parts for s in part.size):
-            raise InputError("a box needs at least one part, every side longer than 0")
-        if not self.mass > 0:
+        if not self.parts or any(
+            not 0 < side < math.inf for part in self.parts for side in part.size
+        ):
+            raise InputError("a box needs at least one part, every side longer than 0 and finite")
+        if not 0 < self.mass < math.inf:
             raise InputError(f"BoxConfig.mass must be positive, got {self.mass}")
+        if not 0 <= self.friction < math.inf:
+            raise InputError(f"BoxConfig.friction must be 0 or more, got {self.friction}")
 
     @property
     def lowest(self) -> float:

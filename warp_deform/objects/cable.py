@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import zip_longest
+from numbers import Integral
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,13 +58,13 @@ class CableConfig:
     last_color: Color = YELLOW
 
     def __post_init__(self) -> None:
-        if self.beads < 3:
-            raise InputError(f"a cable needs at least 3 beads, got {self.beads}")
+        if not isinstance(self.beads, Integral) or self.beads < 3:
+            raise InputError(f"a cable needs at least 3 beads, a whole number, got {self.beads}")
         for name in ("spacing", "radius", "visual_radius", "mass", "link_stiffness"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"CableConfig.{name} must be positive, got {getattr(self, name)}")
         for name in ("fold_stiffness", "bend_stiffness", "exclusion"):
-            if not getattr(self, name) >= 0:
+            if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"CableConfig.{name} must be 0 or more, got {getattr(self, name)}")
         if not 0 <= self.fold_limit < 2:
             raise InputError(f"CableConfig.fold_limit must be in [0, 2), got {self.fold_limit}")
