@@ -14,6 +14,7 @@ from warp_deform.robots import robot
 from warp_deform.robots.primitive import (
     Grasp,
     PrimitiveConfig,
+    Stage,
     approach,
     carry,
     find_grasp,
@@ -21,6 +22,7 @@ from warp_deform.robots.primitive import (
 )
 
 CONFIG = PrimitiveConfig()
+STAGE = Stage(lift=0.04, speed=0.15)
 CABLE = CableConfig(beads=4)
 LINE = cable_line(CABLE, (0.5, 0.0), (0.6, 0.0))
 REACH = CABLE.visual_radius + CONFIG.tip_radius
@@ -47,7 +49,7 @@ def pick(x: float, y: float, yaw: float = 0.0) -> np.ndarray:
 
 def carry_to(place_yaw: float, *, start_yaw: float = 0.0, place=(0.5, 0.2), floor=0.012):
     action = np.array([0.5, 0.0, start_yaw, *place, place_yaw, 0.04])
-    return carry(action, HELD, 0.15, floor, 0.30, CONFIG)
+    return carry(action, HELD, STAGE, floor, 0.30, CONFIG)
 
 
 def test_the_tip_meets_the_highest_bead_within_its_reach() -> None:
@@ -142,7 +144,7 @@ def test_the_arm_goes_on_from_where_it_is_unless_its_wrist_is_wound_up() -> None
         yaw, place_yaw = rng.uniform(-np.pi, np.pi, 2)
         there = approach(tip, pick(x, y, yaw), 0.2, 0.012, CONFIG)
         action = np.array([x, y, yaw, place_x, place_y, place_yaw, 0.04])
-        onwards, _ = carry(action, HELD, 0.15, 0.012, 0.2, CONFIG)
+        onwards, _ = carry(action, HELD, STAGE, 0.012, 0.2, CONFIG)
         for motion in (there, onwards):
             [q] = solve_joints(arm, [motion], [posture])
             assert q is not None

@@ -97,7 +97,7 @@ def test_a_pushed_bead_follows_newton():
     add_particles(builder, [(0, 0, RADIUS)])
     solver = finalize(builder, ideal(table_friction=0.0, rest_seconds=100.0))
     push = Push(0, np.array([3.0, -1.0, 0.0]), 0.2)
-    rollout(solver, [0], pushes={0: push}, most=0.3)
+    rollout(solver, [0], pushes={0: (push,)}, most=0.3)
     np.testing.assert_allclose(velocities(solver)[0], [0.6, -0.2, 0], atol=1e-6)
     expected = 3.0 * 0.2 * (0.2 + DT) / 2 + 0.6 * 0.1
     assert positions(solver)[0, 0] == pytest.approx(expected, abs=0.6 * DT)

@@ -71,7 +71,7 @@ def play(solver: SolverFusedXPBD, slots: dict[int, int], seconds: float = 0.6) -
             knots = start + np.array([[0, 0, 0], [0.03, 0.01 * seed, 0.02], [0.05, 0, -0.01]])
             paths[slot] = GripPath(np.array([0, 0.1, 0.25]), knots, particle=0, lower=(0.15, 0.25))
         else:
-            pushes[slot] = Push(6, np.array([4.0 * seed, 9.0, 20.0]), 0.05)
+            pushes[slot] = (Push(6, np.array([4.0 * seed, 9.0, 20.0]), 0.05),)
         least[slot] = 0.02 * seed
     most = {slot: seconds * (0.5 + 0.1 * seed) for slot, seed in slots.items()}
     rollout(

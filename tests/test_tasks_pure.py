@@ -120,7 +120,9 @@ def test_same_seed_same_start_and_another_seed_another(cls) -> None:
     for name in ("particle_q", "body_q", "targets"):
         assert np.array_equal(getattr(one, name), getattr(same, name))
     assert not np.array_equal(one.targets, other.targets)
-    assert one.push is None or np.array_equal(one.push.acceleration, same.push.acceleration)
+    assert one.pushes == () or np.array_equal(
+        one.pushes[0].acceleration, same.pushes[0].acceleration
+    )
 
 
 @pytest.mark.parametrize("cls", PURE)
@@ -142,7 +144,7 @@ def test_a_goal_scores_one_and_stands_for_its_targets(cls) -> None:
     item, layout, _ = start(cls, 5)
     goal = item.goal_layout(layout)
     assert goal.calm
-    assert goal.push is None
+    assert goal.pushes == ()
     assert goal.zones == ()
     state = snapshot(goal.particle_q, goal, goal.body_q)
     assert item.solved(layout, state)
@@ -192,7 +194,7 @@ def test_ring_push_is_bounded_and_points_to_the_middle_of_the_table() -> None:
     beads = set()
     for seed in range(300):
         layout = start(CableRing, seed)[1]
-        push = layout.push
+        push = layout.pushes[0]
         beads.add(push.particle)
         force = push.acceleration * CableRing.cable.mass
         assert force[2] == pytest.approx(25)

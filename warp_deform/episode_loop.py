@@ -158,5 +158,5 @@ def _see(
     run.rows.append(look(worlds, slot))
     if until_solved and worlds.solved(slot):
         run.ended = SOLVED
-    elif until_solved and episode.actions >= worlds.task.max_actions:
-        run.ended = f"not solved in {episode.actions} actions"
+    elif until_solved and len(episode.actions) >= worlds.task.max_actions:
+        run.ended = f"not solved in {len(episode.actions)} actions"

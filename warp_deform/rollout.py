@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .errors import InputError
+from .solver.grip import PUSHES
 
 if TYPE_CHECKING:
     from .objects.push import Push
@@ -87,7 +88,7 @@ def rollout(
     worlds: Sequence[int],
     *,
     paths: Mapping[int, GripPath] | None = None,
-    pushes: Mapping[int, Push] | None = None,
+    pushes: Mapping[int, Sequence[Push]] | None = None,
     least: float | Mapping[int, float] = 0.0,
     most: float | Mapping[int, float] = 10.0,
     calm: float | Mapping[int, float] = 0.0,
@@ -110,11 +111,13 @@ def rollout(
     paths = paths or {}
     data.clear_grips()
     _write_paths(solver, paths)
-    for w, push in (pushes or {}).items():
-        slot = data.slot[w]
-        data.views["grips.push"][slot] = push.particle
-        data.views["grips.push_acceleration"][slot] = push.acceleration
-        data.views["grips.push_steps"][slot] = round(push.seconds / dt)
+    for w, kicks in (pushes or {}).items():
+        if len(kicks) > PUSHES:
+            raise InputError(f"{len(kicks)} pushes in world {w}; there may be {PUSHES} at once")
+        for at, push in enumerate(kicks, start=data.slot[w] * PUSHES):
+            data.views["grips.push"][at] = push.particle
+            data.views["grips.push_acceleration"][at] = push.acceleration
+            data.views["grips.push_steps"][at] = round(push.seconds / dt)
     solver.activate(np.asarray(worlds, dtype=int))
     longest = 1
     for w in worlds:

@@ -36,7 +36,8 @@ class RunningEpisode:
     goal: Goal | None
     discarded_starts: int
     sim_seconds: float = 0.0
-    actions: int = 0
+    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+    """Actions so far (T, 7)."""
     problems: tuple[Problem, ...] = ()
     at_rest: bool
     """Whether everything came to rest after the last motion before its time was up."""

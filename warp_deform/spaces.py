@@ -102,7 +102,7 @@ def information(
         "at_rest": bool(episode.at_rest),
         "seed": int(episode.seed),
         "discarded_starts": int(episode.discarded_starts),
-        "actions": int(episode.actions),
+        "actions": len(episode.actions),
         "outcome": outcome.value if outcome is not None else "",
         "stage_rule": stage_rule,
         "ground_truth": worlds.task.ground_truth(episode.layout, episode.snapshot),

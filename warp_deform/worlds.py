@@ -15,7 +15,7 @@ import numpy as np
 from .episodes import Goal, state_hash
 from .errors import InputError, WarpDeformError
 from .objects.box import Box
-from .objects.cable import Cable
+from .objects.scene_object import SceneObject
 from .rendering.drawables import Drawables
 from .rendering.images import Images
 from .rendering.pixels import BOUNDS
@@ -79,7 +79,7 @@ class Worlds:
         self.count = count
         one = newton.ModelBuilder()
         SolverFusedXPBD.register_custom_attributes(one)
-        self.objects: tuple[Cable | Box, ...] = self.task.add_objects(one)
+        self.objects: tuple[SceneObject, ...] = self.task.add_objects(one)
         builder = newton.ModelBuilder()
         SolverFusedXPBD.register_custom_attributes(builder)
         builder.replicate(one, count)
@@ -155,12 +155,13 @@ class Worlds:
             if len(layout.body_q):
                 data.set_bodies(slot, layout.body_q)
         least = {
-            s: l.settle_seconds + (l.push.seconds if l.push else 0.0) for s, l in layouts.items()
+            s: l.settle_seconds + max((push.seconds for push in l.pushes), default=0.0)
+            for s, l in layouts.items()
         }
         results = rollout(
             self.solver,
             list(layouts),
-            pushes={s: l.push for s, l in layouts.items() if l.push},
+            pushes={s: l.pushes for s, l in layouts.items()},
             least=least,
             most={s: seconds + REST_LIMIT for s, seconds in least.items()},
             calm={s: l.settle_seconds if l.calm else 0.0 for s, l in layouts.items()},
@@ -207,7 +208,7 @@ class Worlds:
         points = np.concatenate([snapshot.particle_q[:, :2], snapshot.body_q[:, :2]])
         (x0, x1), (y0, y1) = BOUNDS[:2]
         inside = (points >= (x0, y0)).all() and (points <= (x1, y1)).all()
-        return bool(inside) and not self.task.solved(episode.layout, snapshot)
+        return bool(inside) and self.task.acceptable(episode.layout, snapshot)
 
     # -- acting
 
@@ -229,7 +230,7 @@ class Worlds:
             for run in plan.runs:
                 episode.sim_seconds += run.seconds
                 episode.problems += run.watch.problems(slot, limits)
-            episode.actions += 1
+            episode.actions = np.vstack([episode.actions, plan.action])
             self._look(slot)
             seconds = [run.seconds for run in plan.runs]
             reports[slot] = StepReport(
@@ -328,9 +329,9 @@ class Worlds:
             box = next(o for o in self.objects if isinstance(o, Box) and o.body == grasp.body)
             lowest = snapshot.body_q[box.body, 2] + box.config.lowest
         hover = self.robot.hover_height(action[3], action[4], self.task.primitive.hover)
-        speed = self.task.speed(float(action[6]))
+        stage = self.task.stage_of(float(action[6]))
         floor = grasp.height - float(lowest)
-        return carry(action, grasp, speed, floor, hover, self.task.primitive)
+        return carry(action, grasp, stage, floor, hover, self.task.primitive)
 
     # -- looking
 
@@ -350,8 +351,9 @@ class Worlds:
             return topdown.render(drawables, particle_q, body_q)
 
         episode.snapshot = Snapshot(
-            particle_q, particle_qd, body_q, body_qd, drawables.segments, render
-        )
+            particle_q, particle_qd, body_q, body_qd, drawables.segments, render,
+            self.objects, episode.actions,
+        )  # fmt: skip
 
     def score(self, slot: int) -> float:
         """The task's score of a slot's state; 0 when the physics cannot be trusted."""

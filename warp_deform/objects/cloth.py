@@ -57,6 +57,8 @@ class ClothConfig:
     edge_contact: float = 0.0
     """Distance at which edges touch, as a share of the layers'; 0: edges pass through each other.
     At 0.2 second folds and crumples pierce less, at 1.7 to 2.2 times the cost."""
+    grasp_reach: float = 0.025
+    """A descending tip takes hold of a vertex this near [m], as in the original."""
     friction: float = 1.0
     """Factor on the solver's contact friction for whatever touches the sheet's faces."""
     color: Color = YELLOW
@@ -66,7 +68,7 @@ class ClothConfig:
             raise InputError(
                 f"a cloth needs 2 rows and 2 columns or more, got {self.rows} x {self.columns}"
             )
-        for name in ("side", "mass", "radius", "structural_stiffness"):
+        for name in ("side", "mass", "radius", "structural_stiffness", "grasp_reach"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"ClothConfig.{name} must be positive, got {getattr(self, name)}")
         for name in ("shear_stiffness", "bend_stiffness", "exclusion", "friction"):

@@ -37,8 +37,8 @@ def add_sheet(
     positions: np.ndarray,
     *,
     masses: np.ndarray,
-    radius: float,
-    skin: float,
+    radius: float | np.ndarray,
+    skin: float | np.ndarray,
     edge_gap: float,
     exclusion: float,
     friction: float,
@@ -46,7 +46,8 @@ def add_sheet(
 ) -> tuple[range, range, range]:
     """Add a sheet that is undeformed at `rest` (P, 3) and starts at `positions` (P, 3) [m].
 
-    faces (T, 3); masses (P,) [kg]; skin: half the distance at which layers touch [m]
+    faces (T, 3); masses (P,) [kg]; radius: height of a particle on the table [m]; skin: half the
+    distance at which layers touch [m]; both one number or (P,)
     edge_gap: distance at which edges touch [m], 0: never; exclusion: no self-contact closer than
     this in the rest shape [m]
 
@@ -58,18 +59,19 @@ def add_sheet(
     number = next_object(builder)
     particles = builder.particle_count
     first_spring, first_triangle = builder.spring_count, builder.tri_count
-    for x, mass in zip(rest, masses, strict=True):
+    radii, skins = (np.broadcast_to(value, len(rest)) for value in (radius, skin))
+    for x, mass, height, half in zip(rest, masses, radii, skins, strict=True):
         point = wp.vec3(*(float(v) for v in x))
         builder.add_particle(
             point,
             wp.vec3(0.0, 0.0, 0.0),
             float(mass),
-            radius=radius,
+            radius=float(height),
             custom_attributes={
                 attribute("particle_object"): number,
                 attribute("particle_rest"): point,
                 attribute("particle_exclusion"): exclusion,
-                attribute("particle_skin"): skin,
+                attribute("particle_skin"): float(half),
                 attribute("particle_edge_gap"): edge_gap,
             },
         )

@@ -33,7 +33,7 @@ def time_pybullet(scene: str, *, seconds: float = 1.0, repeats: int = 5) -> Peer
     Raises:
         InputError: PyBullet is not installed, or an argument is out of range.
     """
-    bullet = _import_pybullet()
+    bullet = import_pybullet()
     client = bullet.connect(bullet.DIRECT)
     try:
         bullet.resetSimulation(bullet.RESET_USE_DEFORMABLE_WORLD, physicsClientId=client)
@@ -52,7 +52,7 @@ def time_pybullet(scene: str, *, seconds: float = 1.0, repeats: int = 5) -> Peer
     )
 
 
-def _import_pybullet() -> Any:
+def import_pybullet() -> Any:
     try:
         import pybullet
     except ImportError as error:
@@ -67,7 +67,7 @@ class PyBulletWorld:
     """One scene in a PyBullet client of its own."""
 
     def __init__(self, scene: PeerScene) -> None:
-        self._bullet = bullet = _import_pybullet()
+        self._bullet = bullet = import_pybullet()
         self._client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
         bullet.setPhysicsEngineParameter(enableFileCaching=0, **self._client)
         bullet.resetSimulation(bullet.RESET_USE_DEFORMABLE_WORLD, **self._client)

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..objects.bag import Bag
 from ..objects.box import Box
 from ..objects.cable import Cable
 from ..objects.cloth import Cloth
 from ..objects.colors import TABLE
+from ..objects.scene_object import SceneObject
 from ..objects.zone import Zone
 
 __all__ = ["FIRST_SEGMENT", "WORKSPACE_SEGMENT", "Drawables"]
@@ -57,8 +59,11 @@ class Drawables:
     link_segment: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
 
     @classmethod
-    def of(cls, objects: Sequence[Cable | Box | Cloth | Zone]) -> Drawables:
-        """Drawables of `objects` in creation order; every bead, body, fabric and zone has an id."""
+    def of(cls, objects: Sequence[SceneObject | Zone]) -> Drawables:
+        """Drawables of `objects` in creation order; every bead, body, sheet and zone has an id.
+
+        A bag's shell comes first, then its beads around the opening.
+        """
         spheres: list[tuple[int, float, int]] = []
         links: list[tuple[int, int, float, int]] = []
         boxes: list[tuple[int, tuple[float, ...], tuple[float, ...], int]] = []
@@ -90,11 +95,15 @@ class Drawables:
                     boxes.append((item.body, pose, half, segment))
                 palette[segment] = item.config.color
                 segment += 1
-            elif isinstance(item, Cloth):
+            elif isinstance(item, Cloth | Bag):
                 sheets.append(item.faces)
                 sheet_segments += [segment] * len(item.faces)
                 palette[segment] = item.config.color
                 segment += 1
+                for bead in item.ring if isinstance(item, Bag) else ():
+                    spheres.append((bead, item.config.visual_radius, segment))
+                    palette[segment] = item.config.bead_color
+                    segment += 1
             else:
                 quads.append(item.corners)
                 quad_segments += [segment] * len(item.corners)

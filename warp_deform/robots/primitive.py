@@ -18,15 +18,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..objects.bag import Bag
 from ..objects.box import Box
 from ..objects.cable import Cable
+from ..objects.cloth import Cloth
 from ..rollout import GripPath
 
 if TYPE_CHECKING:
+    from ..objects.scene_object import SceneObject
     from .arm import Robot
 
-__all__ = ["Grasp", "Motion", "Outcome", "PrimitiveConfig", "approach", "carry", "find_grasp",
-           "solve_joints"]  # fmt: skip
+__all__ = ["Grasp", "Motion", "Outcome", "PrimitiveConfig", "Stage", "approach", "carry",
+           "find_grasp", "solve_joints"]  # fmt: skip
+
+
+BEAD_FIRST = 0.006
+"""A bead that a descending tip meets so little below a vertex of the shell is taken instead [m]."""
 
 
 class Outcome(StrEnum):
@@ -53,12 +60,28 @@ class PrimitiveConfig:
     """Fastest turn about the tip's axis [rad/s]; the last joints do 3.1 (UR5) and 2.6 (Panda)."""
     dwell: float = 0.2
     """Wait between lowering and letting go [s]; without it a dragged bead hops when released."""
+    sheet_release: float = 0.0
+    """Height above the table at which a vertex of a fabric or a bag is let go [m]."""
     tip_radius: float = 0.001
     """Radius of the suction tip [m]."""
     spacing: float = 0.10
     """Largest distance between joint way-points along a straight line [m]."""
     turn_spacing: float = 0.5
     """Largest turn between them [rad]."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """How high the tip carries what it holds [m], and how fast [m/s].
+
+    lower_speed: of the descent over the place point [m/s]; None: as fast as it carries
+    pause: rest after lifting and before lowering [s], in which what hangs from the tip calms
+    """
+
+    lift: float
+    speed: float
+    lower_speed: float | None = None
+    pause: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +96,8 @@ class Grasp:
     turn: np.ndarray
     particle: int | None = None
     body: int | None = None
+    sheet: bool = False
+    """Whether the particle is a vertex of a fabric or a bag."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +115,7 @@ class Motion:
 
 def find_grasp(
     xy_yaw: np.ndarray,
-    objects: Sequence[Cable | Box],
+    objects: Sequence[SceneObject],
     particle_q: np.ndarray,
     body_q: np.ndarray,
     config: PrimitiveConfig,
@@ -98,7 +123,8 @@ def find_grasp(
     """What a tip that descends at x, y (with a yaw) meets first above the table, or None.
 
     Beads count with their visual radius: the paper's beads are 1 cm cubes, whose corners reach as
-    far. particle_q (P, 3); body_q (B, 7).
+    far. Fabrics and bags are taken by the vertex that first comes within the `grasp_reach` of their
+    config, as the original's suction does. particle_q (P, 3); body_q (B, 7).
     """
     x, y, yaw = xy_yaw
     best: tuple[float, int | None, int | None] | None = None
@@ -112,6 +138,10 @@ def find_grasp(
             i = int(np.argmax(tops))
             if np.isfinite(tops[i]) and (best is None or tops[i] > best[0]):
                 best = float(tops[i]), item.particles.start + i, None
+        elif isinstance(item, Cloth | Bag):
+            met = _sheet_vertex(x, y, item, particle_q)
+            if met is not None and (best is None or met[0] > best[0]):
+                best = *met, None
         else:
             top = _box_top(x, y, item, body_q[item.body])
             if top is not None and (best is None or top > best[0]):
@@ -123,7 +153,8 @@ def find_grasp(
     back = _yaw_quat(-yaw)
     if particle is not None:
         offset = _rotate(back, particle_q[particle] - tip)
-        return Grasp(height, offset, _yaw_quat(0.0), particle=particle)
+        sheet = any(isinstance(o, Cloth | Bag) and particle in o.particles for o in objects)
+        return Grasp(height, offset, _yaw_quat(0.0), particle=particle, sheet=sheet)
     assert body is not None
     com = next(o for o in objects if isinstance(o, Box) and o.body == body).config.inertia()[0]
     centre = body_q[body, :3] + _rotate(body_q[body, 3:], com)
@@ -147,28 +178,34 @@ def approach(
 def carry(
     action: np.ndarray,
     grasp: Grasp,
-    speed: float,
+    stage: Stage,
     floor: float,
     hover: float,
     config: PrimitiveConfig,
 ) -> tuple[Motion, GripPath]:
     """Lift, carry and lower what `grasp` holds, then wait; the path for the solver, and the tip's.
 
+    stage: speeds and pauses
     floor: lowest height of the tip over the place point [m], where what is held rests on the table
-    The retreat to `hover` follows the release and is in the motion only.
+    A bead or a body is lowered until it meets something, a vertex of a fabric or a bag to a fixed
+    height: it hangs on what it would meet. The retreat to `hover` follows the release and is in the
+    motion only.
     """
     pick, place, lift = action[:3], action[3:6], float(action[6])
     yaw = pick[2] + _half_turn(place[2] - pick[2])
-    bottom = min(floor, lift)
+    bottom = min(floor + (config.sheet_release if grasp.sheet else 0.0), lift)
     points = [
         np.array([pick[0], pick[1], grasp.height, pick[2]]),
         np.array([pick[0], pick[1], lift, pick[2]]),
         np.array([place[0], place[1], lift, yaw]),
         np.array([place[0], place[1], bottom, yaw]),
     ]
-    loaded = _straight(points, speed, config)
+    up = _straight(points[:2], stage.speed, config)
+    across = _straight(points[1:3], stage.speed, config)
+    down = _straight(points[2:], stage.lower_speed or stage.speed, config)
+    loaded = _joined([up, across, down], stage.pause)
     lowered = loaded.seconds
-    lower = _straight(points[:-1], speed, config).seconds, lowered
+    lower = lowered - down.seconds, lowered
     times = np.append(loaded.times, lowered + config.dwell)
     way_points = np.vstack([loaded.way_points, loaded.way_points[-1]])
     path = GripPath(
@@ -179,7 +216,7 @@ def carry(
         body=grasp.body,
         offset=grasp.offset,
         turn=grasp.turn,
-        lower=lower,
+        lower=None if grasp.sheet else lower,
     )
     above = np.array([place[0], place[1], hover, yaw])
     retreat = abs(hover - bottom) / config.unloaded_speed
@@ -217,9 +254,52 @@ def _straight(points: Sequence[np.ndarray], speed: float, config: PrimitiveConfi
     return Motion(np.array(times), np.array(way_points))
 
 
+def _joined(motions: Sequence[Motion], pause: float) -> Motion:
+    """One after the other, at rest for `pause` [s] between them."""
+    times, way_points = motions[0].times, motions[0].way_points
+    for motion in motions[1:]:
+        if pause > 0:
+            times = np.append(times, times[-1] + pause)
+            way_points = np.vstack([way_points, way_points[-1]])
+        times = np.append(times, times[-1] + motion.times[1:])
+        way_points = np.vstack([way_points, motion.way_points[1:]])
+    return Motion(times, way_points)
+
+
 def _half_turn(angle: float) -> float:
     """The same turn the short way round, in [-pi, pi) [rad]."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _sheet_vertex(
+    x: float, y: float, sheet: Cloth | Bag, particle_q: np.ndarray
+) -> tuple[float, int] | None:
+    """Height [m] at which a descending tip comes near enough to a sheet, and the vertex it takes.
+
+    A bead of a bag that is met soon after is taken instead: it is the firmer thing to hold.
+    """
+    first, points = sheet.particles.start, particle_q[sheet.particles.start : sheet.particles.stop]
+    reach = sheet.config.grasp_reach
+    away = np.hypot(points[:, 0] - x, points[:, 1] - y)
+    tops = points[:, 2] + np.sqrt(np.maximum(reach**2 - away**2, 0.0))
+    tops[away > reach] = -np.inf
+    i = int(np.argmax(tops))
+    if not np.isfinite(tops[i]):
+        return None
+    if isinstance(sheet, Bag):
+        beads = np.array(sheet.ring) - first
+        bead = int(beads[np.argmax(tops[beads])])
+        if tops[bead] > tops[i] - BEAD_FIRST:
+            i = bead
+    return float(points[i, 2]) + _thickness(sheet, i + first), first + i
+
+
+def _thickness(sheet: Cloth | Bag, particle: int) -> float:
+    """From the middle of a sheet to its surface at a vertex [m]."""
+    if isinstance(sheet, Cloth):
+        return sheet.config.radius
+    beads = particle in sheet.ring
+    return sheet.config.bead_radius if beads else sheet.config.shell_radius
 
 
 def _box_top(x: float, y: float, box: Box, pose: np.ndarray) -> float | None:

@@ -36,13 +36,22 @@ class SolverConfig:
     """Slower than this is at rest [m/s]."""
     rest_seconds: float = 0.05
     """At rest for so long ends a world's rollout [s]."""
+    viscosity: float = 0.0
+    """Rate at which the ends of a strain-limited spring take on one velocity [1/s]."""
+    dry_friction: float = 0.0
+    """Deceleration of a particle by friction inside a fabric, in worlds with triangles [m/s^2]."""
+    sleep_speed: float = 0.0
+    """Particles of a world with triangles stay where they are when slower than this [m/s]."""
+    sleep_ramp: float = 10.0
+    """Factor by which the sleep speed grows from 1 s to 2 s after a release."""
     limits: GuardLimits = field(default_factory=GuardLimits)
 
     def __post_init__(self) -> None:
         for name in ("dt", "max_speed", "calm_speed", "margin", "rest_speed", "stiffness"):
             if not getattr(self, name) > 0:
                 raise InputError(f"SolverConfig.{name} must be positive, got {getattr(self, name)}")
-        for name in ("damping", "table_friction", "contact_friction", "recovery", "rest_seconds"):
+        for name in ("damping", "table_friction", "contact_friction", "recovery", "rest_seconds",
+                     "viscosity", "dry_friction", "sleep_speed", "sleep_ramp"):  # fmt: skip
             if not getattr(self, name) >= 0:
                 raise InputError(
                     f"SolverConfig.{name} must not be negative, got {getattr(self, name)}"

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from .box_box import POINTS
+from .grip import PUSHES
 from .sheet_data import add_sheets
 from .structures import structures
 from .topology import WorldTopology, read_worlds
@@ -244,13 +245,14 @@ class SolverData:
             "tick",
             "knot",
             "knot_end",
-            "push",
-            "push_steps",
         ):
             self.add_array(f"grips.{name}", slots, wp.int32, (), np.int32)
+        for name in ("push", "push_steps"):
+            self.add_array(f"grips.{name}", slots * PUSHES, wp.int32, (), np.int32)
+        self.add_array("grips.push_acceleration", slots * PUSHES, t.R3, (3,), number)
         for name, dtype, shape in (
             ("offset", t.R3, (3,)), ("turn", t.Q, (4,)), ("lower_start", t.S, ()),
-            ("lower_end", t.S, ()), ("shift", t.R3, (3,)), ("push_acceleration", t.R3, (3,)),
+            ("lower_end", t.S, ()), ("shift", t.R3, (3,)),
         ):  # fmt: skip
             self.add_array(f"grips.{name}", slots, dtype, shape, number)
         self.reserve_knots(slots * 16)

@@ -21,7 +21,8 @@ from .box_triangle import box_triangle
 from .cell_list import cell_list
 from .distance import distance
 from .edge_contact import edge_contact
-from .grip import grip
+from .grip import PUSHES, grip
+from .internal_friction import internal_friction
 from .lanes import (  # noqa: F401  (operators are found by name)
     KERNEL_OPTIONS,
     add,
@@ -69,6 +70,10 @@ def forward_kernel(
     project_triangles = triangle_contact(scalar, lanes).project_triangles
     edges_ = edge_contact(scalar, lanes)
     list_edges, project_edges = edges_.list_edges, edges_.project_edges
+    calms = internal_friction(scalar, lanes)
+    sleep_speed, calm_particle, damp_spring = (
+        getattr(calms, n) for n in ("sleep_speed", "calm_particle", "damp_spring")
+    )
     grips_ = grip(scalar, lanes)
     follow_path, take, let_go = grips_.follow_path, grips_.take, grips_.let_go
     body = rigid(scalar, lanes)
@@ -207,6 +212,7 @@ def forward_kernel(
         fresh = zero  # lanes whose triangles have been listed in this launch
         travel = zero
         clamped = zero
+        free_time = zero  # since the launch began or something was let go
         frame = int(0)
         longest_push = int(0)
         for lane in range(wp.static(L)):
@@ -216,8 +222,10 @@ def forward_kernel(
                 if grips.particle[w0 + lane] >= 0 or grips.body[w0 + lane] >= 0:
                     holding[lane] = S(1.0)
                     take(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
-                if grips.push[w0 + lane] >= 0:
-                    longest_push = wp.max(longest_push, grips.push_steps[w0 + lane])
+                for p in range(wp.static(PUSHES)):
+                    at_push = (w0 + lane) * wp.static(PUSHES) + p
+                    if grips.push[at_push] >= 0:
+                        longest_push = wp.max(longest_push, grips.push_steps[at_push])
         # the table hides at once that a particle started under it
         watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
         substep = int(0)
@@ -243,12 +251,13 @@ def forward_kernel(
                             at = b0 + lane * body_count + b
                             predict_body(at, dt, kept[lane], pull, bodies)
             if substep < longest_push:
-                for lane in range(wp.static(L)):
-                    w = w0 + lane
-                    i = grips.push[w]
-                    if i >= 0 and substep < grips.push_steps[w] and on[lane] > S(0.0):
+                for k_push in range(wp.static(L * PUSHES)):
+                    lane = k_push // wp.static(PUSHES)
+                    at_push = w0 * wp.static(PUSHES) + k_push
+                    i = grips.push[at_push]
+                    if i >= 0 and substep < grips.push_steps[at_push] and on[lane] > S(0.0):
                         x = q.x[p0 + i]
-                        kick = grips.push_acceleration[w] * (dt * dt * kept[lane])
+                        kick = grips.push_acceleration[at_push] * (dt * dt * kept[lane])
                         x.x[lane] = x.x[lane] + kick[0]
                         x.y[lane] = x.y[lane] + kick[1]
                         x.z[lane] = x.z[lane] + kick[2]
@@ -336,6 +345,19 @@ def forward_kernel(
                 moved2 = wp.max(
                     moved2, finish(p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q)
                 )
+            unrest2 = moved2
+            if wp.static(with_sheets):
+                if st.dry > S(0.0) or st.sleep > S(0.0):
+                    sleep = sleep_speed(free_time, st.sleep, st.sleep_ramp)
+                    speed2 = zero
+                    for i in range(n):
+                        speed2 = wp.max(speed2, calm_particle(p0 + i, st.dry, sleep, on, q))
+                    unrest2 = speed2 * (dt * dt)
+                if st.viscous > S(0.0):
+                    for s in range(s0, s1):
+                        if springs.limit[s] > S(0.0):
+                            damp_spring(s, p0, st.viscous, on, q, springs)
+                free_time = (free_time + V(dt)) * (one - holding)
             if wp.static(with_bodies):
                 for lane in range(wp.static(L)):
                     if on[lane] > S(0.0):
@@ -343,6 +365,7 @@ def forward_kernel(
                             at = b0 + lane * body_count + b
                             m = finish_body(at, dt, fastest[lane], bodies)
                             moved2[lane] = wp.max(moved2[lane], m)
+                            unrest2[lane] = wp.max(unrest2[lane], m)
             moved = root(moved2)
             travel = travel + moved
             # the next substep may move by half as much again before its contacts are solved
@@ -351,7 +374,7 @@ def forward_kernel(
             clamped = clamped + less(V(st.max_speed * dt), moved) * free_run * on
             steps = steps + on
             calm = wp.max(calm - one, zero)
-            slow = less(moved, V(st.rest_speed * dt))
+            slow = less(unrest2, V(st.rest_speed * st.rest_speed * dt * dt))
             quiet = (quiet + one) * slow
             rested = less(V(st.rest_steps), quiet + V(S(0.5))) * less(least, steps + V(S(0.5)))
             done = wp.max(rested * (one - holding), less(most, steps + V(S(0.5))))

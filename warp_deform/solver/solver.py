@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -235,6 +236,10 @@ class SolverFusedXPBD(SolverBase):
         settings.calm_speed = c.calm_speed
         settings.margin = c.margin
         settings.rest_speed = c.rest_speed
+        settings.viscous = -math.expm1(-c.viscosity * c.dt)
+        settings.dry = c.dry_friction * c.dt
+        settings.sleep = c.sleep_speed
+        settings.sleep_ramp = c.sleep_ramp
         settings.rest_steps = max(1, round(c.rest_seconds / c.dt))
         settings.check_every = 20
         settings.record_every = record_every

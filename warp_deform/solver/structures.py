@@ -33,6 +33,10 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         calm_speed: S  # clamp while a world is calmed [m/s]
         margin: S  # pairs this much farther apart than touching are still listed [m]
         rest_speed: S  # slower than this is at rest [m/s]
+        viscous: S  # share of their relative velocity that ends of a spring lose in a substep
+        dry: S  # speed that a particle of a fabric loses in a substep [m/s]
+        sleep: S  # slower particles of a fabric stay where they are [m/s]
+        sleep_ramp: S  # `sleep` grows by this factor from 1 s to 2 s after a release
         rest_steps: S  # so many substeps at rest end a world's launch
         check_every: int  # substeps between looks of the guards
         record_every: int  # substeps between recorded frames; 0: record nothing
@@ -222,7 +226,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         lower_start: wp.array(dtype=S)  # between these times contact ends the descent [s]
         lower_end: wp.array(dtype=S)
         shift: wp.array(dtype=R3)  # added to the path once contact has ended the descent
-        push: wp.array(dtype=int)  # local number of a perturbed particle or -1
+        push: wp.array(dtype=int)  # local number of a perturbed particle or -1, PUSHES a slot
         push_acceleration: wp.array(dtype=R3)  # [m/s^2]
         push_steps: wp.array(dtype=int)
 

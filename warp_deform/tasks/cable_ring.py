@@ -71,7 +71,7 @@ class CableRing(Task):
             body_q=np.zeros((0, 7)),
             targets=targets,
             zones=(ring_zone(targets),) if self.visible else (),
-            push=self._sample_push(rng, np.array([x, y])),
+            pushes=(self._sample_push(rng, np.array([x, y])),),
             settle_seconds=_SETTLE_SECONDS,
         )
 

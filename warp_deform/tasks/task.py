@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from ..robots.primitive import PrimitiveConfig
+from ..robots.primitive import PrimitiveConfig, Stage
 from ..solver.config import SolverConfig
 
 if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     import newton
 
-    from ..objects.box import Box
-    from ..objects.cable import Cable
     from ..objects.push import Push
+    from ..objects.scene_object import SceneObject
     from ..objects.zone import Zone
     from ..rendering.images import Images
     from .free_space import FreeSpace
@@ -33,14 +32,6 @@ Action = np.ndarray
 """(7,) float64: pick x, y [m], yaw [rad], place x, y [m], yaw [rad], lift [m]."""
 
 
-@dataclass(frozen=True)
-class Stage:
-    """How high the tip carries what it holds [m], and how fast [m/s]."""
-
-    lift: float
-    speed: float
-
-
 @dataclass(frozen=True, eq=False)
 class Layout:
     """One sampled start of an episode.
@@ -49,7 +40,7 @@ class Layout:
     targets: what the task aims at; shape and meaning are the task's ((n, 2) points or a pose)
     frame: pose (3,) x, y [m], yaw [rad] in which the targets were laid out, where a task needs it
     zones: marks that are drawn
-    push: perturbation that follows the start, or None
+    pushes: perturbations that follow the start, at most `MOST_PUSHES`
     calm: start by damping (speeds clamped for a moment) instead of falling freely; for layouts
         that are constructed at rest, such as goals
     """
@@ -58,7 +49,7 @@ class Layout:
     body_q: np.ndarray
     targets: np.ndarray
     zones: tuple[Zone, ...] = ()
-    push: Push | None = None
+    pushes: tuple[Push, ...] = ()
     settle_seconds: float = 0.0
     calm: bool = False
     frame: np.ndarray | None = None
@@ -83,6 +74,10 @@ class Snapshot:
     segments: tuple[range, ...]
     """Segmentation ids of zones and objects, in the order of `Task.drawn`."""
     render: Callable[[], Images] = field(repr=False)
+    objects: tuple[SceneObject, ...] = ()
+    """Where the objects of `Task.add_objects` stand in the arrays above."""
+    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+    """Actions of the episode so far (T, 7)."""
 
     @cached_property
     def images(self) -> Images:
@@ -107,9 +102,9 @@ class Task(abc.ABC):
     primitive: ClassVar[PrimitiveConfig] = PrimitiveConfig()
     """Speeds and heights of the robot's motion."""
 
-    def speed(self, lift: float) -> float:
-        """Speed [m/s] of the loaded tip at a lift [m]: that of the stage with the nearest lift."""
-        return min(self.stages, key=lambda stage: abs(stage.lift - lift)).speed
+    def stage_of(self, lift: float) -> Stage:
+        """The stage whose lift is nearest to `lift` [m]; of equally near ones the first."""
+        return min(self.stages, key=lambda stage: abs(stage.lift - lift))
 
     def privileged_stage(self, segment: int, snapshot: Snapshot, previous: Stage | None) -> Stage:
         """Stage of a pick on what has the segmentation id `segment`, by the paper's hidden rule.
@@ -122,7 +117,7 @@ class Task(abc.ABC):
         return self.stages[0]
 
     @abc.abstractmethod
-    def add_objects(self, builder: newton.ModelBuilder) -> tuple[Cable | Box, ...]:
+    def add_objects(self, builder: newton.ModelBuilder) -> tuple[SceneObject, ...]:
         """Add one world's objects to `builder`, in any pose; every seed has the same ones."""
 
     @abc.abstractmethod
@@ -130,8 +125,8 @@ class Task(abc.ABC):
         """Draw a start. `space` is an empty table and knows the robot's reach."""
 
     def drawn(
-        self, layout: Layout, objects: tuple[Cable | Box, ...]
-    ) -> tuple[Cable | Box | Zone, ...]:
+        self, layout: Layout, objects: tuple[SceneObject, ...]
+    ) -> tuple[SceneObject | Zone, ...]:
         """What is drawn, in creation order: zones first, as in the original."""
         return (*layout.zones, *objects)
 
@@ -143,11 +138,32 @@ class Task(abc.ABC):
         """Whether the task is done."""
         return self.score(layout, snapshot) >= self.success_score
 
+    def acceptable(self, layout: Layout, snapshot: Snapshot) -> bool:
+        """Whether an episode may start like this, once settled; others are drawn again, counted."""
+        return not self.solved(layout, snapshot)
+
     @abc.abstractmethod
     def demonstrate(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
     ) -> Action | None:
         """The scripted demonstrator's next action, or None when it sees nothing to do."""
+
+    def demonstrate_visible(
+        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
+    ) -> Action | None:
+        """The same by the visible demonstrator, which picks only what the tip would really meet."""
+        return self.demonstrate(layout, snapshot, rng)
+
+    def candidates(
+        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
+    ) -> list[Action]:
+        """Up to `count` actions that are worth simulating, for the `mpc` demonstrator."""
+        drawn = [self.demonstrate_visible(layout, snapshot, rng) for _ in range(count)]
+        return [action for action in drawn if action is not None]
+
+    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+        """How good a state is to go on from; `mpc` takes the action whose outcome has the most."""
+        return self.score(layout, snapshot)
 
     @abc.abstractmethod
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
