@@ -9,6 +9,7 @@ on the same starts, and ratios compare like with like.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import newton
@@ -18,7 +19,7 @@ from .bench_cloth import CLOTH_SCENES, run_cloth
 from .errors import InputError
 from .objects.box import add_box, l_block
 from .objects.cable import add_cable
-from .peers import PEER_SCENES, PEERS, PeerScene, peer_scene, time_peer
+from .peers import PEER_SCENES, PeerScene, check_peer, peer_scene, time_peer
 from .solver.solver import SolverFusedXPBD
 from .tasks.block import BlockNotarget
 from .tasks.cable_physics import CABLE_SOLVER
@@ -26,6 +27,9 @@ from .tasks.cable_physics import CABLE_SOLVER
 __all__ = ["run"]
 
 _REST_AFTER = 2.0  # [s], as for the peers
+_SOFT_SCENES: dict[str, Callable[..., dict[str, Any]]] = dict.fromkeys(CLOTH_SCENES, run_cloth)
+"""What times our side of each scene with a play of its own."""
+_EDGES = "-edges"  # our edge contact on or off: the peers have one scene for both
 
 
 def run(
@@ -34,32 +38,48 @@ def run(
     peer: str | None = None,
     lanes: int = 8,
     worlds: int = 64,
-    seconds: float = 1.0,
+    seconds: float | None = None,
     repeats: int = 5,
 ) -> dict[str, Any]:
-    """Time `scene` ("cable", "heap", "ring" or "block"), and `peer` on it when one is named.
+    """Time `scene` ("cable", "heap", "ring", "block", a fabric or a bag), and `peer` beside it.
 
-    The scenes "cloth10" and "cloth25" are those of `bench_cloth`: at most 16 worlds and no peer.
+    The fabrics are those of `bench_cloth`, with at most 16 worlds; their figure is the mean over
+    settling, one fold and lying folded, ours and the peer's.
+
+    seconds: simulated time of one measurement [s]; None: 1 s, or the whole play of a fabric or a
+    bag, which `seconds` cuts short for a peer alone
 
     Returns times in process CPU milliseconds per simulated second and world, `ratio` and
-    `ratio_lanes` (peer's time over ours, falling) and `same_bits`: whether the worlds in lanes
-    ended in the very states they end in alone.
+    `ratio_lanes` (peer's time over ours, falling; `rest_ratio` at rest) and `same_bits`: whether
+    the worlds in lanes ended in the very states they end in alone.
 
     Raises:
         InputError: no such scene or peer, or the peer is not installed.
         PhysicsError: a guard fired.
     """
-    known = (*PEER_SCENES, *CLOTH_SCENES)
+    known = (*PEER_SCENES, *_SOFT_SCENES)
     if scene not in known:
         raise InputError(f"no scene {scene!r} to time; choose from {', '.join(known)}")
-    if peer is not None and peer not in PEERS:
-        raise InputError(f"no peer {peer!r}; choose from {', '.join(PEERS)}")
-    if not (seconds > 0 and repeats > 0 and worlds > 0):
+    if peer is not None:
+        check_peer(peer, scene.removesuffix(_EDGES))
+    if not ((seconds is None or seconds > 0) and repeats > 0 and worlds > 0):
         raise InputError("seconds, repeats and worlds must be positive")
-    if scene in CLOTH_SCENES:
-        if peer is not None:
-            raise InputError(f"{scene} has no peer: leave it out")
-        return run_cloth(scene=scene, lanes=lanes, worlds=worlds, repeats=repeats)
+    if scene in _SOFT_SCENES:
+        report = _SOFT_SCENES[scene](scene=scene, lanes=lanes, worlds=worlds, repeats=repeats)
+    else:
+        length = 1.0 if seconds is None else seconds
+        report = _run_rigid(scene, lanes=lanes, worlds=worlds, seconds=length, repeats=repeats)
+    if peer is not None:
+        theirs = time_peer(peer, scene.removesuffix(_EDGES), seconds=seconds, repeats=repeats)
+        report |= theirs.report()
+        report |= _ratios(report)
+    return report
+
+
+def _run_rigid(
+    scene: str, *, lanes: int, worlds: int, seconds: float, repeats: int
+) -> dict[str, Any]:
+    """Our own side of a cable or the block."""
     starts = [peer_scene(scene, seed=seed) for seed in range(worlds)]
     begin = time.process_time()
     lone, many = _solver(starts[:1], 1), _solver(starts, lanes)
@@ -69,7 +89,7 @@ def run(
     alone = [_time(lone, [s], seconds) for s in starts[:repeats]]
     together = [_time(many, starts, seconds) for _ in range(repeats)]
     config = lone.config
-    report: dict[str, Any] = {
+    return {
         "scene": scene,
         **_percentiles("ms_per_sim_second", [t[0] for t in alone], 1),
         **_percentiles("rest_ms_per_sim_second", [t[1] for t in alone], 1),
@@ -84,13 +104,17 @@ def run(
         "same_bits": _same_bits(lone, many, starts, seconds),
         "start_up_seconds": start_up,
     }
-    if peer is not None:
-        report |= time_peer(peer, scene, seconds=seconds, repeats=repeats).report()
-        for kind in ("", "rest_"):
-            theirs = report[f"peer_{kind}ms_per_sim_second"]
-            report[f"{kind}ratio"] = theirs / report[f"{kind}ms_per_sim_second"]
-            report[f"{kind}ratio_lanes"] = theirs / report[f"{kind}ms_per_sim_second_lanes"]
-    return report
+
+
+def _ratios(report: dict[str, Any]) -> dict[str, float]:
+    """The peer's times over ours; a peer cut short has no time at rest."""
+    return {
+        f"{kind}ratio{many}": report[f"peer_{kind}ms_per_sim_second"]
+        / report[f"{kind}ms_per_sim_second{many}"]
+        for kind in ("", "rest_")
+        for many in ("", "_lanes")
+        if f"peer_{kind}ms_per_sim_second" in report
+    }
 
 
 def _solver(starts: list[PeerScene], lanes: int) -> SolverFusedXPBD:

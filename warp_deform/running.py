@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .episodes import Goal
+from .objects.scene_object import SceneObject
 from .rendering.drawables import Drawables
 from .robots.primitive import Motion, Outcome
 from .rollout import Frames, Rollout
@@ -32,6 +33,7 @@ class RunningEpisode:
 
     seed: int
     layout: Layout
+    objects: tuple[SceneObject, ...]
     drawables: Drawables
     goal: Goal | None
     discarded_starts: int

@@ -7,6 +7,7 @@ episode's bits depend on its seed and its actions only, not on its neighbours or
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import newton
@@ -36,13 +37,14 @@ from .solver.solver import SolverFusedXPBD
 from .tasks.free_space import FreeSpace
 from .tasks.registry import task as find_task
 from .tasks.task import Layout, Snapshot, Task
+from .world_state import WorldState
 
 __all__ = ["Worlds"]
 
 MOST_STARTS = 100
 """Starts that are drawn before a seed is given up; the tasks need 1 to 3."""
 REST_LIMIT = 4.0
-"""A world that does not rest is looked at so long after its path or settling time [s]."""
+"""Longest wait for rest [s], after which a world that still moves is looked at as it is."""
 CALM = 0.2
 """After a release, speeds stay under `calm_speed` for so long [s]: what the released bead's links
 and the beads under it had stored is dissipated instead of flinging it."""
@@ -58,7 +60,8 @@ class Worlds:
         reports = worlds.step({slot: action, ...})
         worlds.episodes[slot].snapshot.images.color
 
-    robot: "ur5" or "panda"; lanes, precision, bundles: see `SolverFusedXPBD`. Starts that already
+    robot: "ur5" or "panda"; lanes, precision, bundles: see `SolverFusedXPBD`; rest_limit: a world
+    that does not rest is looked at so long after its path or settling time [s]. Starts that already
     solve the task, or leave the table, are drawn again and counted.
     """
 
@@ -70,9 +73,11 @@ class Worlds:
         robot: str = "ur5",
         lanes: int | None = None,
         precision: str = "float32",
+        rest_limit: float = REST_LIMIT,
         bundles: Path | None = None,
     ) -> None:
         self.task = find_task(task) if isinstance(task, str) else task
+        self.precision, self.rest_limit = precision, rest_limit
         self.robot = find_robot(robot)
         if count < 1:
             raise InputError(f"count is {count}; there must be 1 world or more")
@@ -113,8 +118,7 @@ class Worlds:
             WarpDeformError: a seed gave no valid start.
         """
         for slot in seeds:
-            if not 0 <= slot < self.count:
-                raise InputError(f"slot {slot} is not one of the {self.count} worlds")
+            self._check_slot(slot)
         goals = goals or {}
         rngs = {slot: episode_rng(seed, LAYOUT_STREAM) for slot, seed in seeds.items()}
         discarded = dict.fromkeys(seeds, 0)
@@ -122,13 +126,16 @@ class Worlds:
         for _ in range(MOST_STARTS):
             if not waiting:
                 return
-            layouts = {s: self.task.sample(rngs[s], self._space) for s in waiting}
+            layouts = {s: self._sample(rngs[s], goals.get(s)) for s in waiting}
             made = {s: goals[s] for s in waiting if s in goals}
             if self.task.goal_conditioned:
                 made |= self._construct_goals(
                     {s: layouts[s] for s in waiting if s not in made}, seeds
                 )
-                layouts = {s: layouts[s].with_targets(goal.targets) for s, goal in made.items()}
+                layouts = {
+                    s: layouts[s] if s in goals else layouts[s].with_targets(goal.targets)
+                    for s, goal in made.items()
+                }
             self._start(layouts, seeds, made)
             again = []
             for s in waiting:
@@ -143,6 +150,15 @@ class Worlds:
                 f"{self.task.name}: no valid start in {MOST_STARTS} draws for seed {names}"
             )
 
+    def _sample(self, rng: np.random.Generator, goal: Goal | None) -> Layout:
+        if goal is None:
+            return self.task.sample(rng, self._space)
+        return self.task.sample_for_goal(rng, self._space, goal.targets)
+
+    def _check_slot(self, slot: int) -> None:
+        if not 0 <= slot < self.count:
+            raise InputError(f"slot {slot} is not one of the {self.count} worlds")
+
     def _start(
         self, layouts: Mapping[int, Layout], seeds: Mapping[int, int], goals: Mapping[int, Goal]
     ) -> None:
@@ -152,8 +168,13 @@ class Worlds:
             if len(layout.particle_q):
                 data.lane("particles.x", slot)[:] = layout.particle_q
                 data.lane("particles.v", slot)[:] = 0.0
+            objects = self._objects(layout)
             if len(layout.body_q):
                 data.set_bodies(slot, layout.body_q)
+                for item in (objects[i] for i in layout.configs):
+                    if isinstance(item, Box):
+                        size, inertia = item.config.parts[0].size, item.config.inertia()[1]
+                        data.set_box(slot, item.body, np.array(size), item.config.mass, inertia)
         least = {
             s: l.settle_seconds + max((push.seconds for push in l.pushes), default=0.0)
             for s, l in layouts.items()
@@ -163,15 +184,17 @@ class Worlds:
             list(layouts),
             pushes={s: l.pushes for s, l in layouts.items()},
             least=least,
-            most={s: seconds + REST_LIMIT for s, seconds in least.items()},
+            most={s: seconds + self.rest_limit for s, seconds in least.items()},
             calm={s: l.settle_seconds if l.calm else 0.0 for s, l in layouts.items()},
         )
         for slot, layout in layouts.items():
-            drawables = Drawables.of(self.task.drawn(layout, self.objects))
+            objects = self._objects(layout)
+            drawables = Drawables.of(self.task.drawn(layout, objects))
             limits = self.solver.config.limits
             self.episodes[slot] = RunningEpisode(
                 seed=seeds[slot],
                 layout=layout,
+                objects=objects,
                 drawables=drawables,
                 goal=goals.get(slot),
                 discarded_starts=0,
@@ -182,6 +205,13 @@ class Worlds:
                 posture=self.robot.home_q,
             )
             self._look(slot)
+
+    def _objects(self, layout: Layout) -> tuple[SceneObject, ...]:
+        """The objects as an episode has them."""
+        return tuple(
+            replace(item, config=layout.configs[i]) if i in layout.configs else item  # type: ignore[arg-type]
+            for i, item in enumerate(self.objects)
+        )
 
     def _construct_goals(
         self, layouts: Mapping[int, Layout], seeds: Mapping[int, int]
@@ -285,7 +315,7 @@ class Worlds:
             moving,
             paths={slot: paths[slot] for slot in moving},
             least=RETREAT_LEAST,
-            most={slot: float(paths[slot].times[-1]) + REST_LIMIT for slot in moving},
+            most={slot: float(paths[slot].times[-1]) + self.rest_limit for slot in moving},
             calm_after=CALM,
             record=record,
         )
@@ -313,7 +343,7 @@ class Worlds:
         snapshot = self.episodes[slot].snapshot
         return find_grasp(
             plan.action[:3],
-            self.objects,
+            snapshot.objects,
             snapshot.particle_q,
             snapshot.body_q,
             self.task.primitive,
@@ -326,7 +356,7 @@ class Worlds:
             radius = self.solver.data.topologies[0].particle_radius[grasp.particle]
             lowest = snapshot.particle_q[grasp.particle, 2] - radius
         else:
-            box = next(o for o in self.objects if isinstance(o, Box) and o.body == grasp.body)
+            box = next(o for o in snapshot.objects if isinstance(o, Box) and o.body == grasp.body)
             lowest = snapshot.body_q[box.body, 2] + box.config.lowest
         hover = self.robot.hover_height(action[3], action[4], self.task.primitive.hover)
         stage = self.task.stage_of(float(action[6]))
@@ -352,8 +382,26 @@ class Worlds:
 
         episode.snapshot = Snapshot(
             particle_q, particle_qd, body_q, body_qd, drawables.segments, render,
-            self.objects, episode.actions,
+            episode.objects, episode.actions,
         )  # fmt: skip
+
+    def state(self, slot: int) -> WorldState:
+        """All that the slot's episode goes on from; the slot must have been reset."""
+        return WorldState.of(self.solver.data, slot, self.episodes[slot])
+
+    def restore(self, slot: int, state: WorldState) -> None:
+        """Go on from `state` in a slot, bit for bit as where it was saved.
+
+        It may come from another slot, or from other worlds of the same task, robot and precision.
+
+        Raises:
+            InputError: it does not fit.
+        """
+        self._check_slot(slot)
+        if state.episode.posture.shape != self.robot.home_q.shape:
+            raise InputError("the state was saved with another robot")
+        self.episodes[slot] = state.put(self.solver.data, slot)
+        self._look(slot)
 
     def score(self, slot: int) -> float:
         """The task's score of a slot's state; 0 when the physics cannot be trusted."""

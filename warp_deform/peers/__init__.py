@@ -4,21 +4,32 @@ They are cross-checks and yardsticks; no part of the product simulates with them
 """
 
 from .newton_peer import NEWTON_SOLVERS, NewtonSettings, newton_settings, time_newton
+from .newton_soft import NewtonSoftSettings, time_newton_soft
 from .pybullet_peer import time_pybullet
-from .registry import PEERS, time_peer
+from .pybullet_soft import time_pybullet_soft
+from .registry import PEERS, SOFT_PEERS, check_peer, time_peer
 from .scene import PEER_SCENES, PeerScene, peer_scene
+from .soft_scene import SOFT_SCENES, SoftScene, soft_scene
 from .timing import PeerTiming
 
 __all__ = [
     "NEWTON_SOLVERS",
     "PEERS",
     "PEER_SCENES",
+    "SOFT_PEERS",
+    "SOFT_SCENES",
     "NewtonSettings",
+    "NewtonSoftSettings",
     "PeerScene",
     "PeerTiming",
+    "SoftScene",
+    "check_peer",
     "newton_settings",
     "peer_scene",
+    "soft_scene",
     "time_newton",
+    "time_newton_soft",
     "time_peer",
     "time_pybullet",
+    "time_pybullet_soft",
 ]

@@ -30,7 +30,7 @@ _TIP_MASS = 1.0  # [kg]
 _GRAVITY = 9.8  # [m/s^2]
 _NOTE = (
     "as the original: springs of stiffness 40, which stretch much, self-collision, friction 1; "
-    "without the arm, which the original also steps: a weight with a given velocity holds the vertex"
+    "without the arm, which the original also steps: a weight of given velocity holds the vertex"
 )
 
 
@@ -75,8 +75,10 @@ class PyBulletSoftWorld:
         self._anchor: int | None = None
 
     def _add_table(self) -> None:
-        """The original's slab, and its ground 1 mm below, which is a box: a fabric hovers 10 cm
-        above PyBullet's infinite plane."""
+        """The original's slab, and its ground 1 mm below.
+
+        The ground is a box too: a fabric hovers 10 cm above PyBullet's infinite plane.
+        """
         bullet = self._bullet
         for half, position in (
             ((15.0, 15.0, 5.0), (0, 0, -5.001)),

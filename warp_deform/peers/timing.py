@@ -39,16 +39,18 @@ class PeerWorld(Protocol):
 class PeerTiming:
     """What one engine costs on one scene. Times are process CPU milliseconds per simulated second.
 
-    The figures without `rest` are of the time from the fall's start; those with it begin when two
-    simulated seconds have passed. p50 and p95 are over the repeats, each from another start.
+    The figures without `rest` are of the time from the fall's start, and of a sheet's whole play;
+    those with it begin when two simulated seconds have passed, or when a sheet lies folded and a
+    bag has lain down. p50 and p95 are over the repeats, each from another start.
     """
 
     engine: str
     scene: str
     ms_per_sim_second_p50: float
     ms_per_sim_second_p95: float
-    rest_ms_per_sim_second_p50: float
-    rest_ms_per_sim_second_p95: float
+    rest_ms_per_sim_second_p50: float | None
+    """None where the play was cut before anything came to rest."""
+    rest_ms_per_sim_second_p95: float | None
     hz: int
     """Solver steps per simulated second."""
     iterations: int
@@ -63,8 +65,8 @@ class PeerTiming:
     """What this engine leaves out, in words."""
 
     def report(self) -> dict[str, float | int | str]:
-        """The keys of a benchmark report that concern a peer."""
-        return {
+        """The keys of a benchmark report that concern a peer; those without a value are absent."""
+        values: dict[str, float | int | str | None] = {
             "peer": self.engine,
             "peer_ms_per_sim_second": self.ms_per_sim_second_p50,
             "peer_ms_per_sim_second_p95": self.ms_per_sim_second_p95,
@@ -73,8 +75,11 @@ class PeerTiming:
             "peer_hz": self.hz,
             "peer_iterations": self.iterations,
             "peer_stretch": self.stretch_max,
+            "peer_seconds": self.seconds,
+            "peer_repeats": self.repeats,
             "peer_note": self.note,
         }
+        return {key: value for key, value in values.items() if value is not None}
 
 
 def measure(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import newton
@@ -11,11 +10,12 @@ import warp as wp
 
 from .box_box import POINTS
 from .grip import PUSHES
+from .mirrored import Mirrored
 from .sheet_data import add_sheets
 from .structures import structures
 from .topology import WorldTopology, read_worlds
 
-__all__ = ["KERNEL_ARGUMENTS", "Mirrored", "SolverData"]
+__all__ = ["KERNEL_ARGUMENTS", "SolverData"]
 
 KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near",
                     "bodies", "contacts", "grips", "watch", "sheets", "cells")  # fmt: skip
@@ -33,30 +33,6 @@ def alias_lanes(structs: list[Any], scalar: Any) -> None:
         count = array.capacity // np.dtype(_NUMPY[scalar]).itemsize
         flat = wp.array(ptr=array.ptr, dtype=scalar, shape=(count,), device=array.device)
         setattr(cells, field, flat)
-
-
-class Mirrored:
-    """A Warp array with a NumPy view of its scalars; on the CPU the view is the array itself."""
-
-    def __init__(
-        self, count: int, dtype: Any, device: Any, scalar: Any, shape: tuple[int, ...]
-    ) -> None:
-        self._host = wp.zeros(max(count, 1), dtype=dtype, device="cpu")
-        self.array = self._host if device.is_cpu else wp.zeros_like(self._host, device=device)
-        shape = (max(count, 1), *shape)
-        size = int(np.prod(shape)) * np.dtype(scalar).itemsize
-        buffer = (ctypes.c_byte * size).from_address(self._host.ptr)
-        self.view: np.ndarray = np.frombuffer(buffer, dtype=scalar).reshape(shape)
-
-    def to_device(self) -> None:
-        """Make the device see what was written to `view`."""
-        if self.array is not self._host:
-            wp.copy(self.array, self._host)
-
-    def to_host(self) -> None:
-        """Make `view` see what a kernel wrote."""
-        if self.array is not self._host:
-            wp.copy(self._host, self.array)
 
 
 class SolverData:
@@ -155,25 +131,28 @@ class SolverData:
             ("topology.body_count", [k.body_count for k in tops]),
             ("topology.spring_start", starts("spring_ij")),
             ("topology.pair_start", starts("pair_ij")),
-            ("topology.shape_start", starts("shape_body")),
+            ("topology.shape_count", [len(k.shape_body) for k in tops]),
             ("springs.mode", joined("spring_mode")),
             ("springs.middle", joined("spring_middle")),
-            ("shapes.body", joined("shape_body")),
         ):
             self.add_constant(name, np.asarray(values), wp.int32, np.int32)
         self.add_constant("topology.radius", joined("particle_radius"), t.S, number)
         for name in ("springs.ij", "pairs.ij"):
             self.add_constant(name, joined(_field(name)), wp.vec2i, np.int32)
         for name in ("springs.length", "springs.compliance", "springs.limit", "springs.floor",
-                     "pairs.distance", "shapes.friction"):  # fmt: skip
+                     "pairs.distance"):  # fmt: skip
             self.add_constant(name, joined(_field(name)), t.S, number)
-        for name, dtype in (
-            ("shapes.center", t.R3),
-            ("shapes.half", t.R3),
-            ("shapes.rotation", t.Q),
-        ):
-            self.add_constant(name, joined(_field(name)), dtype, number)
         groups, L = self.group_count, self.lanes
+        # every world has its own boxes: their sizes may differ
+        for name, dtype, kind in (
+            ("body", wp.int32, np.int32), ("friction", t.S, number), ("center", t.R3, number),
+            ("half", t.R3, number), ("rotation", t.Q, number),
+        ):  # fmt: skip
+            of_worlds = [
+                getattr(tops[k], f"shape_{name}") for k in self.group_topology for _ in range(L)
+            ]
+            self.add_constant(f"shapes.{name}", np.concatenate(of_worlds), dtype, kind)
+        shape_start = np.cumsum([0, *(L * len(tops[k].shape_body) for k in self.group_topology)])
         capacity = [
             # a group's list holds the pairs of all its lanes, so each lane has its own share
             min(len(tops[k].pair_ij), L * pairs_per_particle * max(tops[k].particle_count, 1))
@@ -189,6 +168,7 @@ class SolverData:
             ("near_start", near_start[:-1]),
             ("near_capacity", capacity),
             ("contact_start", contact_start[:-1]),
+            ("shape_start", shape_start[:-1]),
         ):
             self.add_constant(f"group.{name}", np.asarray(values), wp.int32, np.int32)
         for name in ("active", "damping", "table_friction", "contact_friction", "stiffness",
@@ -312,6 +292,27 @@ class SolverData:
         count = self.topologies[self.group_topology[group]].body_count
         start = int(self.group_body[group]) + lane * count
         return slice(start, start + count)
+
+    def set_box(
+        self, world: int, body: int, size: np.ndarray, mass: float, inertia: np.ndarray
+    ) -> None:
+        """Give a body that is one box around its frame another size (3,) [m], mass [kg], inertia.
+
+        inertia (3, 3) [kg m^2]
+        """
+        group, lane = divmod(int(self.slot[world]), self.lanes)
+        owner = self.topologies[self.group_topology[group]].shape_body
+        shapes = np.flatnonzero(owner == body)
+        if len(shapes) != 1:
+            raise ValueError(
+                f"body {body} has {len(shapes)} boxes; only a single one can be changed"
+            )
+        views, row = self.views, self.body_rows(world).start + body
+        start = int(views["group.shape_start"][group]) + lane * len(owner)
+        views["shapes.half"][start + shapes[0]] = np.asarray(size) / 2
+        views["bodies.w0"][row] = views["bodies.w"][row] = 1.0 / mass
+        views["bodies.inertia"][row] = inertia
+        views["bodies.inverse_inertia"][row] = np.linalg.inv(inertia)
 
     def per_world(self, name: str, world: int) -> np.ndarray:
         """Writable element of one world in a per-group array of V -> () or V3 -> (3,)."""

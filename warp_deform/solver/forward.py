@@ -100,8 +100,8 @@ def forward_kernel(
         p0 = group.particle_start[g]
         count = top.body_count[k]
         b0 = group.body_start[g] + lane * count
-        first = top.shape_start[k]
-        last = top.shape_start[k + 1]
+        first = group.shape_start[g] + lane * top.shape_count[k]
+        last = first + top.shape_count[k]
         mv = group.contact_friction[g]
         mu = mv[lane]
         tv = group.table_friction[g]
@@ -271,13 +271,13 @@ def forward_kernel(
                         radius = S(0.0)
                         if grips.particle[w] >= 0:
                             radius = top.radius[radii + grips.particle[w]]
+                        shape = group.shape_start[g] + lane * top.shape_count[k]
                         met = bool(False)
                         if wp.static(with_sheets):
                             met = cells.met[w] > 0
                         if not follow_path(
-                            met, w, lane, p0, bl, top.shape_start[k], top.shape_start[k + 1],
-                            near_start, near_count, radius, dt, q, pairs, shapes, near, bodies,
-                            grips,
+                            met, w, lane, p0, bl, shape, shape + top.shape_count[k], near_start,
+                            near_count, radius, dt, q, pairs, shapes, near, bodies, grips,
                         ):  # fmt: skip
                             let_go(w, lane, p0, bl, q, bodies, grips)
                             holding[lane] = S(0.0)

@@ -22,7 +22,8 @@ def internal_friction(scalar: Any, lanes: int) -> SimpleNamespace:
     """`sleep_speed(free, ...)`: the sleep speed `free` seconds after a release, by lane.
 
     `calm_particle(i, dry, sleep, on, q)`: dry friction and sleep of one particle after its velocity
-    is known; returns its squared speed. `damp_spring(s, p0, share, on, q, springs)`: viscosity of one spring.
+    is known; returns its squared speed. `damp_spring(s, p0, share, on, q, springs)`: viscosity of
+    one spring.
     """
     t = structures(scalar, lanes)
     S, V, V3, Particles, Springs = t.S, t.V, t.V3, t.Particles, t.Springs

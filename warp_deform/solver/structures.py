@@ -54,7 +54,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         body_count: wp.array(dtype=int)
         spring_start: wp.array(dtype=int)
         pair_start: wp.array(dtype=int)
-        shape_start: wp.array(dtype=int)
+        shape_count: wp.array(dtype=int)
 
     @wp.struct
     class Springs:
@@ -77,7 +77,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.struct
     class Shapes:
-        """Boxes, with the local number of their body."""
+        """Boxes of every world, by shape_start + lane * shape_count, with their body's number."""
 
         body: wp.array(dtype=int)
         center: wp.array(dtype=R3)  # in the frame of the body's centre of mass [m]
@@ -95,6 +95,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         near_start: wp.array(dtype=int)
         near_capacity: wp.array(dtype=int)
         contact_start: wp.array(dtype=int)
+        shape_start: wp.array(dtype=int)
         active: wp.array(dtype=V)  # 1: simulate this world, 0: leave it alone
         gravity: wp.array(dtype=V3)  # [m/s^2]
         damping: wp.array(dtype=V)  # [1/s]

@@ -7,7 +7,7 @@ start (`Layout`), reads what came out (`Snapshot`), scores it and proposes the n
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
@@ -20,6 +20,8 @@ from ..solver.config import SolverConfig
 if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     import newton
 
+    from ..objects.bag import BagConfig
+    from ..objects.box import BoxConfig
     from ..objects.push import Push
     from ..objects.scene_object import SceneObject
     from ..objects.zone import Zone
@@ -38,6 +40,8 @@ class Layout:
 
     particle_q (P, 3) [m] and body_q (B, 7) position [m] and quat_xyzw, before settling
     targets: what the task aims at; shape and meaning are the task's ((n, 2) points or a pose)
+    configs: by their number, objects whose config differs from the task's in this episode: the
+        colour of a bag, colour, size and mass of a body that is one box
     frame: pose (3,) x, y [m], yaw [rad] in which the targets were laid out, where a task needs it
     zones: marks that are drawn
     pushes: perturbations that follow the start, at most `MOST_PUSHES`
@@ -53,6 +57,7 @@ class Layout:
     settle_seconds: float = 0.0
     calm: bool = False
     frame: np.ndarray | None = None
+    configs: Mapping[int, BagConfig | BoxConfig] = field(default_factory=dict)
 
     def with_targets(self, targets: np.ndarray) -> Layout:
         """The same start with other targets (a goal from elsewhere)."""
@@ -75,7 +80,7 @@ class Snapshot:
     """Segmentation ids of zones and objects, in the order of `Task.drawn`."""
     render: Callable[[], Images] = field(repr=False)
     objects: tuple[SceneObject, ...] = ()
-    """Where the objects of `Task.add_objects` stand in the arrays above."""
+    """Where the objects of `Task.add_objects` stand in the arrays above, as they are here."""
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
     """Actions of the episode so far (T, 7)."""
 
@@ -123,6 +128,12 @@ class Task(abc.ABC):
     @abc.abstractmethod
     def sample(self, rng: np.random.Generator, space: FreeSpace) -> Layout:
         """Draw a start. `space` is an empty table and knows the robot's reach."""
+
+    def sample_for_goal(
+        self, rng: np.random.Generator, space: FreeSpace, targets: np.ndarray
+    ) -> Layout:
+        """Draw a start for a goal from elsewhere, whose `goal_targets` are `targets`."""
+        return self.sample(rng, space).with_targets(targets)
 
     def drawn(
         self, layout: Layout, objects: tuple[SceneObject, ...]
