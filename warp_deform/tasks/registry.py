@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 
 from ..errors import InputError
+from .bag_alone_open import BagAloneOpen
 from .block import BlockNotarget
 from .cable_line import CableLineNotarget
 from .cable_ring import CableRing, CableRingNotarget
@@ -21,6 +22,7 @@ TASKS: dict[str, type[Task]] = {
         CableShape,
         CableShapeNotarget,
         CableLineNotarget,
+        BagAloneOpen,
         BlockNotarget,
     )
 }

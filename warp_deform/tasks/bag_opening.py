@@ -1,0 +1,276 @@
+"""What the bag tasks share: how a bag is laid out, what its opening shows, and how it is opened.
+
+Source: Seita et al., ICRA 2021, appendix on bag tasks.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..objects.bag import Bag, BagConfig, bag_shell
+from ..objects.push import Push
+from ..rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world
+from ..robots.primitive import PrimitiveConfig, find_grasp
+from .bag_physics import BAG_PRIMITIVE, BAG_SOLVER, OPEN
+from .demonstrators import farthest_bead, pick_place, ring_maps
+from .ground_truth import pose_rows
+from .metrics import hull_area
+from .shapes import chain_yaw
+from .task import Action, Layout, Snapshot, Task
+
+__all__ = ["BagTask", "bag_mask", "enclosed"]
+
+DROP = 0.15
+"""Height of the sphere's centre from which a bag falls [m]."""
+_TILT = 0.25  # [rad] standard deviation about each axis
+_PUSH_SECONDS = 0.2
+_SETTLE_SECONDS = 1.0
+OVERSHOOT = 0.02
+"""How far beyond its target a bead is pulled [m]."""
+FEWEST_VISIBLE = 0.33
+"""The demonstrators give up where no more than this share of the beads can be seen."""
+_RAYS = 96
+_INSIDE = 0.75  # share of the rays sideways and down that meet the shell around an item inside
+
+
+class BagTask(Task):
+    """A task with bags of one kind; the first bag is the one that is to be opened."""
+
+    solver = BAG_SOLVER
+    primitive: ClassVar[PrimitiveConfig] = BAG_PRIMITIVE
+    max_actions = 8
+    bag: ClassVar[BagConfig] = BagConfig()
+    pushes: ClassVar[int] = 8
+    """Number of the original's pushes of up to 10 N sideways and 8 N up at 480 Hz."""
+
+    # -- laying out
+
+    def drop(self, rng: np.random.Generator, x: float, y: float) -> np.ndarray:
+        """Positions (P, 3) of a bag that is about to fall, its opening up, a little tilted."""
+        turn = Rotation.from_euler("xyz", rng.normal(0.0, _TILT, 3))
+        return turn.apply(_shell(self.bag).vertices) + [x, y, DROP]
+
+    def push(self, rng: np.random.Generator, first: int) -> Push:
+        """The perturbation of one bead of the bag whose particles begin at `first`.
+
+        Its impulse is that of the original's pushes, spread over 0.2 s.
+        """
+        shell = _shell(self.bag)
+        bead = int(shell.ring[rng.integers(len(shell.ring))])
+        force = np.array([rng.integers(-10, 11), rng.integers(-10, 11), 8], dtype=float)
+        impulse = force * self.pushes / 480
+        return Push(first + bead, impulse / _bead_mass(self.bag) / _PUSH_SECONDS, _PUSH_SECONDS)
+
+    def ring_targets(self, x: float, y: float) -> np.ndarray:
+        """Where the beads of an open bag at x, y would lie (32, 2) [m]."""
+        shell = _shell(self.bag)
+        return shell.vertices[shell.ring, :2] + [x, y]
+
+    @property
+    def settle_seconds(self) -> float:
+        """Time that a bag gets at least after its push [s]."""
+        return _SETTLE_SECONDS
+
+    # -- looking
+
+    def bag_of(self, snapshot: Snapshot, number: int = 0) -> Bag:
+        """The bag with this number among the scene's bags."""
+        return [item for item in snapshot.objects if isinstance(item, Bag)][number]
+
+    def beads(self, snapshot: Snapshot, number: int = 0) -> np.ndarray:
+        """Positions (32, 3) of a bag's beads, around the opening."""
+        return snapshot.particle_q[list(self.bag_of(snapshot, number).ring)].astype(float)
+
+    def opening(self, snapshot: Snapshot) -> float:
+        """Area of the hull of the beads over that of the opening at rest."""
+        area = hull_area(self.beads(snapshot)[:, :2])
+        return area / (math.pi * self.bag.opening_radius**2)
+
+    def visible_beads(self, layout: Layout, snapshot: Snapshot, number: int = 0) -> np.ndarray:
+        """Which beads (V,) of a bag have a pixel in the segmentation."""
+        ids = self._segments(layout, snapshot, self.bag_of(snapshot, number))
+        seen = np.isin(np.arange(ids.start + 1, ids.stop), snapshot.images.segmentation)
+        return np.flatnonzero(seen)
+
+    def hidden(self, layout: Layout, snapshot: Snapshot) -> bool:
+        """Whether too few beads of the first bag are visible to go on."""
+        beads = len(self.bag_of(snapshot).ring)
+        return len(self.visible_beads(layout, snapshot)) <= FEWEST_VISIBLE * beads
+
+    def hull_mask(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
+        """Filled convex hull (320, 160) uint8 of all pixels of the first bag's visible beads."""
+        ids = self._segments(layout, snapshot, self.bag_of(snapshot))
+        return bag_mask(snapshot.images.segmentation, ids.start + 1, ids.stop)
+
+    def clear_opening(
+        self, layout: Layout, snapshot: Snapshot, size: tuple[float, float], room: float
+    ) -> np.ndarray:
+        """Where (320, 160) uint8 a thing of `size` [m] fits the opening with `room` [m] to spare."""
+        width = round(math.hypot(size[0] + room, size[1] + room) / PIXEL_SIZE)
+        return cv2.erode(self.hull_mask(layout, snapshot), np.ones((width, width), np.uint8))
+
+    def inside_bag(self, snapshot: Snapshot, body: int) -> bool:
+        """Whether a body's centre is inside the first bag."""
+        bag = self.bag_of(snapshot)
+        centre = snapshot.body_q[body, :3].astype(float)
+        return enclosed(centre, snapshot.particle_q.astype(float), bag.faces) >= _INSIDE
+
+    def met_beads(self, snapshot: Snapshot, number: int = 0) -> list[int]:
+        """Beads of a bag that a tip descending at their centre really takes."""
+        ring = self.bag_of(snapshot, number).ring
+        met = []
+        for bead, particle in enumerate(ring):
+            grasp = find_grasp(
+                np.append(snapshot.particle_q[particle, :2], 0.0),
+                snapshot.objects,
+                snapshot.particle_q,
+                snapshot.body_q,
+                self.primitive,
+            )
+            if grasp is not None and grasp.particle == particle:
+                met.append(bead)
+        return met
+
+    def _segments(self, layout: Layout, snapshot: Snapshot, item: object) -> range:
+        """Segmentation ids of an object: of a bag, first the shell's, then those of its beads."""
+        return snapshot.segments[len(layout.zones) + snapshot.objects.index(item)]  # type: ignore[arg-type]
+
+    # -- opening
+
+    def pull(self, layout: Layout, snapshot: Snapshot, beads: list[int] | None) -> Action | None:
+        """Pull the bead that is farthest from its target under the best of 32 maps.
+
+        beads: those that may be picked, None: all; if none may, all may
+        """
+        positions, targets, target_of = self._mapped(layout, snapshot)
+        order = np.argsort(-np.linalg.norm(positions - targets[target_of], axis=1), kind="stable")
+        allowed = [b for b in order if beads is None or b in beads]
+        return self.pull_bead(layout, snapshot, int((allowed or list(order))[0]), OVERSHOOT)
+
+    def pull_bead(
+        self, layout: Layout, snapshot: Snapshot, bead: int, overshoot: float
+    ) -> Action:
+        """Pull one bead to its target and `overshoot` [m] beyond."""
+        positions, targets, target_of = self._mapped(layout, snapshot)
+        here, target = positions[bead, :2], targets[target_of[bead], :2]
+        way = target - here
+        beyond = target + way * (overshoot / max(float(np.hypot(*way)), 1e-9))
+        return pick_place(here, beyond, stage=OPEN)
+
+    def map_distance(self, layout: Layout, snapshot: Snapshot) -> float:
+        """Mean distance of the beads from their targets, over the opening's radius."""
+        positions, targets, target_of = self._mapped(layout, snapshot)
+        mean = np.linalg.norm(positions[:, :2] - targets[target_of, :2], axis=1).mean()
+        return float(mean) / self.bag.opening_radius
+
+    def pulls(
+        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
+    ) -> list[Action]:
+        """Different pulls worth simulating: far beads to their targets, others straight outwards."""
+        positions, targets, target_of = self._mapped(layout, snapshot)
+        far = np.linalg.norm(positions - targets[target_of], axis=1)
+        met = self.met_beads(snapshot) or list(range(len(positions)))
+        met.sort(key=lambda bead: -far[bead])
+        chosen = met[: max(1, count // 4)]
+        actions = [self.pull_bead(layout, snapshot, b, o) for b in chosen for o in (0.02, 0.05)]
+        centre = layout.targets[:, :2].mean(axis=0)
+        out = positions[:, :2] - centre
+        out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-6)
+        gain = {}
+        for bead in met:
+            rim = positions[:, :2].copy()
+            rim[bead] = centre + out[bead] * (self.bag.opening_radius + 0.02)
+            gain[bead] = hull_area(rim)
+        pulled: list[int] = []
+        for bead in sorted(met, key=lambda b: -gain[b]):
+            apart = np.linalg.norm(positions[pulled, :2] - positions[bead, :2], axis=1)
+            if len(actions) < count and (apart > 0.03).all():
+                pulled.append(bead)
+                place = centre + out[bead] * (self.bag.opening_radius + 0.03)
+                actions.append(pick_place(positions[bead, :2], place, stage=OPEN))
+        return actions[:count]
+
+    def _mapped(
+        self, layout: Layout, snapshot: Snapshot
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Beads (32, 3), targets (32, 3), and each bead's target under the best cyclic map."""
+        positions = self.beads(snapshot)
+        targets = np.column_stack([layout.targets, np.zeros(len(layout.targets))])
+        maps = ring_maps(len(positions), reversals=False)
+        bead, target = farthest_bead(positions, targets, maps)
+        return positions, targets, (np.arange(len(positions)) - bead + target) % len(positions)
+
+    # -- ground truth
+
+    def bag_rows(self, layout: Layout, snapshot: Snapshot, number: int = 0) -> np.ndarray:
+        """Rows (33, 3) of a bag: its beads, then its displacement from where it was dropped."""
+        beads = self.beads(snapshot, number)
+        particles = self.bag_of(snapshot, number).particles
+        now = snapshot.particle_q[particles.start : particles.stop, :2].astype(float)
+        start = layout.particle_q[particles.start : particles.stop, :2]
+        a, b = start - start.mean(axis=0), now - now.mean(axis=0)
+        turn = math.atan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
+        moved = pose_rows(now.mean(axis=0) - start.mean(axis=0), turn)
+        return np.concatenate([pose_rows(beads, chain_yaw(beads, closed=True)), moved])
+
+
+def bag_mask(segmentation: np.ndarray, first: int, stop: int) -> np.ndarray:
+    """Filled convex hull (320, 160) uint8 of the pixels with ids first .. stop - 1; may be empty."""
+    mask = np.zeros(SHAPE, np.uint8)
+    pixels = np.argwhere((segmentation >= first) & (segmentation < stop))
+    if len(pixels):
+        hull = cv2.convexHull(pixels[:, ::-1].astype(np.int32))
+        cv2.fillConvexPoly(mask, hull, 1)
+    return mask
+
+
+def enclosed(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Share of rays sideways and downwards from `point` (3,) that meet the triangles.
+
+    vertices (P, 3) and faces (T, 3); near 1 inside a bag, near 0 beside it.
+    """
+    a = vertices[faces[:, 0]]
+    u, v = vertices[faces[:, 1]] - a, vertices[faces[:, 2]] - a
+    rays = _downward_rays()
+    # all rays against all triangles (Moeller, Trumbore, 1997)
+    h = np.cross(rays[:, None], v)
+    det = np.einsum("tk,rtk->rt", u, h)
+    det = np.where(np.abs(det) < 1e-14, 1e-14, det)
+    s = point - a
+    p = np.einsum("tk,rtk->rt", s, h) / det
+    q = np.cross(s, u)
+    w = np.einsum("rk,tk->rt", rays, q) / det
+    far = np.einsum("tk,tk->t", v, q) / det
+    hit = (p >= 0) & (w >= 0) & (p + w <= 1) & (far > 0)
+    return float(hit.any(axis=1).mean())
+
+
+@functools.cache
+def _downward_rays() -> np.ndarray:
+    """Unit vectors (R, 3) spread evenly over the lower half of the sphere (Fibonacci)."""
+    k = np.arange(_RAYS) + 0.5
+    z = -k / _RAYS
+    turn = np.pi * (1 + math.sqrt(5)) * k
+    level = np.sqrt(1 - z**2)
+    return np.column_stack([level * np.cos(turn), level * np.sin(turn), z])
+
+
+@functools.cache
+def _shell(config: BagConfig):  # type: ignore[no-untyped-def]
+    return bag_shell(config)
+
+
+@functools.cache
+def _bead_mass(config: BagConfig) -> float:
+    """Mass of a bead with its share of the shell [kg]."""
+    from ..objects.surface import area_share
+
+    shell = _shell(config)
+    share = area_share(shell.vertices, shell.faces)[shell.ring]
+    return float(config.bead_mass + config.mass * share.mean())

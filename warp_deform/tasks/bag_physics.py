@@ -1,0 +1,30 @@
+"""What all bag tasks share: how bags behave, and how they and the items are carried."""
+
+from __future__ import annotations
+
+from ..robots.primitive import PrimitiveConfig
+from ..solver.config import SolverConfig
+from .task import Stage
+
+__all__ = ["BAG_PRIMITIVE", "BAG_SOLVER", "CARRY", "INSERT", "OPEN"]
+
+BAG_SOLVER = SolverConfig(
+    damping=1.0,
+    table_friction=0.8,
+    contact_friction=0.4,
+    recovery=0.1,
+    margin=0.006,
+    viscosity=30.0,
+    dry_friction=2.0,
+    sleep_speed=0.006,
+)
+"""Viscosity and dry friction inside the shell bring a crumpled bag to rest within a second."""
+
+OPEN = Stage(lift=0.05, speed=0.25)
+"""Low, so that a pulled bead opens the bag instead of lifting it."""
+INSERT = Stage(lift=0.30, speed=0.5, lower_speed=0.15)
+"""Over the rim, and down softly."""
+CARRY = Stage(lift=0.40, speed=0.25, pause=0.3)
+"""The whole bag with what is in it; what hangs from the tip calms before it moves and is lowered."""
+
+BAG_PRIMITIVE = PrimitiveConfig(hover=0.10)
