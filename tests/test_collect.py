@@ -16,7 +16,8 @@ import pytest
 from warp_deform import collect as collecting
 from warp_deform.collect import CollectConfig, CollectReport, collect, most_attempts
 from warp_deform.collection import Attempt, Collection
-from warp_deform.episode_loop import SOLVED, demonstrate, play
+from warp_deform.demonstrators import demonstrator
+from warp_deform.episode_loop import SOLVED, play
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
 from warp_deform.filming import check_video
@@ -89,7 +90,8 @@ def test_slots_and_order_do_not_change_an_episode(collected: tuple[Path, Collect
     reader = EpisodeReader(collected[0])
     worlds = Worlds(TASK, 3, lanes=8)
     seeds = reversed(reader.seeds)
-    runs = play(worlds, seeds, act=demonstrate, look=lambda worlds, slot: worlds.hash(slot))
+    act = demonstrator("scripted")
+    runs = play(worlds, seeds, act=act, look=lambda worlds, slot: worlds.hash(slot))
     found = {run.seed: run for _, run in runs}
     assert sorted(found) == list(reader.seeds)
     for seed, run in found.items():
@@ -148,6 +150,7 @@ def test_growing_and_shrinking_repeat_nothing(tmp_path: Path) -> None:
         ({"task": "cable-ring"}, f"task is {TASK} there and cable-ring here"),
         ({"seed": 8}, "seed is 7 there and 8 here"),
         ({"robot": "panda"}, "robot is ur5 there and panda here"),
+        ({"demonstrator": "mpc"}, "demonstrator is scripted there and mpc here"),
     ],
 )
 def test_a_folder_of_another_collection_is_refused(
@@ -200,7 +203,7 @@ def test_two_owners_are_one_too_many(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"demonstrator": "mpc"}, "no demonstrator 'mpc'; it has: scripted"),
+        ({"demonstrator": "me"}, "no demonstrator 'me'; there are: scripted, visible, mpc"),
         ({"episodes": 0}, "episodes is 0"),
         ({"seed": -1}, "the seed is -1; it must be 0 to"),
         ({"workers": 0}, "workers is 0"),

@@ -173,9 +173,10 @@ def test_goals_come_from_episode_files_and_folders(block: PickPlaceEnv, tmp_path
             for name in ("particle_q", "particle_qd", "body_q", "body_qd")
         }
         steps = tuple(replace(step, **pictures, **arrays) for step in episode.steps)
-        info = replace(episode.info, task=BLOCK, success=True, goal=None)
+        poses.append(block.task.goal_targets(block.worlds.episodes[0].layout, state))
+        extra = {"goal_targets": poses[-1].tolist()}
+        info = replace(episode.info, task=BLOCK, success=True, goal=None, extra=extra)
         writer.write(replace(episode, info=info, steps=steps, goal=None))
-        poses.append(block.task.goal_targets(state))
     for given, seed, pose in (
         (tmp_path, 10_000, poses[0]),
         (str(tmp_path), 10_001, poses[1]),

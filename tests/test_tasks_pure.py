@@ -148,7 +148,7 @@ def test_a_goal_scores_one_and_stands_for_its_targets(cls) -> None:
     assert goal.zones == ()
     state = snapshot(goal.particle_q, goal, goal.body_q)
     assert item.solved(layout, state)
-    assert item.goal_targets(state) == pytest.approx(layout.targets, abs=1e-9)
+    assert item.goal_targets(layout, state) == pytest.approx(layout.targets, abs=1e-9)
     half = cls.ground_truth_size // 2
     vector = item.ground_truth(layout, state)
     assert vector[:half] == pytest.approx(vector[half:], abs=1e-6)

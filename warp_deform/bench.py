@@ -24,11 +24,13 @@ from .solver.solver import SolverFusedXPBD
 from .tasks.block import BlockNotarget
 from .tasks.cable_physics import CABLE_SOLVER
 
-__all__ = ["run"]
+__all__ = ["SCENES", "run"]
 
 _REST_AFTER = 2.0  # [s], as for the peers
 _SOFT_SCENES: dict[str, Callable[..., dict[str, Any]]] = dict.fromkeys(CLOTH_SCENES, run_cloth)
 """What times our side of each scene with a play of its own."""
+SCENES = (*PEER_SCENES, *_SOFT_SCENES)
+"""Names that `run` knows."""
 _EDGES = "-edges"  # our edge contact on or off: the peers have one scene for both
 
 
@@ -57,9 +59,8 @@ def run(
         InputError: no such scene or peer, or the peer is not installed.
         PhysicsError: a guard fired.
     """
-    known = (*PEER_SCENES, *_SOFT_SCENES)
-    if scene not in known:
-        raise InputError(f"no scene {scene!r} to time; choose from {', '.join(known)}")
+    if scene not in SCENES:
+        raise InputError(f"no scene {scene!r} to time; choose from {', '.join(SCENES)}")
     if peer is not None:
         check_peer(peer, scene.removesuffix(_EDGES))
     if not ((seconds is None or seconds > 0) and repeats > 0 and worlds > 0):

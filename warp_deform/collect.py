@@ -16,7 +16,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .collection import Attempt, Collection, append_attempt, check_seeds
-from .episode_loop import SLOTS, SOLVED, demonstrate, play, worlds_for
+from .demonstrators import demonstrator
+from .episode_loop import SLOTS, SOLVED, play, worlds_for
 from .episodes import EpisodeReader, EpisodeWriter, Goal, combine_hashes, rebuild_index
 from .errors import InputError
 from .goals import load_goals
@@ -39,6 +40,7 @@ class CollectConfig:
     """What to collect.
 
     episodes: successes to keep; seed: first seed, the others follow
+    demonstrator: who acts, one of `demonstrators.DEMONSTRATORS`
     goals: folder of goals (see `make_goals`); a seed aims at the one number seed modulo their
         count, as in the environments. None constructs a goal from every seed
     workers: processes; None takes one per core, but not for a handful of episodes
@@ -63,10 +65,7 @@ class CollectConfig:
         if self.episodes < 1:
             raise InputError(f"episodes is {self.episodes}; it must be 1 or more")
         check_seeds(self.seed, most_attempts(self.episodes))
-        if self.demonstrator != "scripted":
-            raise InputError(
-                f"{self.task} has no demonstrator {self.demonstrator!r}; it has: scripted"
-            )
+        demonstrator(self.demonstrator)
 
 
 @dataclass(frozen=True)
@@ -201,8 +200,8 @@ def attempt_chunk(chunk: _Chunk) -> Iterator[Attempt]:
     def goal(seed: int) -> Goal | None:
         return goals[seed % len(goals)] if goals else None
 
-    worlds = worlds_for(config.task, config.robot)
-    for slot, run in play(worlds, chunk.seeds, act=demonstrate, look=observe, goals=goal):
+    worlds, act = worlds_for(config.task, config.robot), demonstrator(config.demonstrator)
+    for slot, run in play(worlds, chunk.seeds, act=act, look=observe, goals=goal):
         success = run.ended == SOLVED
         if success:
             writer.write(record(worlds, slot, run, demonstrator=config.demonstrator))

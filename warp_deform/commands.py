@@ -36,6 +36,7 @@ __all__ = [
 _Task = Annotated[Positional[str], arg(metavar="TASK")]
 _Folder = Annotated[Positional[Path], arg(metavar="DIR")]
 _Count = Annotated[int, arg(aliases=["-n"], metavar="N")]
+_Demonstrator = Literal["scripted", "visible", "mpc"]
 _File = Annotated[Path | None, arg(metavar="FILE")]
 
 
@@ -83,8 +84,9 @@ class DemoOptions(CommandOptions):
     """First seed. Training 0.., test 10,000.., validation 50,000.., goals 100,000.. ."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder for the episodes; complete ones that are there already are kept."""
-    demonstrator: str = "scripted"
-    """Who acts: "scripted", the paper's, which sees the simulator's state."""
+    demonstrator: _Demonstrator = "scripted"
+    """Who acts: "scripted", the paper's; "visible", which picks only what the tip would really
+    meet; or "mpc", which simulates eight candidates and takes the best. All see the state."""
     workers: Annotated[int | None, arg(metavar="W")] = None
     """Processes; left out, one per core, fewer for few episodes. The result is the same."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
@@ -141,6 +143,8 @@ class GoalsOptions(CommandOptions):
     """Folder for the goals."""
     kind: Literal["demonstrated", "constructed"] = "demonstrated"
     """Last states of demonstrations (the paper), or objects placed at the goal and settled."""
+    demonstrator: _Demonstrator = "scripted"
+    """Whose demonstrations, see `warp-deform demo`."""
     workers: Annotated[int | None, arg(metavar="W")] = None
     """Processes; one per core when left out."""
     robot: Literal["ur5", "panda"] = "ur5"
@@ -160,6 +164,7 @@ def goals(options: GoalsOptions) -> Outcome:
         count=options.count,
         seed=options.seed,
         kind=options.kind,
+        demonstrator=options.demonstrator,
         robot=options.robot,
         workers=options.workers,
     )

@@ -10,6 +10,8 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
+from .demonstrators import demonstrator as find_demonstrator
+from .episode_loop import Run
 from .errors import InputError
 from .rendering.scene_view import ArmMeshes, SceneView
 from .reset_options import check_options, goal_for, next_seed
@@ -76,7 +78,7 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         goals = {} if given is None else {0: goal_for(self.task, given, seed=number)}
         self._running = False
         self.worlds.reset({0: number}, goals=goals)
-        self._rng = episode_rng(number, DEMONSTRATOR_STREAM)
+        self._run = Run[Any](number, episode_rng(number, DEMONSTRATOR_STREAM))
         self._score = self.worlds.score(0)
         self._running = True
         return observation(self.worlds, 0), information(self.worlds, 0, outcome=None)
@@ -100,15 +102,18 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self._running = not (terminated or truncated)
         return observation(self.worlds, 0), reward, terminated, truncated, info
 
-    def demonstrate(self) -> Action | None:
-        """The scripted demonstrator's action now; it may look at the simulator's state.
+    def demonstrate(self, demonstrator: str = "scripted") -> Action | None:
+        """What a demonstrator would do now: "scripted", "visible" or "mpc"; it sees the state.
 
         None when it sees nothing to do or would reach beyond the action space.
+
+        Raises:
+            InputError: there is no such demonstrator.
+            gymnasium.error.ResetNeeded: no episode runs.
         """
         if not self._running:
             raise ResetNeeded("no episode runs: call reset() first")
-        episode = self.worlds.episodes[0]
-        action = self.task.demonstrate(episode.layout, episode.snapshot, self._rng)
+        action = find_demonstrator(demonstrator)(self.worlds, {0: self._run})[0]
         return action if action is not None and self.action_space.contains(action) else None
 
     def render(self) -> np.ndarray | None:

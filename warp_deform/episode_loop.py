@@ -17,7 +17,7 @@ from .errors import InputError, WarpDeformError
 from .running import DEMONSTRATOR_STREAM, episode_rng
 from .worlds import Worlds
 
-__all__ = ["SLOTS", "SOLVED", "Act", "Run", "demonstrate", "play", "worlds_for"]
+__all__ = ["SLOTS", "SOLVED", "Act", "Run", "play", "worlds_for"]
 
 Row = TypeVar("Row")
 
@@ -45,16 +45,6 @@ class Run(Generic[Row]):
 
 Act = Callable[[Worlds, Mapping[int, Run[Row]]], Mapping[int, np.ndarray | None]]
 """Next action (7,) of every running slot, or None for a slot whose episode is to end."""
-
-
-def demonstrate(worlds: Worlds, runs: Mapping[int, Run[Row]]) -> dict[int, np.ndarray | None]:
-    """What the task's scripted demonstrator does next, in every slot."""
-    return {
-        slot: worlds.task.demonstrate(
-            worlds.episodes[slot].layout, worlds.episodes[slot].snapshot, run.rng
-        )
-        for slot, run in runs.items()
-    }
 
 
 @functools.lru_cache(maxsize=2)

@@ -27,8 +27,7 @@ from .episodes import (
     rebuild_index,
 )
 from .errors import InputError, WarpDeformError
-from .recording import observe, record, task_config
-from .rendering.images import Images
+from .recording import GOAL_TARGETS, observe, record, task_config
 from .tasks.free_space import FreeSpace
 from .tasks.registry import task as find_task
 from .tasks.task import Layout, Snapshot, Task
@@ -52,19 +51,21 @@ def make_goals(
     count: int,
     seed: int = GOAL_SEED,
     kind: str = _DEMONSTRATED,
+    demonstrator: str = "scripted",
     robot: str = "ur5",
     workers: int | None = None,
 ) -> dict[str, Any]:
     """Make `count` goals of a goal-conditioned task in a folder; goes on with what is there.
 
-    kind: "demonstrated" keeps the scripted demonstrator's successes on the seeds, whose last states
-        are the goals (the paper's protocol); "constructed" places the objects at sampled targets
-        and lets them settle
+    kind: "demonstrated" keeps a demonstrator's successes on the seeds, whose last states are the
+        goals (the paper's protocol); "constructed" places the objects at sampled targets and lets
+        them settle, which takes no demonstrator but the default
 
     Returns task, kind, goals, attempts, seconds [s], physics_ok and state_hash.
 
     Raises:
-        InputError: the task has no goal, the kind is unknown, or the folder holds something else.
+        InputError: the task has no goal, the kind or the demonstrator is unknown, or the folder
+            holds something else.
 
     Source: Seita et al., ICRA 2021, section on goal-conditioned tasks.
     """
@@ -74,6 +75,8 @@ def make_goals(
         raise InputError(f"count is {count}; it must be 1 or more")
     began = time.perf_counter()
     if kind == CONSTRUCTED:
+        if demonstrator != "scripted":
+            raise InputError(f"constructed goals have no demonstrator, so not {demonstrator!r}")
         check_seeds(seed, count)
         _construct(task, Path(out), range(seed, seed + count), robot)
         attempts = count
@@ -81,7 +84,13 @@ def make_goals(
         from .collect import CollectConfig, collect  # it reads goals in its turn
 
         config = CollectConfig(
-            task=task, episodes=count, seed=seed, out=out, robot=robot, workers=workers
+            task=task,
+            episodes=count,
+            seed=seed,
+            out=out,
+            demonstrator=demonstrator,
+            robot=robot,
+            workers=workers,
         )
         attempts = collect(config).attempts
     else:
@@ -169,10 +178,12 @@ def _rest(worlds: Worlds, runs: Mapping[int, Run[Step]]) -> dict[int, np.ndarray
 def _goal_episode(worlds: Worlds, slot: int, run: Run[Step], config: dict[str, Any]) -> Episode:
     """A slot's state as a goal: one row, at which the task is done."""
     made = record(worlds, slot, run, demonstrator=CONSTRUCTED)
+    goal = worlds.as_goal(slot, kind=CONSTRUCTED)
+    extra = {GOAL_TARGETS: goal.targets.tolist()}
     return Episode(
-        info=replace(made.info, success=True, config=config),
+        info=replace(made.info, success=True, config=config, extra=extra),
         steps=(replace(made.steps[0], success=True),),
-        goal=worlds.as_goal(slot, kind=CONSTRUCTED),
+        goal=goal,
     )
 
 
@@ -185,10 +196,5 @@ def _goal(reader: EpisodeReader, seed: int) -> Goal:
     if not info.success:
         raise InputError(f"{path} did not reach its goal, so its last state is none")
     row = reader.read_step(seed, info.actions)
-
-    def images() -> Images:
-        return Images(row.color, row.height, np.zeros(row.height.shape, np.uint8))
-
-    state = Snapshot(row.particle_q, row.particle_qd, row.body_q, row.body_qd, (), images)
     kind = CONSTRUCTED if info.demonstrator == CONSTRUCTED else _DEMONSTRATED
-    return Goal(row.color, row.height, task.goal_targets(state), kind, seed)
+    return Goal(row.color, row.height, np.array(info.extra[GOAL_TARGETS]), kind, seed)

@@ -19,7 +19,10 @@ from .episodes import (
 from .tasks.task import Task
 from .worlds import Worlds
 
-__all__ = ["observe", "record", "task_config"]
+__all__ = ["GOAL_TARGETS", "observe", "record", "task_config"]
+
+GOAL_TARGETS = "goal_targets"
+"""Where an episode of a goal-conditioned task keeps what its last state stands for as a goal."""
 
 
 def observe(worlds: Worlds, slot: int) -> Step:
@@ -70,9 +73,16 @@ def record(worlds: Worlds, slot: int, run: Run[Step], *, demonstrator: str) -> E
         versions=versions(),
         cpu=cpu_fingerprint(),
         goal=None,
-        extra={},
+        extra=_as_goal(worlds, slot),
     )
     return Episode(info, (*rows, last), episode.goal)
+
+
+def _as_goal(worlds: Worlds, slot: int) -> dict[str, Any]:
+    """What the last state of an episode stands for as a goal, where the task has goals."""
+    if not worlds.task.goal_conditioned:
+        return {}
+    return {GOAL_TARGETS: worlds.as_goal(slot, kind="demonstrated").targets.tolist()}
 
 
 def task_config(task: Task) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .errors import InputError
-from .solver.grip import PUSHES
+from .objects.push import MOST_PUSHES
 
 if TYPE_CHECKING:
     from .objects.push import Push
@@ -112,9 +112,11 @@ def rollout(
     data.clear_grips()
     _write_paths(solver, paths)
     for w, kicks in (pushes or {}).items():
-        if len(kicks) > PUSHES:
-            raise InputError(f"{len(kicks)} pushes in world {w}; there may be {PUSHES} at once")
-        for at, push in enumerate(kicks, start=data.slot[w] * PUSHES):
+        if len(kicks) > MOST_PUSHES:
+            raise InputError(
+                f"{len(kicks)} pushes in world {w}; there may be {MOST_PUSHES} at once"
+            )
+        for at, push in enumerate(kicks, start=data.slot[w] * MOST_PUSHES):
             data.views["grips.push"][at] = push.particle
             data.views["grips.push_acceleration"][at] = push.acceleration
             data.views["grips.push_steps"][at] = round(push.seconds / dt)
@@ -153,8 +155,8 @@ def _write_paths(solver: SolverFusedXPBD, paths: Mapping[int, GripPath]) -> None
     views, k = data.views, 0
     for w, path in paths.items():
         slot, n = data.slot[w], len(path.times)
-        count = data.topologies[data.world_topology[w]]
-        limit = count.particle_count if path.particle is not None else count.body_count
+        topology = data.topologies[data.world_topology[w]]
+        limit = topology.particle_count if path.particle is not None else topology.body_count
         held = path.particle if path.particle is not None else path.body
         if held is None or not 0 <= held < limit:
             raise InputError(f"world {w} has no particle or body number {held} to grip")
@@ -170,6 +172,8 @@ def _write_paths(solver: SolverFusedXPBD, paths: Mapping[int, GripPath]) -> None
         views["grips.lower_start"][slot], views["grips.lower_end"][slot] = lower
         views["grips.time"][k : k + n] = path.times
         views["grips.position"][k : k + n] = path.positions
+        if path.particle is not None:
+            data.tether(w, path.particle)
         rotations = _IDENTITY if path.rotations is None else _same_side(path.rotations)
         views["grips.rotation"][k : k + n] = rotations
         k += n

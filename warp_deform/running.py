@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .episodes import Goal
+from .objects.box import Box
 from .objects.scene_object import SceneObject
 from .rendering.drawables import Drawables
-from .robots.primitive import Motion, Outcome
-from .rollout import Frames, Rollout
+from .robots.arm import Robot
+from .robots.primitive import Grasp, Motion, Outcome, carry, find_grasp
+from .rollout import Frames, GripPath, Rollout
 from .solver.guards import Problem
-from .tasks.task import Layout, Snapshot
+from .tasks.task import Layout, Snapshot, Task
 
 __all__ = ["DEMONSTRATOR_STREAM", "LAYOUT_STREAM", "Plan", "RunningEpisode", "StepReport",
            "episode_rng", "join_frames"]  # fmt: skip
@@ -79,6 +81,27 @@ class Plan:
     motions: list[Motion] = field(default_factory=list)
     joints: list[np.ndarray | None] = field(default_factory=list)
     runs: list[Rollout] = field(default_factory=list)
+
+    def grasp(self, task: Task, snapshot: Snapshot) -> Grasp | None:
+        """What the tip meets when it descends at the pick point now."""
+        s = snapshot
+        return find_grasp(self.action[:3], s.objects, s.particle_q, s.body_q, task.primitive)
+
+    def carry(
+        self, grasp: Grasp, task: Task, robot: Robot, snapshot: Snapshot, radii: np.ndarray
+    ) -> tuple[Motion, GripPath]:
+        """Motion of the loaded tip, down to where what it holds would rest on the table.
+
+        radii (P,): of the world's particles [m]
+        """
+        if grasp.particle is not None:
+            lowest = snapshot.particle_q[grasp.particle, 2] - radii[grasp.particle]
+        else:
+            box = next(o for o in snapshot.objects if isinstance(o, Box) and o.body == grasp.body)
+            lowest = snapshot.body_q[box.body, 2] + box.config.lowest
+        hover = robot.hover_height(self.action[3], self.action[4], task.primitive.hover)
+        stage, floor = task.stage_of(float(self.action[6])), grasp.height - float(lowest)
+        return carry(self.action, grasp, stage, floor, hover, task.primitive)
 
 
 def join_frames(frames: Sequence[Frames | None], seconds: Sequence[float]) -> Frames | None:

@@ -12,11 +12,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
+from .demonstrators import demonstrator as find_demonstrator
 from .env import WorldsView, check_render_mode, ending
+from .episode_loop import Run
 from .errors import InputError
 from .reset_options import GoalOption, check_options, goal_for, next_seed
+from .running import DEMONSTRATOR_STREAM, episode_rng
 from .spaces import action_space, check_action, information, observation, observation_space
-from .tasks.task import Task
+from .tasks.task import Action, Task
 from .worlds import Worlds
 
 __all__ = ["PickPlaceVectorEnv"]
@@ -71,6 +74,7 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         """(num_envs,) bool: which episodes are over and wait for their reset."""
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._scores = np.zeros(num_envs)
+        self._runs: dict[int, Run[Any]] = {}
         self._view = WorldsView(self.worlds)
 
     @property
@@ -158,6 +162,25 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
             self._add_info(infos, information(self.worlds, i, outcome=None), i)
         return self._observations(), rewards, terminations, truncations, infos
 
+    def demonstrate(self, demonstrator: str = "scripted") -> list[Action | None]:
+        """What a demonstrator would do now in every environment, as in `PickPlaceEnv`.
+
+        None where the episode is over, and where `PickPlaceEnv` has None.
+
+        Raises:
+            InputError: there is no such demonstrator.
+            gymnasium.error.ResetNeeded: there is no episode yet.
+        """
+        if len(self.worlds.episodes) < self.num_envs:
+            raise ResetNeeded("no episodes run: call reset() first")
+        running = {i: run for i, run in self._runs.items() if not self.ended[i]}
+        chosen = find_demonstrator(demonstrator)(self.worlds, running)
+        space = self.single_action_space
+        actions = [chosen.get(i) for i in range(self.num_envs)]
+        return [
+            action if action is not None and space.contains(action) else None for action in actions
+        ]
+
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One frame (360, 640, 3) uint8 an environment; None without a render mode."""
         if self.render_mode is None:
@@ -173,7 +196,8 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         numbers = {i: self._draw(i) if s is None else s for i, s in seeds.items()}
         made = {i: goal_for(self.task, goal, seed=numbers[i]) for i, goal in goals.items()}
         self.worlds.reset(numbers, goals=made)
-        for i in numbers:
+        for i, number in numbers.items():
+            self._runs[i] = Run(number, episode_rng(number, DEMONSTRATOR_STREAM))
             self._scores[i] = self.worlds.score(i)
             self.ended[i] = False
 

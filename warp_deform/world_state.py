@@ -12,8 +12,6 @@ from .solver.data import SolverData
 
 __all__ = ["WorldState"]
 
-_BODY_ARRAYS = ("x", "q", "v", "omega")
-
 
 @dataclass(frozen=True, eq=False)
 class WorldState:
@@ -39,11 +37,14 @@ class WorldState:
     @staticmethod
     def of(data: SolverData, world: int, episode: RunningEpisode) -> WorldState:
         """Copy the state of one world."""
-        rows = data.body_rows(world)
+        x, quat, v, omega = (array.copy() for array in _bodies(data, world))
         return WorldState(
-            data.lane("particles.x", world).copy(),
-            data.lane("particles.v", world).copy(),
-            *(data.views[f"bodies.{name}"][rows].copy() for name in _BODY_ARRAYS),
+            particle_q=data.lane("particles.x", world).copy(),
+            particle_qd=data.lane("particles.v", world).copy(),
+            body_x=x,
+            body_quat=quat,
+            body_v=v,
+            body_omega=omega,
             episode=_copy(episode),
         )
 
@@ -53,11 +54,10 @@ class WorldState:
         Raises:
             InputError: the world has other numbers of particles or bodies, or another precision.
         """
-        rows = data.body_rows(world)
-        bodies = [data.views[f"bodies.{name}"][rows] for name in _BODY_ARRAYS]
-        places = [data.lane("particles.x", world), data.lane("particles.v", world), *bodies]
-        saved = [self.particle_q, self.particle_qd]
-        saved += [self.body_x, self.body_quat, self.body_v, self.body_omega]
+        particles = [data.lane("particles.x", world), data.lane("particles.v", world)]
+        places = [*particles, *_bodies(data, world)]
+        bodies = [self.body_x, self.body_quat, self.body_v, self.body_omega]
+        saved = [self.particle_q, self.particle_qd, *bodies]
         for place, values in zip(places, saved, strict=True):
             if (place.shape, place.dtype) != (values.shape, values.dtype):
                 raise InputError(
@@ -67,6 +67,12 @@ class WorldState:
         for place, values in zip(places, saved, strict=True):
             place[:] = values
         return _copy(self.episode)
+
+
+def _bodies(data: SolverData, world: int) -> list[np.ndarray]:
+    """Writable views of one world's bodies: centres, turns, velocities, angular velocities."""
+    rows = data.body_rows(world)
+    return [data.views[f"bodies.{name}"][rows] for name in ("x", "q", "v", "omega")]
 
 
 def _copy(episode: RunningEpisode) -> RunningEpisode:

@@ -22,16 +22,8 @@ from .rendering.images import Images
 from .rendering.pixels import BOUNDS
 from .rendering.topdown import TopDown
 from .robots import robot as find_robot
-from .robots.primitive import (
-    Grasp,
-    Motion,
-    Outcome,
-    approach,
-    carry,
-    find_grasp,
-    solve_joints,
-)
-from .rollout import GripPath, rollout
+from .robots.primitive import Motion, Outcome, approach, solve_joints
+from .rollout import rollout
 from .running import LAYOUT_STREAM, Plan, RunningEpisode, StepReport, episode_rng, join_frames
 from .solver.solver import SolverFusedXPBD
 from .tasks.free_space import FreeSpace
@@ -171,10 +163,7 @@ class Worlds:
             objects = self._objects(layout)
             if len(layout.body_q):
                 data.set_bodies(slot, layout.body_q)
-                for item in (objects[i] for i in layout.configs):
-                    if isinstance(item, Box):
-                        size, inertia = item.config.parts[0].size, item.config.inertia()[1]
-                        data.set_box(slot, item.body, np.array(size), item.config.mass, inertia)
+                self._shape_boxes(slot, layout, objects)
         least = {
             s: l.settle_seconds + max((push.seconds for push in l.pushes), default=0.0)
             for s, l in layouts.items()
@@ -213,6 +202,13 @@ class Worlds:
             for i, item in enumerate(self.objects)
         )
 
+    def _shape_boxes(self, slot: int, layout: Layout, objects: tuple[SceneObject, ...]) -> None:
+        """Give the boxes of a slot the sizes and masses that they have in its episode."""
+        for item in (objects[i] for i in layout.configs):
+            if isinstance(item, Box):
+                size, inertia = item.config.parts[0].size, item.config.inertia()[1]
+                self.solver.data.set_box(slot, item.body, np.array(size), item.config.mass, inertia)
+
     def _construct_goals(
         self, layouts: Mapping[int, Layout], seeds: Mapping[int, int]
     ) -> dict[int, Goal]:
@@ -226,7 +222,7 @@ class Worlds:
     def as_goal(self, slot: int, *, kind: str) -> Goal:
         """The present state of a slot as a goal; kind: "constructed" or "demonstrated"."""
         snapshot = self.episodes[slot].snapshot
-        targets = self.task.goal_targets(snapshot)
+        targets = self.task.goal_targets(self.episodes[slot].layout, snapshot)
         images = snapshot.images
         return Goal(images.color, images.height, targets, kind, self.episodes[slot].seed)
 
@@ -285,7 +281,8 @@ class Worlds:
         config = self.task.primitive
         motions = {}
         for slot, plan in plans.items():
-            pick, grasp = plan.action[:3], self._grasp(slot, plan)
+            pick = plan.action[:3]
+            grasp = plan.grasp(self.task, self.episodes[slot].snapshot)
             hover = self.robot.hover_height(pick[0], pick[1], config.hover)
             height = grasp.height if grasp else 0.0
             motions[slot] = approach(self.episodes[slot].tip, pick, hover, height, config)
@@ -303,10 +300,16 @@ class Worlds:
     def _carry(self, plans: Mapping[int, Plan], record: float) -> None:
         """Lift, carry and let go what the tips hold, and let the worlds come to rest."""
         motions, paths = {}, {}
+        radii = self.solver.data.topologies[0].particle_radius
         for slot, plan in plans.items():
-            grasp = self._grasp(slot, plan) if plan.outcome is Outcome.MISSED else None
+            if plan.outcome is not Outcome.MISSED:
+                continue
+            snapshot = self.episodes[slot].snapshot
+            grasp = plan.grasp(self.task, snapshot)
             if grasp is not None:
-                motions[slot], paths[slot] = self._carry_path(slot, plan.action, grasp)
+                motions[slot], paths[slot] = plan.carry(
+                    grasp, self.task, self.robot, snapshot, radii
+                )
         moving = self._reachable(plans, motions)
         if not moving:
             return
@@ -337,31 +340,6 @@ class Worlds:
             else:
                 self.episodes[slot].posture = q[-1]
         return [slot for slot, q in zip(motions, joints, strict=True) if q is not None]
-
-    def _grasp(self, slot: int, plan: Plan) -> Grasp | None:
-        """What the tip meets when it descends at the pick point now."""
-        snapshot = self.episodes[slot].snapshot
-        return find_grasp(
-            plan.action[:3],
-            snapshot.objects,
-            snapshot.particle_q,
-            snapshot.body_q,
-            self.task.primitive,
-        )
-
-    def _carry_path(self, slot: int, action: np.ndarray, grasp: Grasp) -> tuple[Motion, GripPath]:
-        """Motion of the loaded tip, down to where what it holds would rest on the table."""
-        snapshot = self.episodes[slot].snapshot
-        if grasp.particle is not None:
-            radius = self.solver.data.topologies[0].particle_radius[grasp.particle]
-            lowest = snapshot.particle_q[grasp.particle, 2] - radius
-        else:
-            box = next(o for o in snapshot.objects if isinstance(o, Box) and o.body == grasp.body)
-            lowest = snapshot.body_q[box.body, 2] + box.config.lowest
-        hover = self.robot.hover_height(action[3], action[4], self.task.primitive.hover)
-        stage = self.task.stage_of(float(action[6]))
-        floor = grasp.height - float(lowest)
-        return carry(action, grasp, stage, floor, hover, self.task.primitive)
 
     # -- looking
 
@@ -400,7 +378,8 @@ class Worlds:
         self._check_slot(slot)
         if state.episode.posture.shape != self.robot.home_q.shape:
             raise InputError("the state was saved with another robot")
-        self.episodes[slot] = state.put(self.solver.data, slot)
+        episode = self.episodes[slot] = state.put(self.solver.data, slot)
+        self._shape_boxes(slot, episode.layout, episode.objects)
         self._look(slot)
 
     def score(self, slot: int) -> float:

@@ -9,6 +9,10 @@ import numpy as np
 __all__: list[str] = []  # `warp_deform.objects` is the import path of what is here
 
 
+MOST_PUSHES = 2
+"""So many particles of a world may be pushed at once."""
+
+
 @dataclass(frozen=True, eq=False)
 class Push:
     """One particle is accelerated for a while.

@@ -28,10 +28,12 @@ if TYPE_CHECKING:
     from ..objects.scene_object import SceneObject
     from .arm import Robot
 
-__all__ = ["Grasp", "Motion", "Outcome", "PrimitiveConfig", "Stage", "approach", "carry",
+__all__ = ["Grasp", "Motion", "Outcome", "PrimitiveConfig", "approach", "carry",
            "find_grasp", "solve_joints"]  # fmt: skip
 
 
+_GENTLE_PIECES = 13
+"""Way-points of a gentle stretch."""
 BEAD_FIRST = 0.006
 """A bead that a descending tip meets so little below a vertex of the shell is taken instead [m]."""
 
@@ -76,12 +78,14 @@ class Stage:
 
     lower_speed: of the descent over the place point [m/s]; None: as fast as it carries
     pause: rest after lifting and before lowering [s], in which what hangs from the tip calms
+    gentle: whether lift, carry and descent begin and end slowly; their mean speed is then `speed`
     """
 
     lift: float
     speed: float
     lower_speed: float | None = None
     pause: float = 0.0
+    gentle: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +207,8 @@ def carry(
     up = _straight(points[:2], stage.speed, config)
     across = _straight(points[1:3], stage.speed, config)
     down = _straight(points[2:], stage.lower_speed or stage.speed, config)
-    loaded = _joined([up, across, down], stage.pause)
+    parts = [_gentle(part) for part in (up, across, down)] if stage.gentle else [up, across, down]
+    loaded = _joined(parts, stage.pause)
     lowered = loaded.seconds
     lower = lowered - down.seconds, lowered
     times = np.append(loaded.times, lowered + config.dwell)
@@ -252,6 +257,14 @@ def _straight(points: Sequence[np.ndarray], speed: float, config: PrimitiveConfi
             times.append(times[-1] + seconds / pieces)
             way_points.append(a + (b - a) * (k / pieces))
     return Motion(np.array(times), np.array(way_points))
+
+
+def _gentle(motion: Motion) -> Motion:
+    """The same straight line in the same time, begun and ended at rest (smoothstep)."""
+    u = np.linspace(0.0, 1.0, max(_GENTLE_PIECES, len(motion.times)))
+    way = u * u * (3 - 2 * u)
+    a, b = motion.way_points[0], motion.way_points[-1]
+    return Motion(motion.seconds * u, a + (b - a) * way[:, None])
 
 
 def _joined(motions: Sequence[Motion], pause: float) -> Motion:

@@ -8,12 +8,13 @@ import newton
 import numpy as np
 import warp as wp
 
+from ..objects.push import MOST_PUSHES
 from .box_box import POINTS
-from .grip import PUSHES
 from .mirrored import Mirrored
 from .sheet_data import add_sheets
 from .structures import structures
-from .topology import WorldTopology, read_worlds
+from .tether import NO_TETHER
+from .topology import WorldTopology, read_worlds, tethers
 
 __all__ = ["KERNEL_ARGUMENTS", "SolverData"]
 
@@ -189,7 +190,7 @@ class SolverData:
         count, L = int(self.group_particle[-1]), self.lanes
         for name in ("x", "v", "xp", "xr"):
             self.add_array(f"particles.{name}", count, self.types.V3, (3, L), self.number)
-        for name in ("w", "w0"):
+        for name in ("w", "w0", "tether"):
             self.add_array(f"particles.{name}", count, self.types.V, (L,), self.number)
         if self.has_particles:
             inverse = self.model.particle_inv_mass.numpy()
@@ -228,8 +229,8 @@ class SolverData:
         ):
             self.add_array(f"grips.{name}", slots, wp.int32, (), np.int32)
         for name in ("push", "push_steps"):
-            self.add_array(f"grips.{name}", slots * PUSHES, wp.int32, (), np.int32)
-        self.add_array("grips.push_acceleration", slots * PUSHES, t.R3, (3,), number)
+            self.add_array(f"grips.{name}", slots * MOST_PUSHES, wp.int32, (), np.int32)
+        self.add_array("grips.push_acceleration", slots * MOST_PUSHES, t.R3, (3,), number)
         for name, dtype, shape in (
             ("offset", t.R3, (3,)), ("turn", t.Q, (4,)), ("lower_start", t.S, ()),
             ("lower_end", t.S, ()), ("shift", t.R3, (3,)),
@@ -339,6 +340,12 @@ class SolverData:
         """Nothing is gripped or pushed in any world."""
         for name in ("particle", "body", "push"):
             self.arrays[f"grips.{name}"].view[:] = -1
+        self.arrays["particles.tether"].view[:] = NO_TETHER
+
+    def tether(self, world: int, held: int) -> None:
+        """Tie the particles of a fabric to the one that will be held."""
+        topology = self.topologies[self.world_topology[world]]
+        self.lane("particles.tether", world)[:] = tethers(topology, held)
 
     def set_bodies(self, world: int, body_q: np.ndarray, body_qd: np.ndarray | None = None) -> None:
         """Set poses (B, 7) and twists (B, 6: linear at the centre of mass, angular) of a world."""

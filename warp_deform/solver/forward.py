@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from ..objects.attributes import SpringMode
+from ..objects.push import MOST_PUSHES
 from .bending import bending
 from .body_contact import body_contact
 from .box_box import box_box
@@ -21,7 +22,7 @@ from .box_triangle import box_triangle
 from .cell_list import cell_list
 from .distance import distance
 from .edge_contact import edge_contact
-from .grip import PUSHES, grip
+from .grip import grip
 from .internal_friction import internal_friction
 from .lanes import (  # noqa: F401  (operators are found by name)
     KERNEL_OPTIONS,
@@ -40,6 +41,7 @@ from .rigid import rigid
 from .sphere_contact import sphere_contact
 from .structures import structures
 from .table_contact import table_contact
+from .tether import tether
 from .triangle_contact import triangle_contact
 
 __all__ = ["forward_kernel"]
@@ -74,6 +76,7 @@ def forward_kernel(
     sleep_speed, calm_particle, damp_spring = (
         getattr(calms, n) for n in ("sleep_speed", "calm_particle", "damp_spring")
     )
+    project_tether = tether(scalar, lanes).project_tether
     grips_ = grip(scalar, lanes)
     follow_path, take, let_go = grips_.follow_path, grips_.take, grips_.let_go
     body = rigid(scalar, lanes)
@@ -222,8 +225,8 @@ def forward_kernel(
                 if grips.particle[w0 + lane] >= 0 or grips.body[w0 + lane] >= 0:
                     holding[lane] = S(1.0)
                     take(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
-                for p in range(wp.static(PUSHES)):
-                    at_push = (w0 + lane) * wp.static(PUSHES) + p
+                for p in range(wp.static(MOST_PUSHES)):
+                    at_push = (w0 + lane) * wp.static(MOST_PUSHES) + p
                     if grips.push[at_push] >= 0:
                         longest_push = wp.max(longest_push, grips.push_steps[at_push])
         # the table hides at once that a particle started under it
@@ -251,9 +254,9 @@ def forward_kernel(
                             at = b0 + lane * body_count + b
                             predict_body(at, dt, kept[lane], pull, bodies)
             if substep < longest_push:
-                for k_push in range(wp.static(L * PUSHES)):
-                    lane = k_push // wp.static(PUSHES)
-                    at_push = w0 * wp.static(PUSHES) + k_push
+                for k_push in range(wp.static(L * MOST_PUSHES)):
+                    lane = k_push // wp.static(MOST_PUSHES)
+                    at_push = w0 * wp.static(MOST_PUSHES) + k_push
                     i = grips.push[at_push]
                     if i >= 0 and substep < grips.push_steps[at_push] and on[lane] > S(0.0):
                         x = q.x[p0 + i]
@@ -314,6 +317,18 @@ def forward_kernel(
                     project_bend(s, p0, inverse_dt2, q, springs)
                 else:
                     project_distance(s, p0, inverse_dt2, q, springs)
+            if wp.static(with_sheets):
+                if any_less(zero - holding, S(0.0)):
+                    held = q.x[p0]
+                    for lane in range(wp.static(L)):
+                        i = grips.particle[w0 + lane]
+                        if i >= 0:
+                            x = q.x[p0 + i]
+                            held.x[lane] = x.x[lane]
+                            held.y[lane] = x.y[lane]
+                            held.z[lane] = x.z[lane]
+                    for i in range(n):
+                        project_tether(p0 + i, holding, held, q)
             for c in range(near_start, near_start + near_count):
                 project_contact(c, p0, contact_mu, push, q, pairs, near)
             if wp.static(with_sheets):

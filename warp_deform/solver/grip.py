@@ -12,10 +12,8 @@ from .lanes import add, mul, sub  # noqa: F401  (operators are found by name)
 from .sphere_contact import sphere_contact
 from .structures import structures
 
-__all__ = ["PUSHES", "grip"]
+__all__ = ["grip"]
 
-PUSHES = 2
-"""So many particles of a world may be pushed at once."""
 CONTACT = 1.0e-4
 """A held box this close to the table [m] counts as having reached it."""
 

@@ -117,6 +117,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         xr: wp.array(dtype=V3)  # position when the contact list was last made
         w: wp.array(dtype=V)  # inverse mass [1/kg], 0 while gripped
         w0: wp.array(dtype=V)  # inverse mass when free
+        tether: wp.array(dtype=V)  # farthest from what is held [m], see `tether`
 
     @wp.struct
     class Near:

@@ -10,12 +10,15 @@ from dataclasses import dataclass
 
 import newton
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 
 from ..errors import InputError
 from ..objects.attributes import NAMESPACE, SpringMode
 from .sheets import Sheets
+from .tether import NO_TETHER
 
-__all__ = ["WorldTopology", "read_worlds"]
+__all__ = ["WorldTopology", "read_worlds", "tethers"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +76,24 @@ class WorldTopology:
     def key(self) -> bytes:
         """Equal for worlds that can share lanes."""
         return b"|".join(np.ascontiguousarray(v).tobytes() for v in vars(self).values())
+
+
+def tethers(topology: WorldTopology, held: int) -> np.ndarray:
+    """Longest distance (P,) [m] of every particle from the particle `held` of a fabric.
+
+    It is the shortest way along springs at their strain limits; particles that are not joined to it
+    by such springs, and all where a cable or nothing is held, have none (`NO_TETHER`).
+    """
+    limited = (topology.spring_limit > 0) & (topology.spring_mode != int(SpringMode.AT_LEAST))
+    longest = np.full(topology.particle_count, NO_TETHER)
+    if limited.any():
+        i, j = topology.spring_ij[limited].T
+        size = (topology.particle_count, topology.particle_count)
+        ways = csr_array((topology.spring_limit[limited], (i, j)), shape=size)
+        reach = dijkstra(ways, directed=False, indices=held)
+        joined = np.isfinite(reach)
+        longest[joined] = reach[joined]
+    return longest
 
 
 def _slices(worlds: np.ndarray, count: int, what: str) -> list[np.ndarray]:

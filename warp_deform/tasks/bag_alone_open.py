@@ -63,13 +63,13 @@ class BagAloneOpen(BagTask):
         """Pull the farthest bead, seen or not; give up where few beads are visible."""
         if self.hidden(layout, snapshot):
             return None
-        return self.pull(layout, snapshot, None)
+        return self.pull_farthest(layout, snapshot)
 
     def demonstrate_visible(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
     ) -> Action | None:
         """Pull the farthest of the beads that the tip would really take."""
-        return self.pull(layout, snapshot, self.met_beads(snapshot))
+        return self.pull_visible(layout, snapshot)
 
     def candidates(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int

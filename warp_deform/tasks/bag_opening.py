@@ -14,11 +14,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..objects.bag import Bag, BagConfig, bag_shell
+from ..objects.box import Box
 from ..objects.push import Push
 from ..rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world
 from ..robots.primitive import PrimitiveConfig, find_grasp
-from .bag_physics import BAG_PRIMITIVE, BAG_SOLVER, OPEN
-from .demonstrators import farthest_bead, pick_place, ring_maps
+from .bag_physics import BAG_PRIMITIVE, BAG_SOLVER, INSERT, OPEN
+from .demonstrators import farthest_bead, pick_place, ring_maps, visible_point
 from .ground_truth import pose_rows
 from .metrics import hull_area
 from .shapes import chain_yaw
@@ -33,6 +34,8 @@ _PUSH_SECONDS = 0.2
 _SETTLE_SECONDS = 1.0
 OVERSHOOT = 0.02
 """How far beyond its target a bead is pulled [m]."""
+_WORTH = 0.5
+"""A bead so much farther from its target [m] is worth pulling as if it opened the whole circle."""
 FEWEST_VISIBLE = 0.33
 """The demonstrators give up where no more than this share of the beads can be seen."""
 _RAYS = 96
@@ -54,7 +57,12 @@ class BagTask(Task):
     def drop(self, rng: np.random.Generator, x: float, y: float) -> np.ndarray:
         """Positions (P, 3) of a bag that is about to fall, its opening up, a little tilted."""
         turn = Rotation.from_euler("xyz", rng.normal(0.0, _TILT, 3))
-        return turn.apply(_shell(self.bag).vertices) + [x, y, DROP]
+        return turn.apply(_shell(self.bag).vertices) + np.array([x, y, DROP])
+
+    def upright(self, x: float, y: float) -> np.ndarray:
+        """Positions (P, 3) of an open bag that stands on the table."""
+        height = self.bag.radius + self.bag.shell_radius
+        return _shell(self.bag).vertices + np.array([x, y, height])
 
     def push(self, rng: np.random.Generator, first: int) -> Push:
         """The perturbation of one bead of the bag whose particles begin at `first`.
@@ -71,6 +79,10 @@ class BagTask(Task):
         """Where the beads of an open bag at x, y would lie (32, 2) [m]."""
         shell = _shell(self.bag)
         return shell.vertices[shell.ring, :2] + [x, y]
+
+    def ring_targets_of(self, layout: Layout) -> np.ndarray:
+        """Where the beads of the open bag should lie (32, 2) [m]."""
+        return layout.targets
 
     @property
     def settle_seconds(self) -> float:
@@ -111,9 +123,14 @@ class BagTask(Task):
     def clear_opening(
         self, layout: Layout, snapshot: Snapshot, size: tuple[float, float], room: float
     ) -> np.ndarray:
-        """Where (320, 160) uint8 a thing of `size` [m] fits the opening with `room` [m] to spare."""
+        """Where (320, 160) uint8 a thing of `size` [m] fits with `room` [m] to spare."""
+        return self.erode(self.hull_mask(layout, snapshot), size, room)
+
+    @staticmethod
+    def erode(mask: np.ndarray, size: tuple[float, ...], room: float) -> np.ndarray:
+        """`mask` less a rim as wide as half the diagonal of `size` (2,) [m] plus `room` [m]."""
         width = round(math.hypot(size[0] + room, size[1] + room) / PIXEL_SIZE)
-        return cv2.erode(self.hull_mask(layout, snapshot), np.ones((width, width), np.uint8))
+        return cv2.erode(mask, np.ones((width, width), np.uint8))
 
     def inside_bag(self, snapshot: Snapshot, body: int) -> bool:
         """Whether a body's centre is inside the first bag."""
@@ -143,19 +160,29 @@ class BagTask(Task):
 
     # -- opening
 
-    def pull(self, layout: Layout, snapshot: Snapshot, beads: list[int] | None) -> Action | None:
-        """Pull the bead that is farthest from its target under the best of 32 maps.
+    def pull_farthest(self, layout: Layout, snapshot: Snapshot) -> Action:
+        """Pull the bead that is farthest from its target under the best of 32 maps, seen or not."""
+        positions, targets, target_of = self._mapped(layout, snapshot)
+        far = np.linalg.norm(positions - targets[target_of], axis=1)
+        return self.pull_bead(layout, snapshot, int(np.argmax(far)), OVERSHOOT)
 
-        beads: those that may be picked, None: all; if none may, all may
+    def pull_visible(self, layout: Layout, snapshot: Snapshot) -> Action:
+        """Pull a bead that the tip really takes: one that opens the hull much, and is far.
+
+        Of all beads where the tip would take none at its place.
         """
         positions, targets, target_of = self._mapped(layout, snapshot)
-        order = np.argsort(-np.linalg.norm(positions - targets[target_of], axis=1), kind="stable")
-        allowed = [b for b in order if beads is None or b in beads]
-        return self.pull_bead(layout, snapshot, int((allowed or list(order))[0]), OVERSHOOT)
+        far = np.linalg.norm(positions - targets[target_of], axis=1)
+        best: tuple[float, Action] | None = None
+        for bead in self.met_beads(snapshot) or range(len(positions)):
+            action = self.pull_bead(layout, snapshot, bead, OVERSHOOT)
+            value = self._opened(positions, bead, action[3:5]) + far[bead] / _WORTH
+            if best is None or value > best[0]:
+                best = value, action
+        assert best is not None
+        return best[1]
 
-    def pull_bead(
-        self, layout: Layout, snapshot: Snapshot, bead: int, overshoot: float
-    ) -> Action:
+    def pull_bead(self, layout: Layout, snapshot: Snapshot, bead: int, overshoot: float) -> Action:
         """Pull one bead to its target and `overshoot` [m] beyond."""
         positions, targets, target_of = self._mapped(layout, snapshot)
         here, target = positions[bead, :2], targets[target_of[bead], :2]
@@ -172,21 +199,18 @@ class BagTask(Task):
     def pulls(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
     ) -> list[Action]:
-        """Different pulls worth simulating: far beads to their targets, others straight outwards."""
+        """Different pulls: far beads to their targets, others straight outwards."""
         positions, targets, target_of = self._mapped(layout, snapshot)
         far = np.linalg.norm(positions - targets[target_of], axis=1)
         met = self.met_beads(snapshot) or list(range(len(positions)))
         met.sort(key=lambda bead: -far[bead])
         chosen = met[: max(1, count // 4)]
         actions = [self.pull_bead(layout, snapshot, b, o) for b in chosen for o in (0.02, 0.05)]
-        centre = layout.targets[:, :2].mean(axis=0)
+        centre = self.ring_targets_of(layout).mean(axis=0)
         out = positions[:, :2] - centre
         out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-6)
-        gain = {}
-        for bead in met:
-            rim = positions[:, :2].copy()
-            rim[bead] = centre + out[bead] * (self.bag.opening_radius + 0.02)
-            gain[bead] = hull_area(rim)
+        rim = self.bag.opening_radius + OVERSHOOT
+        gain = {b: self._opened(positions, b, centre + out[b] * rim) for b in met}
         pulled: list[int] = []
         for bead in sorted(met, key=lambda b: -gain[b]):
             apart = np.linalg.norm(positions[pulled, :2] - positions[bead, :2], axis=1)
@@ -196,15 +220,50 @@ class BagTask(Task):
                 actions.append(pick_place(positions[bead, :2], place, stage=OPEN))
         return actions[:count]
 
+    def _opened(self, positions: np.ndarray, bead: int, place: np.ndarray) -> float:
+        """The opening, as a share of the circle, if nothing moved but one bead to `place` (2,)."""
+        rim = positions[:, :2].copy()
+        rim[bead] = place
+        return hull_area(rim) / (math.pi * self.bag.opening_radius**2)
+
     def _mapped(
         self, layout: Layout, snapshot: Snapshot
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Beads (32, 3), targets (32, 3), and each bead's target under the best cyclic map."""
         positions = self.beads(snapshot)
-        targets = np.column_stack([layout.targets, np.zeros(len(layout.targets))])
+        rim = self.ring_targets_of(layout)
+        targets = np.column_stack([rim, np.zeros(len(rim))])
         maps = ring_maps(len(positions), reversals=False)
         bead, target = farthest_bead(positions, targets, maps)
         return positions, targets, (np.arange(len(positions)) - bead + target) % len(positions)
+
+    # -- inserting
+
+    turns: ClassVar[int] = 1
+    """Yaws in which the demonstrators place an item."""
+
+    def item_mask(self, layout: Layout, snapshot: Snapshot, item: int) -> np.ndarray:
+        """Pixels (320, 160) of the item with this number among the scene's boxes."""
+        boxes = [o for o in snapshot.objects if isinstance(o, Box)]
+        ids = self._segments(layout, snapshot, boxes[item])
+        return snapshot.images.segmentation == ids.start
+
+    def insert(
+        self,
+        layout: Layout,
+        snapshot: Snapshot,
+        rng: np.random.Generator,
+        clear: np.ndarray,
+        item: int = 0,
+    ) -> Action | None:
+        """Put an item at a random place of `clear` (320, 160); None where it cannot be seen."""
+        pick = visible_point(self.item_mask(layout, snapshot, item), rng)
+        if pick is None:
+            return None
+        pixels = np.argwhere(clear)
+        place = pixel_to_world(pixels[rng.integers(len(pixels))])
+        yaw = 2 * np.pi * rng.integers(self.turns) / self.turns if self.turns > 1 else 0.0
+        return pick_place(pick, place, stage=INSERT, place_yaw=float(yaw))
 
     # -- ground truth
 
@@ -221,7 +280,7 @@ class BagTask(Task):
 
 
 def bag_mask(segmentation: np.ndarray, first: int, stop: int) -> np.ndarray:
-    """Filled convex hull (320, 160) uint8 of the pixels with ids first .. stop - 1; may be empty."""
+    """Filled convex hull (320, 160) uint8 of pixels with ids first .. stop - 1; may be empty."""
     mask = np.zeros(SHAPE, np.uint8)
     pixels = np.argwhere((segmentation >= first) & (segmentation < stop))
     if len(pixels):

@@ -22,9 +22,9 @@ BAG_SOLVER = SolverConfig(
 
 OPEN = Stage(lift=0.05, speed=0.25)
 """Low, so that a pulled bead opens the bag instead of lifting it."""
-INSERT = Stage(lift=0.30, speed=0.5, lower_speed=0.15)
+INSERT = Stage(lift=0.30, speed=0.5, lower_speed=0.15, gentle=True)
 """Over the rim, and down softly."""
-CARRY = Stage(lift=0.40, speed=0.25, pause=0.3)
-"""The whole bag with what is in it; what hangs from the tip calms before it moves and is lowered."""
+CARRY = Stage(lift=0.40, speed=0.25, pause=0.3, gentle=True)
+"""The whole bag with what is in it, which calms before it is moved and before it is lowered."""
 
 BAG_PRIMITIVE = PrimitiveConfig(hover=0.10)

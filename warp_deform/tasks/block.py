@@ -82,6 +82,11 @@ class BlockNotarget(Task):
             return None
         return pick_place_pose(pick, self._pose(snapshot), layout.targets, stage=self.stages[0])
 
+    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+        """The score, less the distance from the target [m] and the turn from it [rad] by 100."""
+        distance, turn = pose_error(self._pose(snapshot), layout.targets)
+        return self.score(layout, snapshot) - distance - turn / 100
+
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(6,): x, y, -yaw / 15 of the block, then of the goal."""
         poses = np.stack([self._pose(snapshot), layout.targets])
@@ -91,7 +96,7 @@ class BlockNotarget(Task):
         """The block standing at the target."""
         return replace(layout, body_q=self._body(layout.targets), calm=True)
 
-    def goal_targets(self, snapshot: Snapshot) -> np.ndarray:
+    def goal_targets(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """The block's pose (3,) x, y [m], yaw [rad]."""
         return self._pose(snapshot)
 

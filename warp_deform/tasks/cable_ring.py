@@ -15,7 +15,7 @@ from ..objects.push import Push
 from ..objects.zone import ring_zone
 from ..rendering.pixels import BOUNDS
 from .cable_physics import CABLE_SOLVER, CABLE_STAGE
-from .demonstrators import farthest_bead, pick_place, ring_maps
+from .demonstrators import best_map, met_particle, pick_place, ring_maps
 from .free_space import FreeSpace
 from .ground_truth import pose_rows
 from .metrics import hull_area
@@ -34,6 +34,11 @@ _PUSH_UP = 25.0  # [N]
 _PUSH_SIDEWAYS = 5.0  # [N]
 _PUSH_SECONDS = 0.25
 _SETTLE_SECONDS = 2.0
+_FAR_BEADS = 3
+_OUTWARD = 1.2
+"""How far candidates pull beads from the ring's middle, in radii."""
+_APART = 0.04
+"""Least distance between the places that candidates pull to [m]."""
 _TABLE_CENTRE = np.array(BOUNDS[:2]).mean(axis=1)
 
 
@@ -84,10 +89,62 @@ class CableRing(Task):
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
     ) -> Action | None:
         """Move the bead that is farthest from its target under the best of 64 maps."""
+        return self._moves(layout, snapshot)[0]
+
+    def demonstrate_visible(
+        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
+    ) -> Action | None:
+        """Of the beads that the tip would really take, move the one farthest from its target."""
+        moves = self._moves(layout, snapshot)
+        return next((move for move in moves if self._takes(move, snapshot)), moves[0])
+
+    def candidates(
+        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
+    ) -> list[Action]:
+        """The scripted action, far beads to their targets, and beads pulled out of the hull."""
+        scripted, *others = self._moves(layout, snapshot)
+        others.sort(key=lambda move: not self._takes(move, snapshot))  # the order else stays
+        drawn = [scripted, *others[:_FAR_BEADS]]
+        return drawn + self._outward(snapshot, count - len(drawn))
+
+    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+        """Share of the circle that is spanned, less half the beads' mean distance in radii."""
+        _, distances = self._mapped(layout, snapshot)
+        return self.score(layout, snapshot) - 0.5 * float(distances.mean()) / self.cable.ring_radius
+
+    def _mapped(self, layout: Layout, snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
+        """Bead of every target (32,) under the best of 64 maps, and its distance (32,) [m]."""
         targets = np.column_stack([layout.targets, np.zeros(self.cable.beads)])
         maps = ring_maps(self.cable.beads, reversals=True)
-        bead, target = farthest_bead(snapshot.particle_q, targets, maps)
-        return pick_place(snapshot.particle_q[bead], targets[target], stage=self.stages[0])
+        return best_map(snapshot.particle_q, targets, maps)
+
+    def _moves(self, layout: Layout, snapshot: Snapshot) -> list[Action]:
+        """Every bead to its target, those farthest from it first."""
+        bead_of, distances = self._mapped(layout, snapshot)
+        return [
+            pick_place(snapshot.particle_q[bead_of[t]], layout.targets[t], stage=self.stages[0])
+            for t in np.argsort(-distances, kind="stable")
+        ]
+
+    def _takes(self, move: Action, snapshot: Snapshot) -> bool:
+        """Whether the tip would take the bead that `move` picks at the centre of."""
+        met = met_particle(move[:2], snapshot, self.primitive)
+        return met is not None and np.array_equal(snapshot.particle_q[met, :2], move[:2])
+
+    def _outward(self, snapshot: Snapshot, count: int) -> list[Action]:
+        """Beads whose pull to the circle about the ring's middle widens the hull most."""
+        beads = snapshot.particle_q[:, :2].astype(float)
+        middle = beads.mean(axis=0)
+        out = beads - middle
+        out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
+        places = middle + out * (self.cable.ring_radius * _OUTWARD)
+        areas = [hull_area(np.vstack([beads, places[bead]])) for bead in range(self.cable.beads)]
+        chosen: list[int] = []
+        for bead in np.argsort(-np.array(areas), kind="stable"):
+            apart = np.linalg.norm(places[chosen] - places[bead], axis=1)
+            if len(chosen) < count and (apart > _APART).all():
+                chosen.append(int(bead))
+        return [pick_place(beads[bead], places[bead], stage=self.stages[0]) for bead in chosen]
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(192,): bead 0, its mark, bead 1, its mark, ... each x, y, -yaw / 15 (0 for marks)."""

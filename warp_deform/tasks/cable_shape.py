@@ -5,6 +5,8 @@ Source: Seita et al., ICRA 2021, appendix on cable-shape.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -13,7 +15,7 @@ import numpy as np
 from ..objects.cable import Cable, CableConfig, add_cable, cable_line
 from ..objects.zone import segment_zone
 from .cable_physics import CABLE_SOLVER, CABLE_STAGE
-from .demonstrators import pick_place, visible_point
+from .demonstrators import met_particle, pick_place, visible_point
 from .free_space import FreeSpace
 from .ground_truth import pose_rows
 from .metrics import share_in_zone, wrap_angle
@@ -87,15 +89,55 @@ class CableShape(Task):
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
     ) -> Action | None:
         """Move the visible bead that is farthest from its own target onto it."""
-        targets = np.column_stack([layout.targets, np.zeros(self.cable.beads)])
-        distances = np.linalg.norm(snapshot.particle_q - targets, axis=1)
+        return next((move for _, move in self._moves(layout, snapshot, rng)), None)
+
+    def demonstrate_visible(
+        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
+    ) -> Action | None:
+        """The first such move whose pick takes that bead, not one that leans over it."""
+        for bead, move in self._moves(layout, snapshot, rng):
+            if met_particle(move[:2], snapshot, self.primitive) == bead:
+                return move
+        return None
+
+    def candidates(
+        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
+    ) -> list[Action]:
+        """The farthest visible beads to their targets, with the cable either way round."""
+        drawn: list[Action] = []
+        for turned in (False, True):
+            moves = self._moves(layout, snapshot, rng, turned=turned)
+            drawn += [move for _, move in itertools.islice(moves, (count + 1) // 2)]
+        return drawn[:count]
+
+    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+        """Share in the zone, less the beads' mean distance with the cable the better way round."""
+        ways = np.stack([layout.targets, layout.targets[::-1]])
+        distances = np.linalg.norm(snapshot.particle_q[:, :2] - ways, axis=2).mean(axis=1)
+        return self.score(layout, snapshot) - float(distances.min()) / self.cable.length
+
+    def _moves(
+        self,
+        layout: Layout,
+        snapshot: Snapshot,
+        rng: np.random.Generator,
+        *,
+        turned: bool = False,
+    ) -> Iterator[tuple[int, Action]]:
+        """Visible beads and how to move each onto its own target, the farthest from it first.
+
+        turned: the last bead's target is the first
+        """
+        targets = layout.targets[::-1] if turned else layout.targets
+        distances = np.linalg.norm(
+            snapshot.particle_q - np.column_stack([targets, np.zeros(self.cable.beads)]), axis=1
+        )
         segments = snapshot.segments[len(layout.zones)]
         for bead in np.argsort(-distances, kind="stable"):
             pick = visible_point(snapshot.images.segmentation == segments[bead], rng)
             if pick is not None:
                 offset = pick - snapshot.particle_q[bead, :2]
-                return pick_place(pick, layout.targets[bead] + offset, stage=self.stages[0])
-        return None
+                yield int(bead), pick_place(pick, targets[bead] + offset, stage=self.stages[0])
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(147,): the target's centre, then bead 0, its target, bead 1, its target, ...
@@ -136,6 +178,6 @@ class CableShapeNotarget(CableShape):
             calm=True,
         )
 
-    def goal_targets(self, snapshot: Snapshot) -> np.ndarray:
+    def goal_targets(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """Where the beads lie (24, 2) [m]."""
         return np.array(snapshot.particle_q[:, :2], dtype=float)

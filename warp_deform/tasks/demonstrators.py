@@ -9,10 +9,19 @@ import cv2
 import numpy as np
 
 from ..rendering.pixels import pixel_to_world
+from ..robots.primitive import PrimitiveConfig, find_grasp
 from .metrics import wrap_angle
-from .task import Action, Stage
+from .task import Action, Snapshot, Stage
 
-__all__ = ["farthest_bead", "pick_place", "pick_place_pose", "ring_maps", "visible_point"]
+__all__ = [
+    "best_map",
+    "farthest_bead",
+    "met_particle",
+    "pick_place",
+    "pick_place_pose",
+    "ring_maps",
+    "visible_point",
+]
 
 
 def visible_point(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
@@ -56,13 +65,34 @@ def ring_maps(beads: int, *, reversals: bool) -> np.ndarray:
     return np.concatenate([shifts, shifts[:, ::-1]]) if reversals else shifts
 
 
-def farthest_bead(beads: np.ndarray, targets: np.ndarray, maps: np.ndarray) -> tuple[int, int]:
-    """Bead and target farthest apart under the map of least mean distance; of equals the first.
+def best_map(
+    beads: np.ndarray, targets: np.ndarray, maps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The map of least mean distance (n,), and the distance to each target under it (n,) [m].
 
     beads, targets (n, 3) [m]; maps (m, n) as from `ring_maps`.
     """
     distances = np.linalg.norm(beads[:, None] - targets, axis=-1)  # bead, target
     mapped = distances[maps, np.arange(len(targets))]
     best = int(np.argmin(mapped.mean(axis=1)))
-    target = int(np.argmax(mapped[best]))
-    return int(maps[best, target]), target
+    return maps[best], mapped[best]
+
+
+def farthest_bead(beads: np.ndarray, targets: np.ndarray, maps: np.ndarray) -> tuple[int, int]:
+    """Bead and target farthest apart under the map of least mean distance; of equals the first.
+
+    beads, targets (n, 3) [m]; maps (m, n) as from `ring_maps`.
+    """
+    bead_of, distances = best_map(beads, targets, maps)
+    target = int(np.argmax(distances))
+    return int(bead_of[target]), target
+
+
+def met_particle(xy: np.ndarray, snapshot: Snapshot, config: PrimitiveConfig) -> int | None:
+    """Number of the particle that a tip descending at `xy` (2,) [m] would take, None if it is none.
+
+    A particle that another one lies on, or leans over, is not met at its own place.
+    """
+    x_y_yaw = np.array([xy[0], xy[1], 0.0])
+    grasp = find_grasp(x_y_yaw, snapshot.objects, snapshot.particle_q, snapshot.body_q, config)
+    return None if grasp is None else grasp.particle

@@ -6,6 +6,8 @@ import difflib
 
 from ..errors import InputError
 from .bag_alone_open import BagAloneOpen
+from .bag_color_goal import BagColorGoal
+from .bag_items import BagItems1, BagItems2
 from .block import BlockNotarget
 from .cable_line import CableLineNotarget
 from .cable_ring import CableRing, CableRingNotarget
@@ -23,6 +25,9 @@ TASKS: dict[str, type[Task]] = {
         CableShapeNotarget,
         CableLineNotarget,
         BagAloneOpen,
+        BagItems1,
+        BagItems2,
+        BagColorGoal,
         BlockNotarget,
     )
 }

@@ -184,6 +184,6 @@ class Task(abc.ABC):
         """Layout with the objects placed at the targets; only for goal-conditioned tasks."""
         raise TypeError(f"{self.name} has no goal")
 
-    def goal_targets(self, snapshot: Snapshot) -> np.ndarray:
-        """Targets that the state of a goal episode stands for; only for goal-conditioned tasks."""
+    def goal_targets(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
+        """Targets that a state stands for as a goal; only for goal-conditioned tasks."""
         raise TypeError(f"{self.name} has no goal")
