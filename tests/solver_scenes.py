@@ -9,8 +9,9 @@ import newton
 import numpy as np
 
 from warp_deform.objects import BoxConfig, add_box
-from warp_deform.objects.attributes import attribute
+from warp_deform.objects.attributes import SpringMode, attribute
 from warp_deform.solver import GuardLimits, SolverConfig, SolverFusedXPBD
+from warp_deform.solver.topology import WorldTopology
 
 LOOSE = GuardLimits(stretch=1e9, depth=1e9, clamped_steps=10**9)
 IDEAL = SolverConfig(damping=0.0, max_speed=1e3, limits=LOOSE)
@@ -130,6 +131,21 @@ def body_frames(
     return x.copy(), q.copy()
 
 
+def spring_energy(top: WorldTopology, x: np.ndarray) -> np.ndarray:
+    """Elastic energy (...) [J] of the springs of one world with particles at x (..., P, 3).
+
+    Strain limits store none.
+    """
+    x = np.asarray(x, dtype=float)
+    start, end = x[..., top.spring_ij[:, 0], :], x[..., top.spring_ij[:, 1], :]
+    bent = (top.spring_mode == SpringMode.BEND)[:, None]
+    way = np.where(bent, x[..., top.spring_middle, :] - (start + end) / 2, start - end)
+    stretch = np.linalg.norm(way, axis=-1) - top.spring_length
+    acts = np.where(top.spring_mode == SpringMode.AT_LEAST, stretch < 0, True)
+    acts &= np.where(top.spring_mode == SpringMode.AT_MOST, stretch > 0, True)
+    return (0.5 * stretch**2 / top.spring_compliance * acts).sum(axis=-1)
+
+
 def energy(solver: SolverFusedXPBD, *, gravity: float = G) -> float:
     """Kinetic, gravitational and elastic energy of a lone world [J]."""
     data, top = solver.data, solver.data.topologies[0]
@@ -138,12 +154,7 @@ def energy(solver: SolverFusedXPBD, *, gravity: float = G) -> float:
         x, v, w = positions(solver), velocities(solver), data.lane("particles.w0", 0)
         mass = np.where(w > 0, 1.0 / np.where(w > 0, w, 1.0), 0.0)
         total += mass @ (0.5 * (v**2).sum(1) + gravity * x[:, 2])
-        length = np.linalg.norm(x[top.spring_ij[:, 0]] - x[top.spring_ij[:, 1]], axis=1)
-        stretch = length - top.spring_length
-        acts = np.select(
-            [top.spring_mode == 1, top.spring_mode == 2], [stretch < 0, stretch > 0], True
-        )
-        total += (0.5 * stretch**2 / top.spring_compliance * acts).sum()
+        total += float(spring_energy(top, x))
     if data.has_bodies:
         mass = 1.0 / data.views["bodies.w0"]
         v, x = data.views["bodies.v"], data.views["bodies.x"]

@@ -34,7 +34,11 @@ START_SCORE = {
     "cable-shape": (0.0, 1 / 24),
     "cable-shape-notarget": (0.0, 1 / 24),
     "cable-line-notarget": (0.0, 1 / 24),
+    "fabric-flat": (0.04, 0.15),
+    "fabric-flat-notarget": (0.04, 0.15),
 }
+# Scores of a constructed goal where they are counted in pixels, whose edges round either way.
+GOAL_SCORE = {"fabric-flat-notarget": 0.97}
 every_task = pytest.mark.parametrize("name", TASKS)
 goal_task = pytest.mark.parametrize("name", [n for n, t in TASKS.items() if t.goal_conditioned])
 
@@ -180,7 +184,7 @@ def test_a_constructed_goal_shows_the_solved_task(name: str) -> None:
     for slot in range(SLOTS):
         episode = side.episodes[slot]
         assert episode.physics_ok
-        assert task.score(episode.layout, episode.snapshot) == 1.0
+        assert task.score(episode.layout, episode.snapshot) >= GOAL_SCORE.get(name, 1.0)
 
 
 @every_task

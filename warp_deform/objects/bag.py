@@ -57,7 +57,7 @@ class BagConfig:
     """The same of a bead [m]."""
     visual_radius: float = 0.0075
     """Radius of a bead that is drawn and that a descending tip meets [m]."""
-    thickness: float = 0.006
+    thickness: float = 0.008
     """Distance at which layers touch [m]; a bead adds 1.5 mm."""
     structural_stiffness: float = 2e3
     """Along rows and columns [N/m]."""
@@ -67,6 +67,10 @@ class BagConfig:
     """Between vertices opposite each other across an edge [N/m]."""
     ring_stiffness: float = 60.0
     """Between second neighbours of the ring [N/m]; keeps the opening from folding flat."""
+    shortest: float = 0.7
+    """Hard limit of rows and columns, as a share of the rest length; 0: none."""
+    shortest_diagonal: float = 0.5
+    """Hard limit of the diagonals; keeps triangles from collapsing."""
     longest: float = 1.06
     """Hard limit of rows and columns, as a share of the rest length."""
     longest_diagonal: float = 1.12
@@ -94,6 +98,9 @@ class BagConfig:
         for name in ("longest", "longest_diagonal"):
             if not getattr(self, name) > 1:
                 raise InputError(f"BagConfig.{name} must be more than 1, got {getattr(self, name)}")
+        for name in ("shortest", "shortest_diagonal"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(f"BagConfig.{name} must be in [0, 1), got {getattr(self, name)}")
         if not -0.7 <= self.cut <= 0.9:
             raise InputError(f"BagConfig.cut must be in [-0.7, 0.9], got {self.cut}")
         if not 0 <= self.edge_contact <= 1:
@@ -246,10 +253,13 @@ def _add(builder: newton.ModelBuilder, config: BagConfig, shell: BagShell, pose:
         rest,
         faces,
         (
-            Spring(edges[~diagonal], config.structural_stiffness, longest=config.longest),
+            Spring(
+                edges[~diagonal], config.structural_stiffness, shortest=config.shortest,
+                longest=config.longest,
+            ),
             Spring(
                 edges[diagonal], config.shear_stiffness, SpringMode.AT_MOST,
-                longest=config.longest_diagonal,
+                shortest=config.shortest_diagonal, longest=config.longest_diagonal,
             ),
             Spring(across, config.bend_stiffness),
             Spring(np.column_stack([ring, np.roll(ring, -2)]), config.ring_stiffness),

@@ -13,6 +13,11 @@ from .structures import structures
 
 __all__ = ["box_particle"]
 
+CARRIED = 1.0e-4
+"""A particle this close to where it lies on the table is carried by it [m]."""
+STEEP = 0.7
+"""A normal with this much downwards pushes onto the table: a flatter one squeezes out sideways."""
+
 
 @functools.cache
 def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
@@ -20,6 +25,10 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
 
     The normal is that of the nearest point of the box; for a centre inside the box, that of the
     nearest face. Separation is limited as in `sphere_contact`.
+
+    A particle that the table carries does not give way downwards: the box would sink through light
+    fabric, as the table takes back only afterwards what a contact of very unequal masses gives to
+    the particle.
     """
     t = structures(scalar, lanes)
     S, R3 = t.S, t.R3
@@ -41,6 +50,11 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
                 wp.max(wp.abs(at[2]) - h[2], S(0.0)),
             )
         )
+
+    @wp.func
+    def stands(z: S, radius: S, down: S):
+        """0 for a particle at height z that the table carries and a push downwards, else 1."""
+        return wp.where(down < -S(STEEP) and z < radius + S(CARRIED), S(0.0), S(1.0))
 
     @wp.func
     def project_box_particle(
@@ -81,17 +95,23 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
             depth = wp.min(radius - gap, wp.max(push - approach, S(0.0)))
             wv = q.w[i]
             wi = wv[lane]
-            w = wi + response(b, bodies, r, n)
+            yields = wi * stands(p[2], radius, n[2])
+            across = wi + response(b, bodies, r, n)
+            w = yields + response(b, bodies, r, n)
             if w > S(0.0):
                 slip = step - n * approach
-                f = coulomb_scalar(wp.dot(slip, slip), depth * mu * shapes.friction[shape])
-                impulse = (n * depth - slip * f) / w
-                px.x[lane] = px.x[lane] + impulse[0] * wi
-                px.y[lane] = px.y[lane] + impulse[1] * wi
-                px.z[lane] = px.z[lane] + impulse[2] * wi
+                budget = depth * mu * shapes.friction[shape] * across / w
+                along = n * (depth / w)
+                drag = slip * (coulomb_scalar(wp.dot(slip, slip), budget) / across)
+                given = along * yields - drag * wi
+                px.x[lane] = px.x[lane] + given[0]
+                px.y[lane] = px.y[lane] + given[1]
+                px.z[lane] = px.z[lane] + given[2]
                 q.x[i] = px
-                push_body(b, bodies, r, -impulse)
-                bodies.touching[b] = bodies.touching[b] + 1
-                bodies.support[b] = bodies.support[b] + 1
+                push_body(b, bodies, r, drag - along)
+            bodies.touching[b] = bodies.touching[b] + 1
+            bodies.support[b] = bodies.support[b] + 1
 
-    return SimpleNamespace(project_box_particle=project_box_particle, particle_gap=particle_gap)
+    return SimpleNamespace(
+        project_box_particle=project_box_particle, particle_gap=particle_gap, stands=stands
+    )

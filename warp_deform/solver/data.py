@@ -134,6 +134,7 @@ class SolverData:
             ("topology.pair_start", starts("pair_ij")),
             ("topology.shape_count", [len(k.shape_body) for k in tops]),
             ("springs.mode", joined("spring_mode")),
+            ("springs.watched", joined("spring_watched")),
             ("springs.middle", joined("spring_middle")),
         ):
             self.add_constant(name, np.asarray(values), wp.int32, np.int32)

@@ -123,11 +123,9 @@ def forward_kernel(
                     )
             if wp.static(with_sheets):
                 for f in range(sheets.first[k], sheets.first[k + 1]):
-                    tri = sheets.triangle[f]
                     project_box_triangle(
-                        f, lane, p0, top.radius[radii + tri[0]], shape, b, mu, push, shapes,
-                        bodies, sheets, cells,
-                    )  # fmt: skip
+                        f, lane, p0, radii, shape, b, mu, push, top, shapes, bodies, sheets, cells
+                    )
         for b in range(b0, b0 + count):
             begin_body(b, bodies)
         start = group.contact_start[g]
@@ -169,7 +167,7 @@ def forward_kernel(
         watch.depth[g] = wp.max(watch.depth[g], wp.max(zero - lowest, zero))
         stretch = watch.stretch[g]
         for s in range(s0, s1):
-            if springs.mode[s] == 0:
+            if springs.watched[s] > 0:
                 ij = springs.ij[s]
                 l = length(q.x[p0 + ij[0]] - q.x[p0 + ij[1]])
                 stretch = wp.max(stretch, l * (S(1.0) / springs.length[s]))
@@ -361,9 +359,11 @@ def forward_kernel(
                     moved2, finish(p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q)
                 )
             unrest2 = moved2
+            drowsy = one
             if wp.static(with_sheets):
                 if st.dry > S(0.0) or st.sleep > S(0.0):
                     sleep = sleep_speed(free_time, st.sleep, st.sleep_ramp)
+                    drowsy = sleep_speed(free_time, S(1.0), st.sleep_ramp)
                     speed2 = zero
                     for i in range(n):
                         speed2 = wp.max(speed2, calm_particle(p0 + i, st.dry, sleep, on, q))
@@ -378,7 +378,7 @@ def forward_kernel(
                     if on[lane] > S(0.0):
                         for b in range(body_count):
                             at = b0 + lane * body_count + b
-                            m = finish_body(at, dt, fastest[lane], bodies)
+                            m = finish_body(at, dt, fastest[lane], drowsy[lane], bodies)
                             moved2[lane] = wp.max(moved2[lane], m)
                             unrest2[lane] = wp.max(unrest2[lane], m)
             moved = root(moved2)

@@ -39,7 +39,8 @@ class GuardLimits:
     """Limits of the guards."""
 
     stretch: float = 1.5
-    """Longest two-sided spring over its rest length; cables peak at 1.1 to 1.2 when dragged."""
+    """Longest link or edge over its rest length; cables peak at 1.1 to 1.2 when dragged. Bending
+    springs of fabrics do not count."""
     depth: float = 0.01
     """Deepest that a particle's centre may be under the table [m]."""
     clamped_steps: int = 120

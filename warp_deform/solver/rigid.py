@@ -83,18 +83,25 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
             bodies.q[b] = turned(q, wp.quat_rotate(q, omega) * (dt * kept))
 
     @wp.func
-    def finish_body(b: int, dt: S, fastest: S, bodies: Bodies):
+    def finish_body(b: int, dt: S, fastest: S, drowsy: S, bodies: Bodies):
         """Velocities from the substep; returns the squared step of the centre of mass [m^2], with
         the turning counted at 2 cm from it.
+
+        drowsy: factor on the speeds of sleep; above 1 (late in a world of fabrics, where light
+        layers under a box give way for ever) a sleeper loses its velocity as well.
         """
         d = bodies.x[b] - bodies.xp[b]
         # the inverse of `turned`, which turns by twice the arc tangent of half the vector's length
         turn = bodies.q[b] * wp.quat_inverse(bodies.qp[b])
         rotation = R3(turn[0], turn[1], turn[2]) * (S(2.0) / turn[3])
         if bodies.w[b] > S(0.0) and bodies.support[b] >= 3:
-            if wp.length(d) < S(SLEEP_SPEED) * dt and wp.length(rotation) < S(SLEEP_TURN) * dt:
+            still = wp.length(d) < S(SLEEP_SPEED) * drowsy * dt
+            if still and wp.length(rotation) < S(SLEEP_TURN) * drowsy * dt:
                 bodies.x[b] = bodies.xp[b]
                 bodies.q[b] = bodies.qp[b]
+                if drowsy > S(1.0):
+                    d = R3()
+                    rotation = R3()
         # a calmed body is slowed as a whole
         limit = fastest / wp.max(wp.length(d), fastest)
         bodies.v[b] = d * (limit / dt)

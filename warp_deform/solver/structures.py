@@ -66,6 +66,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         limit: wp.array(dtype=S)  # longest allowed length [m]; 0: none
         floor: wp.array(dtype=S)  # shortest allowed length [m]; 0: none
         mode: wp.array(dtype=int)
+        watched: wp.array(dtype=int)  # 1: the stretch guard looks at it
         middle: wp.array(dtype=int)  # of a bending spring: the particle between the two
 
     @wp.struct
@@ -238,7 +239,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
 
         steps: wp.array(dtype=V)  # substeps simulated
         nonfinite: wp.array(dtype=V)  # 1 when a coordinate was not a number
-        stretch: wp.array(dtype=V)  # longest two-sided spring / its rest length
+        stretch: wp.array(dtype=V)  # longest watched spring / its rest length
         depth: wp.array(dtype=V)  # deepest a particle's centre was under the table [m]
         clamped: wp.array(dtype=V)  # substeps in which the speed clamp acted
         overflow: wp.array(dtype=V)  # pairs of the world that found no room in the list

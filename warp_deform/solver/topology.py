@@ -27,6 +27,7 @@ class WorldTopology:
 
     spring_ij (S, 2); spring_length (S,) [m]; spring_compliance (S,) [m/N]; spring_limit (S,) [m];
     spring_floor (S,) [m]; spring_mode (S,)
+    spring_watched (S,): two-sided and not a soft one of a fabric; the stretch guard looks at these
     spring_middle (S,): third particle of a bending spring, else -1
     pair_ij (C, 2), pair_distance (C,) [m]: particles that may collide
     particle_radius (P,) [m]
@@ -45,6 +46,7 @@ class WorldTopology:
     spring_limit: np.ndarray
     spring_floor: np.ndarray
     spring_mode: np.ndarray
+    spring_watched: np.ndarray
     spring_middle: np.ndarray
     pair_ij: np.ndarray
     pair_distance: np.ndarray
@@ -199,6 +201,10 @@ class _Springs:
             self.floor = ours.spring_floor.numpy() * self.length  # type: ignore[attr-defined]
             self.mode = ours.spring_mode.numpy()  # type: ignore[attr-defined]
             middle = ours.spring_middle.numpy()  # type: ignore[attr-defined]
+            # a fabric's edges have a strain limit; its bending pairs may lengthen as it flattens
+            corners = model.tri_indices.numpy() if model.tri_count else np.zeros(0, int)
+            edge = (self.limit > 0) | ~np.isin(self.ij, corners).any(axis=1)
+            self.watched = edge & (self.mode == int(SpringMode.EQUAL))
             self.middle = np.where(self.mode == int(SpringMode.BEND), middle, -1)
 
     def of(self, ids: np.ndarray, local: np.ndarray) -> dict[str, np.ndarray]:
@@ -207,7 +213,7 @@ class _Springs:
             return {
                 "spring_ij": np.zeros((0, 2), int), "spring_length": empty,
                 "spring_compliance": empty, "spring_limit": empty, "spring_floor": empty,
-                "spring_mode": empty.astype(int),
+                "spring_mode": empty.astype(int), "spring_watched": empty.astype(int),
                 "spring_middle": empty.astype(int),
             }  # fmt: skip
         mine = np.isin(self.ij[:, 0], ids)
@@ -218,7 +224,8 @@ class _Springs:
             "spring_ij": local[self.ij[mine]], "spring_length": self.length[mine],
             "spring_compliance": self.compliance[mine], "spring_limit": self.limit[mine],
             "spring_floor": self.floor[mine],
-            "spring_mode": self.mode[mine], "spring_middle": local[self.middle[mine]],
+            "spring_mode": self.mode[mine], "spring_watched": self.watched[mine],
+            "spring_middle": local[self.middle[mine]],
         }  # fmt: skip
 
 

@@ -32,7 +32,11 @@ _SETTLE_SECONDS = 0.3
 
 
 class FabricCover(Task):
-    """A cube has to be hidden under a fabric, in two actions."""
+    """A cube has to be hidden under a fabric, in two actions.
+
+    Deliberate differences from the original: the cube's inertia is that of a solid cube, and it is
+    set on the table instead of dropped.
+    """
 
     name = "fabric-cover"
     max_actions = 2
@@ -61,7 +65,9 @@ class FabricCover(Task):
         """The cube anywhere, and the flat fabric about to fall, clear of it."""
         size = self.cube.parts[0].size[0]
         x, y, yaw = space.sample(rng, size, size)
-        square = to_world(size / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), (x, y, yaw))
+        square = to_world(
+            size / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), np.array([x, y, yaw])
+        )
         side = self.fabric.side
         u, v, _ = space.occupy_polygon(square).sample(
             rng, side, side, extent=side / np.sqrt(2) + self.overshoot

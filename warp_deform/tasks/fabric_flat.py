@@ -32,15 +32,20 @@ _FARTHEST = 0.34  # [m] from the zone's centre to where the fabric is drawn at f
 _TOWARDS_ZONE = 0.4  # and the share of that way which it is moved back
 _MOST_DRAWS = 1000
 _SETTLE_SECONDS = 0.3
+_CANDIDATE_SPREAD = 0.015  # [m] standard deviation of how far candidates pull beyond their target
 _FOLD_DEPTH = (0.06, 0.14)  # [m] from the corner; 0.141 folds the fabric in half
 _CYCLES = (np.arange(4) + np.arange(4)[:, None]) % 4
-"""The four ways (4, 4) to give corners to corners in order: row k gives corner i the target i + k."""
+"""Ways to give corners to places in order (4, 4): row k gives corner i the place i + k."""
 
 
 class FabricFlat(Task):
     """A fabric of 0.2 m has to cover 0.85 of a square of its size that is drawn on the table.
 
     folded: start with a corner of the fabric turned over, a variant that the paper has not
+
+    Deliberate differences from the original: the demonstrator pulls a corner, which is one cell
+    inwards, to where it lies in a flat fabric on the square, not to the square's own corner and
+    3 cm beyond; the original's fabric stretches by that much, this one would be dragged off.
     """
 
     name = "fabric-flat"
@@ -56,9 +61,9 @@ class FabricFlat(Task):
     visible: ClassVar[bool] = True
     """Whether the square is drawn."""
     overshoot: ClassVar[float] = 0.0
-    """How far beyond its target the demonstrator pulls a corner [m]."""
+    """How far beyond its target the demonstrator pulls a corner [m]; the original 0.03."""
     inset: ClassVar[float] = FABRIC.spacing
-    """How far inside the square's corners the demonstrator's targets are, along x and y [m]."""
+    """How far inside the square's corners the demonstrator's targets are, along both sides [m]."""
 
     def __init__(self, *, folded: bool = False) -> None:
         self.folded = folded
@@ -110,7 +115,7 @@ class FabricFlat(Task):
     def demonstrate(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
     ) -> Action | None:
-        """Pull one corner of the fabric to a corner of the square, and a little beyond.
+        """Pull one corner of the fabric to its place on the square.
 
         First the one nearest to the square's centre, to where it goes when all four move alike;
         then always the one that is farthest from its place.
@@ -128,13 +133,13 @@ class FabricFlat(Task):
     def candidates(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
     ) -> list[Action]:
-        """The visible demonstrator's action, then pulls on all corners in turn, less or more far."""
+        """The visible demonstrator's action, then pulls on all corners in turn, less or more."""
         first = self.demonstrate_visible(layout, snapshot, rng)
         if first is None:
             return []
         drawn = [first]
         while len(drawn) < count:
-            overshoot = rng.normal(self.overshoot, self.overshoot)
+            overshoot = rng.normal(self.overshoot, _CANDIDATE_SPREAD)
             drawn += self._pulls(layout, snapshot, overshoot).values()
         return drawn[:count]
 

@@ -12,6 +12,8 @@ from .block import BlockNotarget
 from .cable_line import CableLineNotarget
 from .cable_ring import CableRing, CableRingNotarget
 from .cable_shape import CableShape, CableShapeNotarget
+from .fabric_cover import FabricCover
+from .fabric_flat import FabricFlat, FabricFlatNotarget
 from .task import Task
 
 __all__ = ["TASKS", "task"]
@@ -24,6 +26,9 @@ TASKS: dict[str, type[Task]] = {
         CableShape,
         CableShapeNotarget,
         CableLineNotarget,
+        FabricCover,
+        FabricFlat,
+        FabricFlatNotarget,
         BagAloneOpen,
         BagItems1,
         BagItems2,
