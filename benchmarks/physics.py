@@ -41,6 +41,7 @@ PEERS = {
     "cloth25": ("pybullet", "newton-vbd"),
     "cloth25-edges": ("pybullet",),
     "cloth50": ("pybullet",),
+    "cloth50-edges": (),
     "bag": ("pybullet", "newton-vbd"),
     "bag-cube": ("pybullet", "newton-vbd"),
 }

@@ -74,7 +74,7 @@ def stress(task: str, *, actions: int, seed: int = 0, count: int = 16) -> Tally:
         waiting = [
             slot
             for slot in chosen
-            if not worlds.episodes[slot].physics_ok or worlds.episodes[slot].actions >= EPISODE
+            if not worlds.episodes[slot].physics_ok or len(worlds.episodes[slot].actions) >= EPISODE
         ]
     tally.seconds = time.perf_counter() - begin
     return tally
@@ -157,7 +157,7 @@ def examine(
     for what, good in checks.items():
         if not good:
             numbers = np.array2string(action, precision=17, separator=",", max_line_width=1000)
-            before = f"seed {episode.seed}, action number {episode.actions}"
+            before = f"seed {episode.seed}, action number {len(episode.actions)}"
             tally.broken.append(f"{what}: {before}, {kind} {numbers}")
 
 

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-import numpy as np
-from solver_scenes import new_builder
+from dataclasses import replace
 
-from warp_deform.objects import BoxConfig, Cloth, ClothConfig, add_box, add_cloth, cloth_sheet
+import numpy as np
+from solver_scenes import finalize, new_builder
+
+from warp_deform.objects import (
+    BoxConfig,
+    CableConfig,
+    Cloth,
+    ClothConfig,
+    add_box,
+    add_cable,
+    add_cloth,
+    cable_line,
+    cloth_sheet,
+)
 from warp_deform.rollout import GripPath
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import CLOTH_SOLVER
 
 FABRIC = ClothConfig()
+SMALL = ClothConfig(rows=6, columns=6, side=0.1)
 
 
 def cloth_solver(
@@ -29,6 +42,26 @@ def cloth_solver(
         add_box(one, BoxConfig(), box)
     builder.replicate(one, worlds)
     return SolverFusedXPBD(builder.finalize(device="cpu"), config, **options), handle
+
+
+def two_sheets_and_a_cable(
+    config: SolverConfig = CLOTH_SOLVER, *, edge: float = 0.0, **options: object
+) -> SolverFusedXPBD:
+    """Two sheets above each other and a cable above both; edge: share `edge_contact`."""
+    builder = new_builder()
+    for height in (0.03, 0.04):
+        cloth = replace(SMALL, edge_contact=edge)
+        add_cloth(builder, cloth, cloth_sheet(SMALL, (0.5, 0.0), height=height, yaw=height * 30))
+    # as light as the sheets: what is much heavier sinks into a layer by some millimetres
+    cable = CableConfig(beads=8, mass=0.005)
+    beads = np.add(cable_line(cable, (0.46, 0.0), (0.6, 0.02)), [0, 0, 0.05])
+    add_cable(builder, cable, beads)
+    return finalize(builder, config, **options)
+
+
+def crumpled(count: int, seed: int = 0, size: float = 0.05) -> np.ndarray:
+    """Positions (count, 3) in a box of side `size` [m] above the table: far too close."""
+    return np.add(np.random.default_rng(seed).uniform(0, size, (count, 3)), [0.5, 0.0, 0.02])
 
 
 def fold_path(start: np.ndarray, way: tuple[float, float], *, particle: int = 0) -> GripPath:

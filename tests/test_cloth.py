@@ -216,8 +216,8 @@ def test_the_cost_of_a_fold_is_measured():
     report = run(scene="cloth10", worlds=2, repeats=2)
     assert report["same_bits"] and report["particles"] == 100 and report["worlds"] == 2
     assert 0 < report["ms_per_sim_second"] < 500
-    with pytest.raises(InputError, match="no peer"):
-        run(scene="cloth25", peer="newton-vbd")
+    with pytest.raises(InputError, match="does not run"):
+        run(scene="cloth25", peer="newton-xpbd")
 
 
 # -- how fabrics move
@@ -279,21 +279,29 @@ def test_a_sheet_that_is_dropped_comes_to_rest_on_the_table(config):
      (FINE, 0, (0.13, 0.13))],
 )  # fmt: skip
 def test_a_fold_holds_and_neither_pierces_nor_collapses(config, corner, way):
-    solver, cloth = cloth_solver(config)
+    # a fold is chaotic, and without edge contact one in twelve pierces a little: eight, each by
+    # another way, show what is usual
+    count = 8
+    solver, cloth = cloth_solver(config, worlds=count, lanes=8)
     before = positions(solver).astype(float)
-    path = fold_path(before[corner], way, particle=corner)
-    result = rollout(solver, [0], paths={0: path}, least=1.2, most=2.5)[0]
-    assert result.watch.problems(0, solver.config.limits) == ()
-    x = positions(solver)
-    hold = (x[corner] - before[corner])[:2] @ way / np.dot(way, way)
-    assert 0.75 < hold < 1.4
-    ratio = edge_ratios(x, before, cloth.faces)
-    assert ratio.min() > 0.4 and ratio.max() < 1.2
-    assert piercing(x, cloth.faces) <= 0.02 * len(edges_of(cloth.faces))
-    speed = np.linalg.norm(velocities(solver), axis=1)
-    assert np.sqrt((speed**2).mean()) < 0.01
-    # it is a fold: the corner lies a layer above others
-    assert x[corner, 2] > config.radius + 0.5 * config.layer_distance(config.spacing)
+    ways = np.array(way) + np.random.default_rng(0).normal(0, 0.005, (count, 2))
+    ways[0] = way
+    paths = {w: fold_path(before[corner], tuple(ways[w]), particle=corner) for w in range(count)}
+    results = rollout(solver, range(count), paths=paths, least=1.2, most=2.5)
+    pierced = 0
+    for w in range(count):
+        assert results[w].watch.problems(w, solver.config.limits) == ()
+        x = positions(solver, w)
+        hold = (x[corner] - before[corner])[:2] @ ways[w] / np.dot(ways[w], ways[w])
+        assert 0.75 < hold < 1.4
+        ratio = edge_ratios(x, before, cloth.faces)
+        assert ratio.min() > 0.4 and ratio.max() < 1.2
+        pierced += piercing(x, cloth.faces)
+        speed = np.linalg.norm(velocities(solver, w), axis=1)
+        assert np.sqrt((speed**2).mean()) < 0.01
+        # it is a fold: the corner lies a layer above others
+        assert x[corner, 2] > config.radius + 0.5 * config.layer_distance(config.spacing)
+    assert pierced <= 0.01 * count * len(edges_of(cloth.faces))
 
 
 def test_edges_keep_a_second_fold_from_piercing():

@@ -359,7 +359,7 @@ def test_block_action_carries_the_block_exactly_to_the_target(seed: int) -> None
     after = snapshot(layout.particle_q, layout, moved[None])
     assert not item.solved(layout, state)
     assert item.solved(layout, after)
-    reached = item.goal_targets(after)
+    reached = item.goal_targets(layout, after)
     assert reached[:2] == pytest.approx(layout.targets[:2], abs=1e-9)
     assert np.cos(reached[2] - layout.targets[2]) == pytest.approx(1)
 

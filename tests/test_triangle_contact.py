@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
-from cloth_scenes import FABRIC, cloth_solver, fold_path
+from cloth_scenes import FABRIC, SMALL, cloth_solver, crumpled, fold_path, two_sheets_and_a_cable
 from solver_scenes import (
     G,
     add_particles,
@@ -34,90 +33,6 @@ from warp_deform.objects.attributes import attribute
 from warp_deform.rollout import rollout
 from warp_deform.solver import PhysicsError, ProblemKind, SolverFusedXPBD, replay_bundle
 from warp_deform.tasks.cloth_physics import CLOTH_SOLVER
-
-SMALL = ClothConfig(rows=6, columns=6, side=0.1)
-
-
-def crumpled(count: int, seed: int = 0, size: float = 0.05) -> np.ndarray:
-    """Positions (count, 3) in a box of side `size` [m] above the table: far too close."""
-    return np.add(np.random.default_rng(seed).uniform(0, size, (count, 3)), [0.5, 0.0, 0.02])
-
-
-def listed(solver: SolverFusedXPBD, world: int = 0) -> set[tuple[int, int]]:
-    """Pairs (particle, triangle) in the list of a world."""
-    views, (group, lane) = solver.data.views, divmod(solver.data.slot[world], solver.data.lanes)
-    start = views["cells.list_start"][group] + lane * views["cells.capacity"][group]
-    rows = slice(start, start + views["cells.count"][solver.data.slot[world]])
-    return set(
-        zip(views["cells.particle"][rows].tolist(), views["cells.face"][rows].tolist(), strict=True)
-    )
-
-
-def near(solver: SolverFusedXPBD, x: np.ndarray, world: int = 0) -> set[tuple[int, int]]:
-    """The same by brute force, with another library's closest points."""
-    top = solver.data.topologies[0]
-    found = set()
-    for t, tri in enumerate(top.sheet_triangle):
-        corners = np.broadcast_to(x[tri].astype(float), (len(x), 3, 3))
-        distance = np.linalg.norm(
-            trimesh.triangles.closest_point(corners, x.astype(float)) - x, axis=1
-        )
-        apart = np.linalg.norm(top.sheet_rest[:, None] - top.sheet_rest[tri], axis=2).min(axis=1)
-        own = top.sheet_owner == top.sheet_owner[tri[0]]
-        reach = top.sheet_skin + top.sheet_skin[tri[0]] + solver.config.margin
-        hits = (distance < reach) & (~own | (apart > top.sheet_exclusion))
-        found |= {(int(i), t) for i in np.flatnonzero(hits)}
-    return found
-
-
-def two_sheets_and_a_cable(config=CLOTH_SOLVER, **options) -> SolverFusedXPBD:
-    builder = new_builder()
-    for height in (0.03, 0.04):
-        add_cloth(builder, SMALL, cloth_sheet(SMALL, (0.5, 0.0), height=height, yaw=height * 30))
-    # as light as the sheets: what is much heavier sinks into a layer by some millimetres
-    cable = CableConfig(beads=8, mass=0.005)
-    beads = np.add(cable_line(cable, (0.46, 0.0), (0.6, 0.02)), [0, 0, 0.05])
-    add_cable(builder, cable, beads)
-    return finalize(builder, config, **options)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_list_is_what_is_near(seed):
-    solver = two_sheets_and_a_cable(pairs_per_particle=500)
-    x = solver.data.lane("particles.x", 0)
-    x[:] = crumpled(len(x), seed)
-    solver.run(1)
-    # listed where the first substep predicted the particles
-    expected = near(solver, solver.data.lane("cells.xr", 0))
-    assert len(expected) > 500
-    assert listed(solver) == expected
-
-
-def test_no_near_pair_is_ever_missing():
-    solver = two_sheets_and_a_cable(precision="float32")
-    margin = solver.config.margin
-    seen = 0
-    for _ in range(40):
-        solver.run(7)
-        x, xr = positions(solver), solver.data.lane("cells.xr", 0)
-        # at the end of a substep its corrections come on top of what the list allows for
-        assert np.linalg.norm(x - xr, axis=1).max() < 1.5 * margin
-        top = solver.data.topologies[0]
-        tight = {
-            (i, t) for i, t in near(solver, x)
-            if distance(x, i, top.sheet_triangle[t])
-            < top.sheet_skin[i] + top.sheet_skin[top.sheet_triangle[t][0]]
-        }  # fmt: skip
-        seen += len(tight)
-        assert tight <= listed(solver)
-    assert seen > 1000
-
-
-def distance(x: np.ndarray, i: int, tri: np.ndarray) -> float:
-    point = x[i : i + 1].astype(float)
-    return float(
-        np.linalg.norm(trimesh.triangles.closest_point(x[tri][None].astype(float), point) - point)
-    )
 
 
 def test_layers_and_beads_lie_on_top_of_each_other():

@@ -45,8 +45,8 @@ def run(
 ) -> dict[str, Any]:
     """Time `scene` ("cable", "heap", "ring", "block", a fabric or a bag), and `peer` beside it.
 
-    The fabrics are those of `bench_cloth`, with at most 16 worlds; their figure is the mean over
-    settling, one fold and lying folded, ours and the peer's.
+    The fabrics are those of `bench_cloth`, with at most 16 worlds (4 of 50 rows); their figure is
+    the mean over settling, one fold and lying folded, ours and the peer's.
 
     seconds: simulated time of one measurement [s]; None: 1 s, or the whole play of a fabric or a
     bag, which `seconds` cuts short for a peer alone

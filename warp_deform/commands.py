@@ -245,7 +245,10 @@ def inspect(options: InspectOptions) -> Outcome:
 class BenchOptions(CommandOptions):
     """Time one simulated second of a scene; compiling is timed apart."""
 
-    scene: Literal["cable", "heap", "ring", "block", "cloth10", "cloth25"] = "cable"
+    scene: Literal[
+        "cable", "heap", "ring", "block", "cloth10", "cloth25", "cloth50",
+        "cloth10-edges", "cloth25-edges", "cloth50-edges",
+    ] = "cable"  # fmt: skip
     """What is simulated."""
     peer: Literal["pybullet", "newton-vbd", "newton-vbd-bodies", "newton-xpbd"] | None = None
     """Another simulator to time on the same scene."""

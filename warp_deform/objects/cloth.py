@@ -56,7 +56,7 @@ class ClothConfig:
     """No self-contact closer than this in the flat sheet, in spacings."""
     edge_contact: float = 0.0
     """Distance at which edges touch, as a share of the layers'; 0: edges pass through each other.
-    At 0.2 second folds and crumples pierce less, at 1.7 to 2.2 times the cost."""
+    At 0.2 second folds and crumples pierce less, at 1.4 to 2.2 times the cost."""
     grasp_reach: float = 0.025
     """A descending tip takes hold of a vertex this near [m], as in the original."""
     friction: float = 1.0

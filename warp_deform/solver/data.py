@@ -30,6 +30,7 @@ def alias_lanes(structs: list[Any], scalar: Any) -> None:
     particles, cells = (structs[KERNEL_ARGUMENTS.index(name)] for name in ("particles", "cells"))
     for field, array in (
         ("x", particles.x), ("xp", particles.xp), ("w", particles.w), ("xr_flat", cells.xr),
+        ("slack_flat", cells.slack),
     ):  # fmt: skip
         count = array.capacity // np.dtype(_NUMPY[scalar]).itemsize
         flat = wp.array(ptr=array.ptr, dtype=scalar, shape=(count,), device=array.device)

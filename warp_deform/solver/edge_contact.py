@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from .cell_sort import cell_sort
 from .lane_access import lane_access
 from .structures import structures
 
@@ -27,12 +28,14 @@ PARALLEL = 0.01
 def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     """`list_edges` lists pairs of edges of one lane, `project_edges` solves them in that order.
 
-    Listing uses the cells of the lane's triangles, which must have been listed just before, and
-    returns how many pairs found no room.
+    `list_edges` follows `list_triangles` (see `cell_list`), whose slacks and moved particles it
+    takes over, and returns how many pairs found no room.
     """
     t = structures(scalar, lanes)
     S, R3, L = t.S, t.R3, t.L
-    R2 = wp.types.vector(2, S)
+    R2, V4 = wp.types.vector(2, S), t.V4
+    cells_ = cell_sort(scalar, lanes)
+    cell_of, sort_cells, next_in_ball = cells_.cell_of, cells_.sort_cells, cells_.next_in_ball
     Topology, Sheets, Cells = t.Topology, t.Sheets, t.Cells
     access = lane_access(scalar, lanes)
     get, put, get_mass = access.get, access.put, access.get_mass
@@ -76,87 +79,128 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         return h
 
     @wp.func
+    def point(p: V4):
+        return R3(p[0], p[1], p[2])
+
+    @wp.func
+    def meeting(
+        base: int, places: int, e: wp.vec2i, f: wp.vec2i, sheets: Sheets, cells: Cells
+    ):  # fmt: skip
+        """Signed distance at which two edges touch, 0 where they are too far apart to be listed."""
+        gap = S(0.0)
+        if e[0] != f[0] and e[0] != f[1] and e[1] != f[0] and e[1] != f[1]:
+            a4 = cells.place[places + e[0]]
+            b4 = cells.place[places + e[1]]
+            c4 = cells.place[places + f[0]]
+            d4 = cells.place[places + f[1]]
+            a = point(a4)
+            b = point(b4)
+            c = point(c4)
+            d = point(d4)
+            h = S(0.5) * (sheets.edge_gap[base + e[0]] + sheets.edge_gap[base + f[0]])
+            at = nearest(a, b, c, d)
+            way = a + (b - a) * at[0] - c - (d - c) * at[1]
+            far = h + wp.max(a4[3], b4[3]) + wp.max(c4[3], d4[3])
+            if wp.length_sq(way) < far * far:
+                h = touching_distance(base, e, f, h, sheets)
+                if h > S(1.0e-5):
+                    gap = wp.where(wp.dot(wp.cross(b - a, d - c), way) >= S(0.0), h, -h)
+        return gap
+
+    @wp.func
+    def drop_moved(start: int, count: int, links: int, sheets: Sheets, cells: Cells):
+        """Takes pairs with a moved end off the list; returns how many are left."""
+        kept = int(0)
+        for at in range(start, start + count):
+            e = sheets.edge[cells.edge_a[at]]
+            f = sheets.edge[cells.edge_b[at]]
+            if (
+                cells.moved[links + e[0]] + cells.moved[links + e[1]]
+                + cells.moved[links + f[0]] + cells.moved[links + f[1]]
+            ) == 0:  # fmt: skip
+                cells.edge_a[start + kept] = cells.edge_a[at]
+                cells.edge_b[start + kept] = cells.edge_b[at]
+                cells.edge_gap[start + kept] = cells.edge_gap[at]
+                kept += 1
+        return kept
+
+    @wp.func
     def list_edges(
-        g: int, lane: int, k: int, p0: int, margin: S, top: Topology, sheets: Sheets, cells: Cells
+        g: int, lane: int, k: int, p0: int, anew: bool, top: Topology, sheets: Sheets, cells: Cells
     ):
         base = top.particle_start[k]
         first = sheets.edge_first[k]
         count = sheets.edge_first[k + 1] - first
         grid = sheets.grid[k]
-        heads = cells.head_start[g] + lane * grid * grid
+        heads = cells.head_start[g] + lane * (grid * grid + 1)
         links = cells.link_start[g] + lane * count
+        places = p0 * wp.static(L) + lane * top.particle_count[k]
         start = cells.list_start[g] + lane * cells.capacity[g]
-        # one square around all midpoints
-        half = S(0.0)
-        a = get(cells.x, p0, lane)
-        low0 = a[0]
-        low1 = a[1]
-        high0 = a[0]
-        high1 = a[1]
-        for n in range(count):
-            ij = sheets.edge[first + n]
-            a = get(cells.x, p0 + ij[0], lane)
-            b = get(cells.x, p0 + ij[1], lane)
-            half = wp.max(half, wp.length_sq(b - a))
-            low0 = wp.min(low0, a[0])
-            low1 = wp.min(low1, a[1])
-            high0 = wp.max(high0, a[0])
-            high1 = wp.max(high1, a[1])
-        half = S(0.5) * wp.sqrt(half)
-        side = wp.max(wp.max(high0 - low0, high1 - low1) / S(grid), sheets.cell[k])
-        inverse = S(1.0) / side
-        for at in range(grid * grid):
-            cells.head[heads + at] = -1
+        slot = g * wp.static(L) + lane
         listed = int(0)
-        left_out = int(0)
+        if not anew:
+            listed = drop_moved(start, cells.edge_count[slot], places, sheets, cells)
+        # the cells cover what moved edges can reach
+        half = S(0.0)
+        low = R3(S(1.0e9), S(1.0e9), S(1.0e9))
+        high = -low
         for n in range(count):
             e = sheets.edge[first + n]
-            a = get(cells.x, p0 + e[0], lane)
-            b = get(cells.x, p0 + e[1], lane)
-            thick = sheets.edge_gap[base + e[0]]
-            wide = thick + margin
-            reach = R3(wide, wide, wide)
-            low = wp.min(a, b) - reach
-            high = wp.max(a, b) + reach
-            r0 = wp.clamp(int((low[0] - half - low0) * inverse), 0, grid - 1)
-            r1 = wp.clamp(int((high[0] + half - low0) * inverse), 0, grid - 1)
-            q0 = wp.clamp(int((low[1] - half - low1) * inverse), 0, grid - 1)
-            q1 = wp.clamp(int((high[1] + half - low1) * inverse), 0, grid - 1)
-            for r in range(r0, r1 + 1):
-                for q in range(q0, q1 + 1):
-                    m = cells.head[heads + r * grid + q]
-                    while m >= 0:
-                        f = sheets.edge[first + m]
-                        c = get(cells.x, p0 + f[0], lane)
-                        d = get(cells.x, p0 + f[1], lane)
-                        l = wp.min(c, d)
-                        h = wp.max(c, d)
-                        if (
-                            l[2] < high[2] and h[2] > low[2]
-                            and l[0] < high[0] and h[0] > low[0]
-                            and l[1] < high[1] and h[1] > low[1]
-                            and e[0] != f[0] and e[0] != f[1] and e[1] != f[0] and e[1] != f[1]
-                        ):  # fmt: skip
-                            at2 = nearest(a, b, c, d)
-                            way = a + (b - a) * at2[0] - c - (d - c) * at2[1]
-                            if wp.length_sq(way) < wide * wide:
-                                gap = touching_distance(base, e, f, thick, sheets)
-                                if gap > S(1.0e-5):
-                                    if listed < cells.capacity[g]:
-                                        above = wp.dot(wp.cross(b - a, d - c), way) >= S(0.0)
-                                        cells.edge_a[start + listed] = first + n
-                                        cells.edge_b[start + listed] = first + m
-                                        cells.edge_gap[start + listed] = wp.where(above, gap, -gap)
-                                        listed += 1
-                                    else:
-                                        left_out += 1
-                        m = cells.edge_next[links + m]
-            middle = (a + b) * S(0.5)
-            row = wp.clamp(int((middle[0] - low0) * inverse), 0, grid - 1)
-            column = wp.clamp(int((middle[1] - low1) * inverse), 0, grid - 1)
-            cells.edge_next[links + n] = cells.head[heads + row * grid + column]
-            cells.head[heads + row * grid + column] = n
-        cells.edge_count[g * wp.static(L) + lane] = listed
+            moved = cells.moved[places + e[0]] + cells.moved[places + e[1]]
+            cells.edge_moved[links + n] = moved
+            ball = cells.edge_ball[links + n]
+            if moved > 0:
+                a4 = cells.place[places + e[0]]
+                b4 = cells.place[places + e[1]]
+                middle = (point(a4) + point(b4)) * S(0.5)
+                l = S(0.5) * wp.length(point(b4) - point(a4))
+                # what a slack adds to the reach of the edge makes its ball larger
+                ball = V4(middle[0], middle[1], middle[2], l + wp.max(a4[3], b4[3]))
+                cells.edge_ball[links + n] = ball
+                low = wp.min(low, middle)
+                high = wp.max(high, middle)
+            half = wp.max(half, ball[3])
+        wide = S(2.0) * half + sheets.edge_widest[k]
+        low = low - R3(wide, wide, wide)
+        high = high + R3(wide, wide, wide)
+        low0 = low[0]
+        low1 = low[1]
+        inverse = S(grid) / wp.max(wp.max(high[0] - low0, high[1] - low1), S(grid) * sheets.cell[k])
+        sort_cells(
+            heads, grid, links, count, low, high, inverse, cells.edge_ball, cells.edge_moved,
+            cells.head, cells.edge_key, cells.edge_sorted,
+        )  # fmt: skip
+        left_out = int(0)
+        for n in range(count):
+            if cells.edge_moved[links + n] > 0:
+                e = sheets.edge[first + n]
+                ball = cells.edge_ball[links + n]
+                ball[3] = ball[3] + sheets.edge_widest[k]
+                wide = ball[3] + half
+                first1 = heads + cell_of(ball[1] - wide, low1, inverse, grid)
+                last1 = heads + cell_of(ball[1] + wide, low1, inverse, grid) + 1
+                last0 = cell_of(ball[0] + wide, low0, inverse, grid)
+                for row in range(cell_of(ball[0] - wide, low0, inverse, grid), last0 + 1):
+                    end = links + cells.head[last1 + row * grid]
+                    at = links + cells.head[first1 + row * grid]
+                    at = next_in_ball(cells.edge_sorted, at, end, ball)
+                    while at < end:
+                        m = cells.edge_key[at]
+                        # two moved ones meet once
+                        if m < n:
+                            if m < 0:
+                                m = -1 - m
+                            gap = meeting(base, places, e, sheets.edge[first + m], sheets, cells)
+                            if gap != S(0.0):
+                                if listed < cells.capacity[g]:
+                                    cells.edge_a[start + listed] = first + n
+                                    cells.edge_b[start + listed] = first + m
+                                    cells.edge_gap[start + listed] = gap
+                                    listed += 1
+                                else:
+                                    left_out += 1
+                        at = next_in_ball(cells.edge_sorted, at + 1, end, ball)
+        cells.edge_count[slot] = listed
         return left_out
 
     @wp.func

@@ -294,15 +294,17 @@ def forward_kernel(
                 travel = select(stale, zero, travel)
             if wp.static(with_sheets):
                 if sheets.first[k + 1] > sheets.first[k]:
-                    way2 = moved_since(p0, n, q, cells)
-                    half2 = S(0.25) * st.margin * st.margin
+                    far = moved_since(p0, n, q, cells)
                     for lane in range(wp.static(L)):
-                        if on[lane] > S(0.0) and (fresh[lane] < S(0.5) or way2[lane] > half2):
+                        if on[lane] > S(0.0) and (fresh[lane] < S(0.5) or far[lane] > S(0.0)):
+                            anew = fresh[lane] < S(0.5)
                             fresh[lane] = S(1.0)
-                            left = list_triangles(g, lane, k, p0, st.margin, top, sheets, cells)
+                            left = list_triangles(
+                                g, lane, k, p0, st.margin, anew, top, sheets, cells
+                            )  # fmt: skip
                             if wp.static(with_edges):
                                 left += list_edges(
-                                    g, lane, k, p0, st.margin, top, sheets, cells
+                                    g, lane, k, p0, anew, top, sheets, cells
                                 )  # fmt: skip
                             over = watch.overflow[g]
                             over[lane] = wp.max(over[lane], S(left))

@@ -34,4 +34,7 @@ def lane_access(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func_native(f"return x.data[(size_t)i * {L} + lane];")
     def get_mass(x: wp.array(dtype=S), i: int, lane: int) -> S: ...
 
-    return SimpleNamespace(get=get, put=put, get_mass=get_mass)
+    @wp.func_native(f"x.data[(size_t)i * {L} + lane] = v;")
+    def put_scalar(x: wp.array(dtype=S), i: int, lane: int, v: S): ...
+
+    return SimpleNamespace(get=get, put=put, get_mass=get_mass, put_scalar=put_scalar)

@@ -21,6 +21,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
     """Struct types for one precision and width."""
     t = lane_types(scalar, lanes)
     S, V, V3, R3, Q, M33 = t.S, t.V, t.V3, t.R3, t.Q, t.M33
+    V4 = wp.types.vector(4, S)
 
     @wp.struct
     class Settings:
@@ -132,7 +133,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         """Triangles of fabrics, numbered inside their world, and their particles at rest.
 
         Per topology: first (topologies + 1,), grid, cell, widest. Per particle as
-        `Topology.radius`: skin, rest, owner, exclusion.
+        `Topology.radius`: skin, rest, owner, edge_gap, exempt_first (particles + 1,).
         """
 
         first: wp.array(dtype=int)
@@ -144,34 +145,49 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         skin: wp.array(dtype=S)  # a particle's share of the distance at which things touch [m]
         rest: wp.array(dtype=R3)  # [m]
         owner: wp.array(dtype=int)  # number of the object
-        exclusion: wp.array(dtype=S)  # no self-contact closer than this in the rest shape [m]
+        exempt_first: wp.array(dtype=int)  # where the particle's own slice of `exempt` starts
+        exempt: wp.array(dtype=int)  # particles that never touch triangles with this corner
         edge_first: wp.array(dtype=int)  # per topology, as `first`
         edge: wp.array(dtype=wp.vec2i)
         edge_gap: wp.array(dtype=S)  # per particle: distance at which its edges touch others [m]
+        edge_widest: wp.array(dtype=S)  # per topology: largest edge_gap [m]
 
     @wp.struct
     class Cells:
-        """Particles near triangles, per group and lane, and the cells that find them."""
+        """Particles near triangles, per group and lane, and the cells that find them.
+
+        A lane's own slice of `key`, `place`, ... begins at particle_start * L + lane * particles;
+        that of edges at link_start + lane * edges.
+        """
 
         head_start: wp.array(dtype=int)
         list_start: wp.array(dtype=int)
         capacity: wp.array(dtype=int)  # pairs of one lane at most
-        head: wp.array(dtype=int)  # first particle of a cell or -1
-        next: wp.array(dtype=int)  # the particle after this one in its cell or -1
+        head: wp.array(dtype=int)  # where each cell starts
         count: wp.array(dtype=int)  # pairs, by group * L + lane
         particle: wp.array(dtype=int)
         face: wp.array(dtype=int)
         gap: wp.array(dtype=S)  # distance at which they touch, negative below the triangle [m]
         link_start: wp.array(dtype=int)
-        edge_next: wp.array(dtype=int)  # the edge after this one in its cell or -1
+        edge_moved: wp.array(dtype=int)  # as `moved`
+        edge_key: wp.array(dtype=int)
+        edge_sorted: wp.array(dtype=V4)
         edge_count: wp.array(dtype=int)  # pairs of edges, as `count`
         edge_a: wp.array(dtype=int)
         edge_b: wp.array(dtype=int)
+        edge_ball: wp.array(dtype=V4)  # midpoint in `place`; half the length and the slack [m]
         edge_gap: wp.array(dtype=S)  # as `gap`
         met: wp.array(dtype=int)  # whether what the grip holds touched a triangle, as `count`
-        xr: wp.array(dtype=V3)  # positions at the last listing
+        xr: wp.array(dtype=V3)  # positions to which the lists refer
+        slack: wp.array(dtype=V)  # a particle may go so far from there before it is listed anew [m]
+        place: wp.array(dtype=V4)  # both of these, lane by lane
+        moved: wp.array(dtype=int)  # 1: the particle's pairs are being listed anew
+        stamp: wp.array(dtype=int)  # 1 + number of the last triangle it was found exempt from
+        key: wp.array(dtype=int)  # particles by cell (see `cell_sort`)
+        sorted: wp.array(dtype=V4)
         # the same memory as arrays of V3 and V, scalar by scalar (see `lane_access`)
         xr_flat: wp.array(dtype=S)
+        slack_flat: wp.array(dtype=S)
         x: wp.array(dtype=S)
         xp: wp.array(dtype=S)
         w: wp.array(dtype=S)
@@ -248,7 +264,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         frame_body_q: wp.array(dtype=Q)
 
     return SimpleNamespace(
-        **vars(t), Settings=Settings, Topology=Topology, Springs=Springs, Pairs=Pairs,
+        **vars(t), V4=V4, Settings=Settings, Topology=Topology, Springs=Springs, Pairs=Pairs,
         Shapes=Shapes, Group=Group, Particles=Particles, Near=Near, Bodies=Bodies, Grips=Grips,
         Watch=Watch, Contacts=Contacts, Sheets=Sheets, Cells=Cells,
     )  # fmt: skip

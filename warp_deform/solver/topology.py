@@ -266,13 +266,14 @@ def _pairs(
 
     Corners of the triangles `fabric` are left out: particles meet the triangles instead.
     """
-    i, j = np.triu_indices(len(ids), 1)
+    free = np.ones(len(ids), bool)
+    free[fabric.ravel()] = False
+    number = np.flatnonzero(free)
+    i, j = (number[side] for side in np.triu_indices(len(number), 1))
     owner = ours.particle_object.numpy()[ids]  # type: ignore[attr-defined]
     rest = ours.particle_rest.numpy()[ids]  # type: ignore[attr-defined]
     exclusion = ours.particle_exclusion.numpy()[ids]  # type: ignore[attr-defined]
     apart = np.linalg.norm(rest[i] - rest[j], axis=1) > np.minimum(exclusion[i], exclusion[j])
-    free = np.ones(len(ids), bool)
-    free[fabric.ravel()] = False
-    keep = ((owner[i] != owner[j]) | apart) & free[i] & free[j]
+    keep = (owner[i] != owner[j]) | apart
     pairs = np.column_stack([i, j])[keep]
     return pairs, radius[ids][pairs].sum(axis=1)
