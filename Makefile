@@ -5,12 +5,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-DEMO := demo/cable-shape
+DEMO := demo
 
 .PHONY: help venv demo test lint format bench clean
 
 help:
-	@echo "make demo    five demonstrations of cable-shape and their video, under demo/"
+	@echo "make demo    demonstrations of cable-shape and bag-items-1 and their videos, under demo/"
 	@echo "make test    the tests, on every core"
 	@echo "make lint    ruff and mypy"
 	@echo "make format  let ruff rewrite what it can"
@@ -26,8 +26,10 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 demo: $(STAMP)
-	$(BIN)/warp-deform demo cable-shape -n 5 --seed 0 --out $(DEMO) --video $(DEMO).mp4
-	@echo "episodes: $(DEMO)/    video: $(DEMO).mp4"
+	$(BIN)/warp-deform demo cable-shape -n 5 --out $(DEMO)/cable-shape --video $(DEMO)/cable-shape.mp4
+	$(BIN)/warp-deform demo bag-items-1 -n 2 --demonstrator visible \
+		--out $(DEMO)/bag-items-1 --video $(DEMO)/bag-items-1.mp4
+	@echo "episodes and videos: $(DEMO)/"
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto tests

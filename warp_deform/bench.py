@@ -15,6 +15,7 @@ from typing import Any
 import newton
 import numpy as np
 
+from .bench_bag import BAG_SCENES, run_bag
 from .bench_cloth import CLOTH_SCENES, run_cloth
 from .errors import InputError
 from .objects.box import add_box, l_block
@@ -27,7 +28,10 @@ from .tasks.cable_physics import CABLE_SOLVER
 __all__ = ["SCENES", "run"]
 
 _REST_AFTER = 2.0  # [s], as for the peers
-_SOFT_SCENES: dict[str, Callable[..., dict[str, Any]]] = dict.fromkeys(CLOTH_SCENES, run_cloth)
+_SOFT_SCENES: dict[str, Callable[..., dict[str, Any]]] = {
+    **dict.fromkeys(CLOTH_SCENES, run_cloth),
+    **dict.fromkeys(BAG_SCENES, run_bag),
+}
 """What times our side of each scene with a play of its own."""
 SCENES = (*PEER_SCENES, *_SOFT_SCENES)
 """Names that `run` knows."""

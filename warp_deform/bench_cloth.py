@@ -1,8 +1,7 @@
 """What a simulated second of folding a fabric costs: settling, one fold, and lying folded.
 
 Process CPU time, kernels compiled before. Every world folds another way. Sheets of 10, 25 and 50
-rows fold without contact between edges and, in scenes named so, with it. There is no peer: other
-engines' fabrics are made of other springs and other contacts.
+rows fold without contact between edges and, in scenes named so, with it.
 """
 
 from __future__ import annotations

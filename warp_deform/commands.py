@@ -247,7 +247,7 @@ class BenchOptions(CommandOptions):
 
     scene: Literal[
         "cable", "heap", "ring", "block", "cloth10", "cloth25", "cloth50",
-        "cloth10-edges", "cloth25-edges", "cloth50-edges",
+        "cloth10-edges", "cloth25-edges", "cloth50-edges", "bag", "bag-cube",
     ] = "cable"  # fmt: skip
     """What is simulated."""
     peer: Literal["pybullet", "newton-vbd", "newton-vbd-bodies", "newton-xpbd"] | None = None

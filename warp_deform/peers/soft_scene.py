@@ -31,7 +31,7 @@ _BAG_MARGIN = 0.003  # [m]
 _RING = 32  # vertices on a circle of latitude
 _RINGS = 11  # circles of latitude, pi / 16 apart; what is above the last is the opening
 _BAG_HEIGHT = 0.15  # [m]; of the sphere's centre
-_TILT = 0.25  # [rad]; standard deviation of each Euler angle
+TILT = 0.25  # [rad]; standard deviation of each Euler angle
 _BAG_FALL, _BAG_LIE = 1.0, 0.5  # [s]
 _CUBE_DEPTH = 0.045  # [m]; of the cube's centre below the sphere's
 
@@ -143,7 +143,7 @@ def _bag(name: str, rng: np.random.Generator) -> SoftScene:
     no_path = np.zeros((0, 3))
     return SoftScene(
         name=name,
-        vertices=sphere @ _rotation(rng.normal(0, _TILT, 3)).T + centre,
+        vertices=sphere @ _rotation(rng.normal(0, TILT, 3)).T + centre,
         triangles=np.concatenate(
             [
                 np.column_stack([pole, after[0], number[0]]),

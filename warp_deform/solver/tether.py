@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from .lanes import add, any_less, div, dot, mul, root, select, sub  # noqa: F401  (operators)
+from .lanes import add, any_less, div, dot, less, mul, root, select, sub  # noqa: F401
 from .structures import structures
 
 __all__ = ["NO_TETHER", "tether"]
@@ -33,10 +33,13 @@ def tether(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def project_tether(i: int, holding: V, held: V3, q: Particles):
         longest = select(holding, q.tether[i], V(S(NO_TETHER)))
-        d = q.x[i] - held
+        x = q.x[i]
+        d = x - held
         l2 = dot(d, d)
         if any_less(longest * longest - l2, S(0.0)):
-            share = longest / wp.max(root(l2), V(S(1.0e-12)))
-            q.x[i] = held + d * wp.min(select(q.w[i], share, V(S(1.0))), V(S(1.0)))
+            over = less(longest * longest, l2) * less(V(S(0.0)), q.w[i])
+            y = held + d * (longest / wp.max(root(l2), V(S(1.0e-12))))
+            # rounding must not move what is within reach
+            q.x[i] = V3(select(over, y.x, x.x), select(over, y.y, x.y), select(over, y.z, x.z))
 
     return SimpleNamespace(project_tether=project_tether)

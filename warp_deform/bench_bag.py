@@ -1,0 +1,101 @@
+"""What a simulated second of a falling bag costs, empty or with a cube in it, and one at rest.
+
+Process CPU time, kernels compiled before. Every world starts with another tilt, as the peers do on
+the original's mesh of 353 vertices; ours is the bag of the tasks, with edge contact.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import newton
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .objects.bag import BagConfig, add_bag, bag_shell
+from .objects.box import BoxConfig, BoxPart, add_box
+from .peers.soft_scene import TILT, soft_scene
+from .rollout import rollout
+from .solver.solver import SolverFusedXPBD
+from .tasks.bag_physics import BAG_SOLVER
+
+__all__ = ["BAG_SCENES", "run_bag"]
+
+BAG_SCENES = ("bag", "bag-cube")
+_MOST_WORLDS = 16  # a launch of more would take minutes
+_CUBE = BoxConfig(parts=(BoxPart((0.036, 0.036, 0.036)),), mass=0.02, friction=1.5)
+
+
+def run_bag(*, scene: str, lanes: int = 8, worlds: int = 8, repeats: int = 3) -> dict[str, Any]:
+    """Time `scene` (one of `BAG_SCENES`); returns what `bench.run` does, without a peer.
+
+    `ms_per_sim_second` is that of the fall, which ends crumpled; `rest_ms_per_sim_second` that of
+    what follows, simulated to the end although everything may be at rest.
+    """
+    worlds = min(worlds, _MOST_WORLDS)
+    begin = time.process_time()
+    lone, many = _solver(scene, 1, 1), _solver(scene, worlds, lanes)
+    for solver in (lone, many):
+        solver.run(20)
+    start_up = time.process_time() - begin
+    alone = [_play(lone, scene, [seed]) for seed in range(repeats)]
+    together = [_play(many, scene, list(range(worlds))) for _ in range(repeats)]
+    same = all(
+        np.array_equal(end, together[0][3][seed])
+        for seed, (_, _, _, (end,)) in enumerate(alone[:worlds])
+    )
+    report: dict[str, Any] = {
+        "scene": scene,
+        "lanes": lanes,
+        "worlds": worlds,
+        "dt": lone.config.dt,
+        "substeps": round(1 / 60 / lone.config.dt),
+        "particles": int(lone.model.particle_count),
+        "stretch": max(t[2] for t in alone),
+        "same_bits": same,
+        "start_up_seconds": start_up,
+    }
+    for suffix, times, count in (("", alone, 1), ("_lanes", together, worlds)):
+        for k, kind in enumerate(("", "rest_")):
+            values, name = [t[k] for t in times], f"{kind}ms_per_sim_second{suffix}"
+            report[name] = float(np.median(values)) / count
+            report[f"{name}_p95"] = float(np.percentile(values, 95)) / count
+    return report
+
+
+def _solver(scene: str, worlds: int, lanes: int) -> SolverFusedXPBD:
+    one, builder = newton.ModelBuilder(), newton.ModelBuilder()
+    for part in (one, builder):
+        SolverFusedXPBD.register_custom_attributes(part)
+    add_bag(one, BagConfig())
+    if scene == "bag-cube":
+        add_box(one, _CUBE, (0.5, 0.0, 0.1))
+    builder.replicate(one, worlds)
+    return SolverFusedXPBD(builder.finalize(device="cpu"), BAG_SOLVER, lanes=lanes)
+
+
+def _play(
+    solver: SolverFusedXPBD, scene: str, seeds: list[int]
+) -> tuple[float, float, float, list[np.ndarray]]:
+    """CPU ms per simulated second falling and after, the largest stretch, and the ends."""
+    data, shell = solver.data, bag_shell(BagConfig())
+    data.reset()
+    starts = [soft_scene(scene, seed=seed) for seed in seeds]
+    for world, (seed, start) in enumerate(zip(seeds, starts, strict=True)):
+        # as `soft_scene` draws it, about the middle of its sphere
+        turn = Rotation.from_euler("xyz", np.random.default_rng(seed).normal(0, TILT, 3))
+        pole = start.vertices[0] - turn.apply(shell.vertices[0])
+        data.lane("particles.x", world)[:] = turn.apply(shell.vertices) + pole
+        data.lane("particles.v", world)[:] = 0.0
+        if start.cube is not None:
+            data.set_bodies(world, np.array([[*start.cube, 0.0, 0.0, 0.0, 1.0]]))
+    worlds, fall, lie = range(len(seeds)), starts[0].before, starts[0].after
+    begin = time.process_time()
+    done = [rollout(solver, worlds, least=1e3, most=fall)]
+    middle = time.process_time()
+    done.append(rollout(solver, worlds, least=1e3, most=lie))
+    end = time.process_time()
+    stretch = max(result.watch.stretch for part in done for result in part.values())
+    ends = [data.lane("particles.x", w).copy() for w in worlds]
+    return 1e3 * (middle - begin) / fall, 1e3 * (end - middle) / lie, stretch, ends
