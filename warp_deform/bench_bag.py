@@ -58,7 +58,8 @@ def run_bag(*, scene: str, lanes: int = 8, worlds: int = 8, repeats: int = 3) ->
     }
     for suffix, times, count in (("", alone, 1), ("_lanes", together, worlds)):
         for k, kind in enumerate(("", "rest_")):
-            values, name = [t[k] for t in times], f"{kind}ms_per_sim_second{suffix}"
+            values = [(t[0], t[1])[k] for t in times]
+            name = f"{kind}ms_per_sim_second{suffix}"
             report[name] = float(np.median(values)) / count
             report[f"{name}_p95"] = float(np.percentile(values, 95)) / count
     return report

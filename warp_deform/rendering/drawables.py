@@ -100,10 +100,11 @@ class Drawables:
                 sheet_segments += [segment] * len(item.faces)
                 palette[segment] = item.config.color
                 segment += 1
-                for bead in item.ring if isinstance(item, Bag) else ():
-                    spheres.append((bead, item.config.visual_radius, segment))
-                    palette[segment] = item.config.bead_color
-                    segment += 1
+                if isinstance(item, Bag):
+                    for bead in item.ring:
+                        spheres.append((bead, item.config.visual_radius, segment))
+                        palette[segment] = item.config.bead_color
+                        segment += 1
             else:
                 quads.append(item.corners)
                 quad_segments += [segment] * len(item.corners)

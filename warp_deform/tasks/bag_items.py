@@ -47,7 +47,7 @@ class BagItems1(BagTask):
     stages = (OPEN, INSERT, CARRY)
     success_score = 0.5
     ground_truth_size = 105
-    objects = ("bag", "cube")
+    objects: ClassVar[tuple[str, ...]] = ("bag", "cube")
 
     cubes: ClassVar[tuple[BoxConfig, ...]] = (
         BoxConfig(parts=(BoxPart((0.036, 0.036, 0.036)),), mass=0.02, friction=1.5, color=RED),
@@ -260,7 +260,7 @@ class BagItems2(BagItems1):
     name = "bag-items-2"
     max_actions = 9
     ground_truth_size = 108
-    objects = ("bag", "box", "box")
+    objects: ClassVar[tuple[str, ...]] = ("bag", "box", "box")
     cubes: ClassVar[tuple[BoxConfig, ...]] = (
         BoxConfig(parts=(BoxPart((0.035, 0.035, 0.03)),), mass=0.1, friction=1.5, color=BROWN),
         BoxConfig(parts=(BoxPart((0.035, 0.035, 0.03)),), mass=0.1, friction=1.5, color=BROWN),

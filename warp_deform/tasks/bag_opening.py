@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..objects.bag import Bag, BagConfig, bag_shell
+from ..objects.bag import Bag, BagConfig, BagShell, bag_shell
 from ..objects.box import Box
 from ..objects.push import Push
+from ..objects.surface import area_share
 from ..rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world
 from ..robots.primitive import PrimitiveConfig, find_grasp
 from .bag_physics import BAG_PRIMITIVE, BAG_SOLVER, INSERT, OPEN
@@ -156,7 +157,7 @@ class BagTask(Task):
 
     def _segments(self, layout: Layout, snapshot: Snapshot, item: object) -> range:
         """Segmentation ids of an object: of a bag, first the shell's, then those of its beads."""
-        return snapshot.segments[len(layout.zones) + snapshot.objects.index(item)]  # type: ignore[arg-type]
+        return snapshot.segments[len(layout.zones) + snapshot.objects.index(item)]
 
     # -- opening
 
@@ -321,15 +322,13 @@ def _downward_rays() -> np.ndarray:
 
 
 @functools.cache
-def _shell(config: BagConfig):  # type: ignore[no-untyped-def]
+def _shell(config: BagConfig) -> BagShell:
     return bag_shell(config)
 
 
 @functools.cache
 def _bead_mass(config: BagConfig) -> float:
     """Mass of a bead with its share of the shell [kg]."""
-    from ..objects.surface import area_share
-
     shell = _shell(config)
     share = area_share(shell.vertices, shell.faces)[shell.ring]
     return float(config.bead_mass + config.mass * share.mean())
