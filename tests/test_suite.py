@@ -26,6 +26,7 @@ from warp_deform.worlds import Worlds
 
 STRESS = Path(__file__).resolve().parent.parent / "benchmarks" / "stress.py"
 SLOTS = 20
+BAG_SLOTS = 8  # a bag costs as much as ten cables
 MOVING = 0.02  # [m/s]
 # Medians of the score at the start: as hard as the original's, measured there.
 START_SCORE = {
@@ -36,9 +37,17 @@ START_SCORE = {
     "cable-line-notarget": (0.0, 1 / 24),
     "fabric-flat": (0.04, 0.15),
     "fabric-flat-notarget": (0.04, 0.15),
+    "bag-alone-open": (0.30, 0.45),
+    "bag-items-1": (0.0, 0.0),  # nothing was carried yet
+    "bag-items-2": (0.0, 0.0),
+    "bag-color-goal": (0.0, 0.05),
 }
+# Starts that are looked at, where fewer than a hundred.
+STARTS = {"bag-alone-open": 24, "bag-items-1": 24, "bag-items-2": 24, "bag-color-goal": 16}
 # Scores of a constructed goal where they are counted in pixels, whose edges round either way.
-GOAL_SCORE = {"fabric-flat-notarget": 0.97}
+GOAL_SCORE = {"fabric-flat-notarget": 0.97, "bag-color-goal": 0.97}
+# Of eight seeds, where the demonstrator solves fewer than seven; the visible one acts for bags.
+LEAST_SOLVED = {"bag-items-1": 5, "bag-items-2": 2, "bag-color-goal": 3}
 every_task = pytest.mark.parametrize("name", TASKS)
 goal_task = pytest.mark.parametrize("name", [n for n, t in TASKS.items() if t.goal_conditioned])
 
@@ -47,6 +56,16 @@ goal_task = pytest.mark.parametrize("name", [n for n, t in TASKS.items() if t.go
 def worlds(name: str, count: int) -> Worlds:
     """Worlds that tests share; every test resets the slots it uses."""
     return Worlds(name, count)
+
+
+def is_bag(name: str) -> bool:
+    """Whether a task simulates bags, and so gets fewer seeds."""
+    return "bag" in TASKS[name].objects
+
+
+def slots(name: str) -> int:
+    """How many episodes of a task its tests run side by side."""
+    return BAG_SLOTS if is_bag(name) else SLOTS
 
 
 @cache
@@ -80,12 +99,12 @@ def test_environment_follows_gymnasium(name: str) -> None:
 
 @every_task
 def test_same_seed_and_actions_same_bits_in_any_lane_and_company(name: str) -> None:
-    seeds = (3, 11, 24)
+    seeds, count = (3, 11, 24), slots(name)
     plans = {seed: [] for seed in seeds}
 
-    def play(count: int, order: dict[int, int]) -> dict[int, list[str]]:
+    def play(size: int, order: dict[int, int]) -> dict[int, list[str]]:
         """Hashes by seed of the start and two steps: first near an object, then anywhere."""
-        side = worlds(name, count)
+        side = worlds(name, size)
         side.reset(order)
         hashes = {seed: [side.hash(slot)] for slot, seed in order.items()}
         for step in range(2):
@@ -105,8 +124,8 @@ def test_same_seed_and_actions_same_bits_in_any_lane_and_company(name: str) -> N
 
     alone = {seed: play(1, {0: seed})[seed] for seed in seeds}
     again = {seed: play(1, {0: seed})[seed] for seed in seeds}
-    lanes = play(SLOTS, dict(enumerate((*seeds, *range(40, 46)))))
-    shuffled = play(SLOTS, {17: 11, 2: 24, 9: 3, 8: 50})
+    lanes = play(count, dict(enumerate((*seeds, *range(40, min(46, 37 + count))))))
+    shuffled = play(count, {count - 3: 11, 2: 24, count // 2 - 1: 3, count - 1: 50})
     assert alone == again
     assert {seed: lanes[seed] for seed in seeds} == alone
     assert {seed: shuffled[seed] for seed in seeds} == alone
@@ -116,30 +135,30 @@ def test_same_seed_and_actions_same_bits_in_any_lane_and_company(name: str) -> N
 
 @every_task
 def test_demonstrator_solves_most_of_a_few_seeds_within_the_limit(name: str) -> None:
-    side, seeds = worlds(name, SLOTS), range(8)
+    side, seeds = worlds(name, slots(name)), range(8)
+    act = side.task.demonstrate_visible if is_bag(name) else side.task.demonstrate
     side.reset(dict(enumerate(seeds)))
     rngs = [episode_rng(seed, DEMONSTRATOR_STREAM) for seed in seeds]
     running = set(seeds)
     for _ in range(side.task.max_actions):
         episodes = side.episodes
         actions = {
-            i: side.task.demonstrate(episodes[i].layout, episodes[i].snapshot, rngs[i])
-            for i in sorted(running)
+            i: act(episodes[i].layout, episodes[i].snapshot, rngs[i]) for i in sorted(running)
         }
         reports = side.step({i: a for i, a in actions.items() if a is not None})
         assert all(isinstance(report.outcome, Outcome) for report in reports.values())
         running = {i for i in reports if not side.solved(i) and episodes[i].physics_ok}
         if not running:
             break
-    assert sum(side.solved(slot) for slot in seeds) >= 7
+    assert sum(side.solved(slot) for slot in seeds) >= LEAST_SOLVED.get(name, 7)
 
 
 @every_task
 def test_starts_are_hard_at_rest_and_on_the_table(name: str) -> None:
-    side, scores, resting = worlds(name, SLOTS), [], 0
-    for first in range(0, 100, SLOTS):
-        side.reset({slot: first + slot for slot in range(SLOTS)})
-        for slot in range(SLOTS):
+    side, scores, resting = worlds(name, slots(name)), [], 0
+    for first in range(0, STARTS.get(name, 100), side.count):
+        side.reset({slot: first + slot for slot in range(side.count)})
+        for slot in range(side.count):
             episode = side.episodes[slot]
             scores.append(side.score(slot))
             resting += fastest(side, slot) < MOVING
@@ -150,7 +169,7 @@ def test_starts_are_hard_at_rest_and_on_the_table(name: str) -> None:
     low, high = START_SCORE.get(name, (0.0, side.task.success_score))
     assert low <= np.median(scores) <= high
     assert 0.0 <= min(scores) and max(scores) < side.task.success_score
-    assert resting >= 95
+    assert resting >= 0.95 * len(scores)
 
 
 @every_task
@@ -169,19 +188,19 @@ def test_infos_and_observations_lie_in_their_spaces(name: str) -> None:
 
 @goal_task
 def test_a_constructed_goal_shows_the_solved_task(name: str) -> None:
-    side, seeds = worlds(name, SLOTS), range(30, 30 + SLOTS)
+    side, seeds = worlds(name, slots(name)), range(30, 30 + slots(name))
     side.reset(dict(enumerate(seeds)))
-    targets = {slot: side.episodes[slot].goal.targets for slot in range(SLOTS)}
+    targets = {slot: side.episodes[slot].goal.targets for slot in range(side.count)}
     task = side.task
-    side.reset(dict(enumerate(seeds)), goals={s: side.episodes[s].goal for s in range(SLOTS)})
-    for slot in range(SLOTS):
+    side.reset(dict(enumerate(seeds)), goals={s: side.episodes[s].goal for s in range(side.count)})
+    for slot in range(side.count):
         episode = side.episodes[slot]
         assert np.array_equal(episode.layout.targets, targets[slot])
         assert episode.goal is not None and episode.goal.kind == "constructed"
         assert not np.array_equal(episode.goal.color, episode.snapshot.images.color)
-    side._start({s: task.goal_layout(side.episodes[s].layout) for s in range(SLOTS)},
+    side._start({s: task.goal_layout(side.episodes[s].layout) for s in range(side.count)},
                 dict(enumerate(seeds)), {})  # fmt: skip
-    for slot in range(SLOTS):
+    for slot in range(side.count):
         episode = side.episodes[slot]
         assert episode.physics_ok
         assert task.score(episode.layout, episode.snapshot) >= GOAL_SCORE.get(name, 1.0)
@@ -189,11 +208,13 @@ def test_a_constructed_goal_shows_the_solved_task(name: str) -> None:
 
 @every_task
 def test_random_and_adversarial_actions_break_nothing(name: str) -> None:
-    tally = stress().stress(name, actions=200, seed=5, count=16)
+    actions, count = (16, 8) if is_bag(name) else (200, 16)
+    tally = stress().stress(name, actions=actions, seed=5, count=count)
     assert tally.broken == []
-    assert sum(tally.outcomes.values()) == tally.actions == 200
+    assert sum(tally.outcomes.values()) == tally.actions == actions
     assert set(tally.outcomes) <= {outcome.value for outcome in Outcome}
-    assert tally.outcomes["placed"] >= 60 and tally.outcomes["missed"] >= 10
+    assert tally.outcomes["placed"] >= 0.3 * actions
+    assert tally.outcomes["missed"] >= 0.05 * actions
 
 
 def test_stress_reports_in_json(monkeypatch, capsys) -> None:

@@ -31,7 +31,8 @@ class SolverConfig:
     calm_speed: float = 0.1
     """Speed clamp while a world is calmed, after a release for example [m/s]."""
     margin: float = 0.005
-    """Pairs this much farther apart than touching are listed [m]."""
+    """Pairs this much farther apart than touching are listed [m]; of fabrics the largest slack per
+    particle."""
     rest_speed: float = 0.01
     """Slower than this is at rest [m/s]."""
     rest_seconds: float = 0.05
