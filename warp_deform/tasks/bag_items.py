@@ -31,6 +31,7 @@ _ZONE = 0.26  # [m] outer side
 _INNER = 0.13  # [m] what is nearer to the zone's centre along both of its axes is inside
 _ZONE_HEIGHT = (-0.01, 0.28)
 _ROOM = 0.025  # [m] that an item needs beyond its size
+_ROOM_SECOND = 0.015  # [m] the same where another item is in the bag
 _TRIES = 50  # draws of a whole layout; a zone in the way leaves no room in some of them
 
 
@@ -99,7 +100,7 @@ class BagItems1(BagTask):
         return self.cubes
 
     def acceptable(self, layout: Layout, snapshot: Snapshot) -> bool:
-        """Every item can be seen, and the bag is not so open that nothing is left to do."""
+        """Every item can be seen, and the task is not solved yet."""
         seen = all(self.item_mask(layout, snapshot, n).any() for n in range(len(self.cubes)))
         return seen and not self.solved(layout, snapshot)
 
@@ -293,9 +294,6 @@ class BagItems2(BagItems1):
             free[self.item_mask(layout, snapshot, n)] = 0
         less = self.erode(free, first[:2], _ROOM_SECOND)
         return less if less.any() else self.erode(hull, first[:2], _ROOM_SECOND)
-
-
-_ROOM_SECOND = 0.015
 
 
 def _frame(layout: Layout) -> np.ndarray:
