@@ -13,16 +13,12 @@ import warp as wp
 
 from ..objects.attributes import SpringMode
 from ..objects.push import MOST_PUSHES
-from .bending import bending
-from .body_contact import body_contact
-from .box_box import box_box
-from .box_particle import box_particle
-from .box_table import box_table
-from .box_triangle import box_triangle
+from .bending import bending, bending_adjoint
+from .body_solve import body_solve
 from .cell_list import cell_list
-from .distance import distance
+from .distance import distance, distance_adjoint
 from .edge_contact import edge_contact
-from .grip import grip
+from .grip import grip, grip_adjoint
 from .internal_friction import internal_friction
 from .lanes import (  # noqa: F401  (operators are found by name)
     KERNEL_OPTIONS,
@@ -38,11 +34,13 @@ from .lanes import (  # noqa: F401  (operators are found by name)
     sub,
 )
 from .rigid import rigid
-from .sphere_contact import sphere_contact
+from .sphere_contact import sphere_contact, sphere_contact_adjoint
 from .structures import structures
-from .table_contact import table_contact
+from .table_contact import table_contact, table_contact_adjoint
+from .tape import COUNTERS, GRIP_WORDS, STATE, tape
 from .tether import tether
 from .triangle_contact import triangle_contact
+from .watch import watch
 
 __all__ = ["forward_kernel"]
 
@@ -54,11 +52,13 @@ def forward_kernel(
     with_bodies: bool,
     with_sheets: bool = False,
     with_edges: bool = False,
+    taped: bool = False,
 ) -> Any:
     """The kernel for a precision and a width; launch it with one thread per group.
 
     `with_bodies` False leaves the code of rigid bodies out, which halves the compile time;
-    `with_sheets` False that of triangles, `with_edges` False that of their edges.
+    `with_sheets` False that of triangles, `with_edges` False that of their edges. `taped` leaves a
+    tape for the backward sweep (see `tape`) and can continue a launch, to the same bits.
     """
     t = structures(scalar, lanes)
     S, V, R3, L = t.S, t.V, t.R3, t.L
@@ -81,103 +81,24 @@ def forward_kernel(
     follow_path, take, let_go = grips_.follow_path, grips_.take, grips_.let_go
     body = rigid(scalar, lanes)
     predict_body, finish_body = body.predict_body, body.finish_body
-    list_table = box_table(scalar, lanes).list_table
-    project_box_particle = box_particle(scalar, lanes).project_box_particle
-    project_box_triangle = box_triangle(scalar, lanes).project_box_triangle
-    list_boxes = box_box(scalar, lanes).list_boxes
-    bodies_ = body_contact(scalar, lanes)
-    begin_body, solve_contacts, end_body = (
-        getattr(bodies_, n) for n in ("begin_body", "solve_contacts", "end_body")
-    )
+    solve_bodies = body_solve(scalar, lanes, with_sheets).solve_bodies
+    watch_group = watch(scalar, lanes, with_bodies).watch_group
+    record_distance = distance_adjoint(scalar, lanes, with_sheets).record_distance
+    record_bend = bending_adjoint(scalar, lanes).record_bend
+    record_contact = sphere_contact_adjoint(scalar, lanes).record_contact
+    record_finish = table_contact_adjoint(scalar, lanes).record_finish
+    record_grip = grip_adjoint(scalar, lanes).record_grip
+    has_room = tape(scalar, lanes).has_room
     Settings, Topology, Group, Particles = t.Settings, t.Topology, t.Group, t.Particles
     Springs, Pairs, Shapes, Near = t.Springs, t.Pairs, t.Shapes, t.Near
     Bodies, Contacts, Grips, Watch = t.Bodies, t.Contacts, t.Grips, t.Watch
-    Sheets, Cells = t.Sheets, t.Cells
-
-    @wp.func
-    def solve_bodies(
-        g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
-        q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets, cells: Cells,
-    ):  # fmt: skip
-        """Contacts of one lane's bodies with particles, each other and the table."""
-        p0 = group.particle_start[g]
-        count = top.body_count[k]
-        b0 = group.body_start[g] + lane * count
-        first = group.shape_start[g] + lane * top.shape_count[k]
-        last = first + top.shape_count[k]
-        mv = group.contact_friction[g]
-        mu = mv[lane]
-        tv = group.table_friction[g]
-        radii = top.particle_start[k]
-        for shape in range(first, last):
-            b = b0 + shapes.body[shape]
-            far = wp.length(shapes.half[shape])
-            center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
-            for i in range(top.particle_count[k]):
-                radius = top.radius[radii + i]
-                x = q.x[p0 + i]
-                d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
-                if wp.dot(d, d) < (far + radius) * (far + radius):
-                    project_box_particle(
-                        p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
-                    )
-            if wp.static(with_sheets):
-                for f in range(sheets.first[k], sheets.first[k + 1]):
-                    project_box_triangle(
-                        f, lane, p0, radii, shape, b, mu, push, top, shapes, bodies, sheets, cells
-                    )
-        for b in range(b0, b0 + count):
-            begin_body(b, bodies)
-        start = group.contact_start[g]
-        c = int(start)
-        for sa in range(first, last):
-            for sb in range(sa + 1, last):
-                a = b0 + shapes.body[sa]
-                b = b0 + shapes.body[sb]
-                if a != b and bodies.w[a] + bodies.w[b] > S(0.0):
-                    pair_mu = mu * wp.min(shapes.friction[sa], shapes.friction[sb])
-                    c = list_boxes(c, sa, a, sb, b, pair_mu, push, shapes, bodies, contacts)
-        for b in range(count):
-            if bodies.w[b0 + b] > S(0.0):
-                c = list_table(c, b0 + b, b, first, last, tv[lane], push, shapes, bodies, contacts)
-        solve_contacts(start, c, bodies, contacts)
-        for b in range(b0, b0 + count):
-            end_body(b, bodies)
-
-    @wp.func
-    def watch_group(
-        g: int, p0: int, n: int, s0: int, s1: int, b0: int, body_count: int, springs: Springs,
-        q: Particles, bodies: Bodies, watch: Watch,
-    ):  # fmt: skip
-        """Worst values of the guards, once every `check_every` substeps."""
-        zero = V(S(0.0))
-        bad = watch.nonfinite[g]
-        lowest = V(S(1.0e9))
-        for i in range(p0, p0 + n):
-            x = q.x[i]
-            bad = wp.max(bad, nonfinite(x.x + x.y + x.z))
-            lowest = wp.min(lowest, x.z)
-        if wp.static(with_bodies):
-            for lane in range(wp.static(L)):
-                for b in range(b0 + lane * body_count, b0 + (lane + 1) * body_count):
-                    sum = bodies.x[b] + bodies.omega[b]
-                    if not wp.isfinite(sum[0] + sum[1] + sum[2]):
-                        bad[lane] = S(1.0)
-        watch.nonfinite[g] = bad
-        watch.depth[g] = wp.max(watch.depth[g], wp.max(zero - lowest, zero))
-        stretch = watch.stretch[g]
-        for s in range(s0, s1):
-            if springs.watched[s] > 0:
-                ij = springs.ij[s]
-                l = length(q.x[p0 + ij[0]] - q.x[p0 + ij[1]])
-                stretch = wp.max(stretch, l * (S(1.0) / springs.length[s]))
-        watch.stretch[g] = stretch
+    Sheets, Cells, Tape = t.Sheets, t.Cells, t.Tape
 
     @wp.kernel(module="unique", enable_backward=False, module_options=dict(KERNEL_OPTIONS))
     def forward(
         st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
         q: Particles, near: Near, bodies: Bodies, contacts: Contacts, grips: Grips, watch: Watch,
-        sheets: Sheets, cells: Cells,
+        sheets: Sheets, cells: Cells, tape: Tape,
     ):  # fmt: skip
         g = wp.tid()
         k = group.topology[g]
@@ -216,10 +137,14 @@ def forward_kernel(
         free_time = zero  # since the launch began or something was let go
         frame = int(0)
         longest_push = int(0)
+        begins = bool(True)
+        if wp.static(taped):
+            begins = tape.resume == 0
         for lane in range(wp.static(L)):
             if wp.static(with_sheets):
-                cells.met[w0 + lane] = 0
-            if on[lane] > S(0.0):
+                if begins:
+                    cells.met[w0 + lane] = 0
+            if begins and on[lane] > S(0.0):
                 if grips.particle[w0 + lane] >= 0 or grips.body[w0 + lane] >= 0:
                     holding[lane] = S(1.0)
                     take(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
@@ -230,6 +155,31 @@ def forward_kernel(
         # the table hides at once that a particle started under it
         watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
         substep = int(0)
+        if wp.static(taped):
+            tops = tape.first[g]
+            tx = int(tops[0])
+            tv = int(tops[1])
+            tk = int(tops[2])
+            ts = int(tops[3])
+            if not begins:
+                at = g * wp.static(STATE)
+                on = tape.state[at]
+                steps = tape.state[at + 1]
+                quiet = tape.state[at + 2]
+                holding = tape.state[at + 3]
+                calm = tape.state[at + 4]
+                stale = tape.state[at + 5]
+                fresh = tape.state[at + 6]
+                travel = tape.state[at + 7]
+                clamped = tape.state[at + 8]
+                free_time = tape.state[at + 9]
+                least = tape.state[at + 10]
+                at = g * wp.static(COUNTERS)
+                substep = tape.counters[at]
+                near_count = tape.counters[at + 1]
+                longest_push = tape.counters[at + 2]
+            tape.steps[g] = -substep
+            tape.full[g] = 0
         while substep < st.max_steps and any_less(zero - on, S(0.0)):
             all_on = not any_less(on, S(0.5))
             if st.record_every > 0 and substep % wp.max(st.record_every, 1) == 0:
@@ -264,6 +214,8 @@ def forward_kernel(
                         x.z[lane] = x.z[lane] + kick[2]
                         q.x[p0 + i] = x
             # grips
+            if wp.static(taped):
+                mark = int(tk)
             if any_less(zero - holding, S(0.0)):
                 for lane in range(wp.static(L)):
                     if holding[lane] > S(0.0) and on[lane] > S(0.0):
@@ -276,10 +228,18 @@ def forward_kernel(
                         met = bool(False)
                         if wp.static(with_sheets):
                             met = cells.met[w] > 0
-                        if not follow_path(
+                        if wp.static(taped):
+                            tick = grips.tick[w]
+                            knot = grips.knot[w]
+                        goes_on = follow_path(
                             met, w, lane, p0, bl, shape, shape + top.shape_count[k], near_start,
                             near_count, radius, dt, q, pairs, shapes, near, bodies, grips,
-                        ):  # fmt: skip
+                        )  # fmt: skip
+                        if wp.static(taped):
+                            released = wp.where(goes_on, 0, 1)
+                            record_grip(tk, w, lane, tick, knot, released, grips, tape)
+                            tk += wp.static(GRIP_WORDS)
+                        if not goes_on:
                             let_go(w, lane, p0, bl, q, bodies, grips)
                             holding[lane] = S(0.0)
                             after = group.calm_after[g]
@@ -309,14 +269,41 @@ def forward_kernel(
                             over = watch.overflow[g]
                             over[lane] = wp.max(over[lane], S(left))
                             watch.overflow[g] = over
+            if wp.static(taped):
+                tape.k[tk] = (tk - mark) // wp.static(GRIP_WORDS)
+                tk += 1
+                listed = int(0)
+                if wp.static(with_sheets):
+                    for lane in range(wp.static(L)):
+                        listed += cells.count[w0 + lane]
+                        if wp.static(with_edges):
+                            listed += cells.edge_count[w0 + lane]
+                if not has_room(g, tx, tv, tk, ts, s1 - s0, n, near_count, listed, tape):
+                    tape.full[g] = 1
+                    break
+                mark = int(tk)
             # constraints
             # always in the same order: sweeping backwards in every other substep makes tight heaps
             # crawl for ever, and shells jitter
             for s in range(s0, s1):
-                if springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                if wp.static(taped):
+                    if springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                        record_bend(s, p0, tx, inverse_dt2, q, springs, tape)
+                        tx += 1
+                    else:
+                        acted = record_distance(s, p0, tx, inverse_dt2, q, springs, tape)
+                        if acted:
+                            tx += 1
+                            if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
+                                tape.k[tk] = s
+                                tk += 1
+                elif springs.mode[s] == wp.static(int(SpringMode.BEND)):
                     project_bend(s, p0, inverse_dt2, q, springs)
                 else:
                     project_distance(s, p0, inverse_dt2, q, springs)
+            if wp.static(taped):
+                tape.k[tk] = tk - mark
+                tk += 1
             if wp.static(with_sheets):
                 if any_less(zero - holding, S(0.0)):
                     held = q.x[p0]
@@ -329,8 +316,22 @@ def forward_kernel(
                             held.z[lane] = x.z[lane]
                     for i in range(n):
                         project_tether(p0 + i, holding, held, q)
+            if wp.static(taped):
+                mark = int(tk)
             for c in range(near_start, near_start + near_count):
-                project_contact(c, p0, contact_mu, push, q, pairs, near)
+                if wp.static(taped):
+                    if record_contact(
+                        c, p0, tx, tv, contact_mu, push, q, pairs, near, tape
+                    ):  # fmt: skip
+                        tape.k[tk] = near.pair[c]
+                        tx += 2
+                        tv += 1
+                        tk += 1
+                else:
+                    project_contact(c, p0, contact_mu, push, q, pairs, near)
+            if wp.static(taped):
+                tape.k[tk] = tk - mark
+                tk += 1
             if wp.static(with_sheets):
                 if sheets.first[k + 1] > sheets.first[k]:
                     for lane in range(wp.static(L)):
@@ -357,9 +358,17 @@ def forward_kernel(
             moved2 = zero
             for i in range(n):
                 radius = top.radius[radii + i]
-                moved2 = wp.max(
-                    moved2, finish(p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q)
-                )
+                ended2 = zero
+                if wp.static(taped):
+                    ended2 = record_finish(
+                        p0 + i, tx, radius, inverse_dt, table_mu, fastest, all_on, on, q, tape
+                    )
+                    tx += 3
+                else:
+                    ended2 = finish(
+                        p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q
+                    )  # fmt: skip
+                moved2 = wp.max(moved2, ended2)
             unrest2 = moved2
             drowsy = one
             if wp.static(with_sheets):
@@ -383,6 +392,10 @@ def forward_kernel(
                             m = finish_body(at, dt, fastest[lane], drowsy[lane], bodies)
                             moved2[lane] = wp.max(moved2[lane], m)
                             unrest2[lane] = wp.max(unrest2[lane], m)
+            if wp.static(taped):
+                tape.v[tv] = on
+                tape.v[tv + 1] = fastest
+                tv += 2
             moved = root(moved2)
             travel = travel + moved
             # the next substep may move by half as much again before its contacts are solved
@@ -402,9 +415,39 @@ def forward_kernel(
         watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
         watch.steps[g] = steps
         watch.clamped[g] = clamped
+        ends = bool(True)
+        if wp.static(taped):
+            at = g * wp.static(STATE)
+            tape.state[at] = on
+            tape.state[at + 1] = steps
+            tape.state[at + 2] = quiet
+            tape.state[at + 3] = holding
+            tape.state[at + 4] = calm
+            tape.state[at + 5] = stale
+            tape.state[at + 6] = fresh
+            tape.state[at + 7] = travel
+            tape.state[at + 8] = clamped
+            tape.state[at + 9] = free_time
+            tape.state[at + 10] = least
+            at = g * wp.static(COUNTERS)
+            tape.counters[at] = substep
+            tape.counters[at + 1] = near_count
+            tape.counters[at + 2] = longest_push
+            tape.steps[g] = tape.steps[g] + substep
+            tape.until[g] = substep
+            ends = tape.last > 0
+            mark = int(tk)
         # a world cut off while it held something lets go: nothing is held between launches
         for lane in range(wp.static(L)):
-            if holding[lane] > S(0.0):
+            if ends and holding[lane] > S(0.0):
+                if wp.static(taped):
+                    tape.k[tk] = lane
+                    tape.k[tk + 1] = grips.particle[w0 + lane]
+                    tk += 2
                 let_go(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
+        if wp.static(taped):
+            tape.k[tk] = (tk - mark) // 2
+            tk += 1
+            tape.top[g] = wp.vec4i(tx, tv, tk, ts)
 
     return forward

@@ -6,10 +6,10 @@ from typing import Any
 
 import warp as wp
 
-from .lanes import add, div, mul, root, sub  # noqa: F401  (operators are found by name)
+from .lanes import add, div, less, mul, root, sub  # noqa: F401  (operators are found by name)
 from .structures import structures
 
-__all__ = ["friction"]
+__all__ = ["friction", "friction_adjoint"]
 
 
 @functools.cache
@@ -47,3 +47,44 @@ def friction(scalar: Any, lanes: int) -> SimpleNamespace:
     return SimpleNamespace(
         coulomb=coulomb, coulomb_soft=coulomb_soft, coulomb_scalar=coulomb_scalar
     )
+
+
+@functools.cache
+def friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+    """Slopes of `coulomb` and `coulomb_soft` by their budget and by `moved2`, as a pair.
+
+    With the ratio r = b^2 / d^2 the share is f = sqrt(r / sqrt(1 + r^2)), so df/db =
+    f / (b (1 + r^2)) and df/d(d^2) = -f / (2 d^2 (1 + r^2)); where r is bounded, both are 0.
+    """
+    t = structures(scalar, lanes)
+    S, V = t.S, t.V
+
+    @wp.func
+    def coulomb_slopes(moved2: V, budget: V, share: V):
+        tiny = V(S(1.0e-30))
+        bound = V(S(1.0e8))
+        below = wp.max(moved2, tiny)
+        ratio = wp.min(budget * budget / below, bound)
+        one = V(S(1.0))
+        slope = less(ratio, bound) * share / (one + ratio * ratio)
+        return slope / wp.max(budget, tiny), slope / below * S(-0.5)
+
+    @wp.func
+    def coulomb_soft_slopes(moved2: V, budget: V):
+        inverse = V(S(1.0)) / wp.max(root(moved2 + budget * budget), V(S(1.0e-12)))
+        cube = inverse * inverse * inverse
+        return moved2 * cube, budget * cube * S(-0.5)
+
+    @wp.func
+    def coulomb_scalar_slopes(moved2: S, budget: S, share: S):
+        below = wp.max(moved2, S(1.0e-30))
+        ratio = budget * budget / below
+        slope = S(0.0)
+        if ratio < S(1.0e8):
+            slope = share / (S(1.0) + ratio * ratio)
+        return slope / wp.max(budget, S(1.0e-30)), slope / below * S(-0.5)
+
+    return SimpleNamespace(
+        coulomb_slopes=coulomb_slopes, coulomb_soft_slopes=coulomb_soft_slopes,
+        coulomb_scalar_slopes=coulomb_scalar_slopes,
+    )  # fmt: skip

@@ -1,0 +1,81 @@
+"""The tape of a differentiated rollout, and how often constraints of each kind acted on it.
+
+A taped launch pushes what the derivative of each constraint needs (its inputs, as differences where
+those suffice) onto one of four stacks of its group: V3, V, whole numbers, and scalars of one lane.
+Constraints that always act push no more; those that act now and then push who they were as well,
+and every phase of a substep ends with their number. The backward sweep pops in reverse, so it finds
+the very inputs, and takes the very branches, of the forward pass. Nothing else of the state is
+needed: the sweep restores none.
+"""
+
+import functools
+from enum import IntEnum
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .structures import structures
+
+__all__ = ["COUNTERS", "GRIP_WORDS", "STATE", "TRIANGLE_SCALARS", "TRIANGLE_WORDS", "Kind", "tape"]
+
+STATE = 11
+"""Lane vectors of the kernel's own state per group."""
+COUNTERS = 3
+"""Whole numbers of the kernel's own state per group."""
+GRIP_WORDS = 7
+"""Whole numbers on the tape for a lane that holds something."""
+TRIANGLE_WORDS = 2
+"""The same for a particle that touches a triangle, or an edge that touches another one."""
+TRIANGLE_SCALARS = 13
+"""Scalars of that pair: distance at which they touch, and the four positions [m]."""
+
+
+class Kind(IntEnum):
+    """What is counted in the sweep, world by world."""
+
+    STRETCH = 0
+    FOLD_LIMIT = 1
+    STRAIN_LIMIT = 2
+    BEND = 3
+    CONTACT = 4
+    CONTACT_SLOWED = 5
+    TABLE = 6
+    TABLE_SLIP = 7
+    SPEED_CLAMP = 8
+    GRIP = 9
+    REACHED = 10
+    RELEASE = 11
+    TETHER = 12
+    TRIANGLE_FACE = 13
+    TRIANGLE_RIM = 14
+    EDGE = 15
+    DRY_FRICTION = 16
+    SLEEP = 17
+    VISCOSITY = 18
+
+
+@functools.cache
+def tape(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`has_room(...)`: whether a substep with so many springs, particles, near pairs and listed
+    pairs of triangles and edges fits on the tape, and the grips of the next substep with it.
+    """
+    t = structures(scalar, lanes)
+    L, Tape = t.L, t.Tape
+
+    @wp.func
+    def has_room(
+        g: int, tx: int, tv: int, tk: int, ts: int, springs: int, particles: int, near: int,
+        listed: int, tape: Tape,
+    ):  # fmt: skip
+        end = tape.end[g]
+        words = springs + particles + near + wp.static(TRIANGLE_WORDS) * listed
+        words += wp.static(2 * L * (GRIP_WORDS + 4) + 8)
+        return (
+            tx + 2 * springs + 4 * particles + 2 * near <= end[0]
+            and tv + near + 8 <= end[1]
+            and tk + words <= end[2]
+            and ts + wp.static(TRIANGLE_SCALARS) * listed <= end[3]
+        )
+
+    return SimpleNamespace(has_room=has_room)
