@@ -15,12 +15,16 @@ from ..objects.attributes import SpringMode
 from ..objects.push import MOST_PUSHES
 from .bending import bending_adjoint
 from .distance import distance_adjoint
+from .edge_contact_adjoint import edge_contact_adjoint
 from .grip import grip_adjoint
+from .internal_friction import internal_friction_adjoint
 from .lanes import KERNEL_OPTIONS, add, any_less, div, less, mul, select, sub  # noqa: F401
 from .sphere_contact import sphere_contact_adjoint
 from .structures import structures
 from .table_contact import table_contact_adjoint
-from .tape import GRIP_WORDS, Kind
+from .tape import GRIP_WORDS, TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind
+from .tether import tether_adjoint
+from .triangle_contact_adjoint import triangle_contact_adjoint
 
 __all__ = ["adjoint_kernel"]
 
@@ -46,10 +50,17 @@ def adjoint_kernel(
     sweep_contact = sphere_contact_adjoint(scalar, lanes).sweep_contact
     table_ = table_contact_adjoint(scalar, lanes)
     sweep_finish, sweep_predict = table_.sweep_finish, table_.sweep_predict
+    finish_velocity = table_.finish_velocity
+    sweep_tether = tether_adjoint(scalar, lanes).sweep_tether
+    sweep_triangle = triangle_contact_adjoint(scalar, lanes).sweep_triangle
+    sweep_edge = edge_contact_adjoint(scalar, lanes).sweep_edge
+    calms = internal_friction_adjoint(scalar, lanes)
+    sweep_spring, sweep_calm = calms.sweep_spring, calms.sweep_calm
     grips_ = grip_adjoint(scalar, lanes)
     sweep_grip, held_again = grips_.sweep_grip, grips_.held_again
     Settings, Topology, Springs, Pairs = t.Settings, t.Topology, t.Springs, t.Pairs
     Group, Grips, Tape, Adjoint = t.Group, t.Grips, t.Tape, t.Adjoint
+    Particles, Sheets = t.Particles, t.Sheets
     KINDS = len(Kind)
 
     @wp.func
@@ -58,8 +69,8 @@ def adjoint_kernel(
 
     @wp.kernel(module="unique", enable_backward=False, module_options=dict(KERNEL_OPTIONS))
     def sweep(
-        st: Settings, top: Topology, springs: Springs, pairs: Pairs, group: Group, grips: Grips,
-        tape: Tape, adj: Adjoint,
+        st: Settings, top: Topology, springs: Springs, pairs: Pairs, group: Group, q: Particles,
+        grips: Grips, sheets: Sheets, tape: Tape, adj: Adjoint,
     ):  # fmt: skip
         g = wp.tid()
         k = group.topology[g]
@@ -87,15 +98,19 @@ def adjoint_kernel(
         by_contact = zero
         bends = int(0)
         stretches = int(0)
+        damped = int(0)
         for s in range(s0, s1):
             if springs.mode[s] == wp.static(int(SpringMode.BEND)):
                 bends += 1
             elif springs.mode[s] == wp.static(int(SpringMode.EQUAL)):
                 stretches += 1
+            if springs.limit[s] > S(0.0):
+                damped += 1
         tops = tape.top[g]
         tx = int(tops[0])
         tv = int(tops[1])
         tk = int(tops[2])
+        ts = int(tops[3])
         # what the end of the launch let go is held before
         tk -= 1
         for _ in range(tape.k[tk]):
@@ -104,12 +119,20 @@ def adjoint_kernel(
                 held_again(tape.k[tk], tape.k[tk + 1], p0, adj)
         for back in range(tape.steps[g]):
             substep = tape.until[g] - 1 - back
-            tv -= 2
+            tv -= 4
             on = tape.v[tv]
             fastest = tape.v[tv + 1]
             count(counts + wp.static(int(Kind.STRETCH)), on, stretches, adj)
             count(counts + wp.static(int(Kind.BEND)), on, bends, adj)
             # velocities, table
+            if wp.static(with_sheets):
+                if st.viscous > S(0.0):
+                    count(counts + wp.static(int(Kind.VISCOSITY)), on, damped, adj)
+                    for r in range(s1 - s0):
+                        s = s1 - 1 - r
+                        if springs.limit[s] > S(0.0):
+                            tx -= 1
+                            sweep_spring(s, p0, tape.x[tx], st.viscous, on, springs, adj)
             tx -= 3 * n
             for i in range(n):
                 gv = adj.v[p0 + i]
@@ -119,11 +142,44 @@ def adjoint_kernel(
                 else:
                     gv = gv * on
                     adj.v[p0 + i] = frozen - gv
+                x = tape.x[tx + 3 * i]
+                start = tape.x[tx + 3 * i + 1]
+                radius = top.radius[radii + i]
+                if wp.static(with_sheets):
+                    if st.dry > S(0.0) or st.sleep > S(0.0):
+                        v = finish_velocity(
+                            x, start, adj.w[p0 + i], radius, inverse_dt, table_mu, fastest
+                        )
+                        gv = sweep_calm(
+                            p0 + i, v, gv, st.dry, tape.v[tv + 3], on, counts, adj
+                        )  # fmt: skip
                 by_table = by_table + sweep_finish(
-                    p0 + i, tape.x[tx + 3 * i], tape.x[tx + 3 * i + 1], top.radius[radii + i],
-                    inverse_dt, table_mu, fastest, on, gv, counts, adj,
-                )  # fmt: skip
+                    p0 + i, x, start, radius, inverse_dt, table_mu, fastest, on, gv, counts, adj
+                )
             finished = int(tx)
+            tv_end = int(tv)
+            # contacts of fabrics
+            if wp.static(with_sheets):
+                if sheets.first[k + 1] > sheets.first[k]:
+                    for r in range(wp.static(L)):
+                        lane = wp.static(L) - 1 - r
+                        if on[lane] > S(0.0):
+                            if wp.static(with_edges):
+                                tk -= 1
+                                for _ in range(tape.k[tk]):
+                                    tk -= wp.static(TRIANGLE_WORDS)
+                                    ts -= wp.static(TRIANGLE_SCALARS)
+                                    sweep_edge(
+                                        tk, ts, finished, lane, p0, push, counts, sheets, tape, adj
+                                    )
+                            tk -= 1
+                            for _ in range(tape.k[tk]):
+                                tk -= wp.static(TRIANGLE_WORDS)
+                                ts -= wp.static(TRIANGLE_SCALARS)
+                                by_contact[lane] = by_contact[lane] + sweep_triangle(
+                                    tk, ts, finished, lane, p0, contact_mu[lane], push, counts,
+                                    sheets, tape, adj,
+                                )  # fmt: skip
             # contacts
             tk -= 1
             for _ in range(tape.k[tk]):
@@ -134,6 +190,27 @@ def adjoint_kernel(
                     tape.k[tk], p0, tape.x[tx], tape.x[tx + 1], tape.v[tv], contact_mu, push,
                     pairs, counts, adj,
                 )  # fmt: skip
+            # tethers
+            if wp.static(with_sheets):
+                holding = tape.v[tv_end + 2]
+                if any_less(zero - holding, S(0.0)):
+                    tk -= wp.static(L)
+                    at = int(tk)
+                    tk -= 1
+                    by_held = V3(zero, zero, zero)
+                    for _ in range(tape.k[tk]):
+                        tk -= 1
+                        tx -= 1
+                        by_held = by_held + sweep_tether(
+                            tape.k[tk], tape.x[tx], holding, counts, q, adj
+                        )
+                    for lane in range(wp.static(L)):
+                        if tape.k[at + lane] >= 0:
+                            gx = adj.x[p0 + tape.k[at + lane]]
+                            gx.x[lane] = gx.x[lane] + by_held.x[lane]
+                            gx.y[lane] = gx.y[lane] + by_held.y[lane]
+                            gx.z[lane] = gx.z[lane] + by_held.z[lane]
+                            adj.x[p0 + tape.k[at + lane]] = gx
             # springs
             tk -= 1
             left = tape.k[tk]

@@ -18,8 +18,9 @@ from .body_solve import body_solve
 from .cell_list import cell_list
 from .distance import distance, distance_adjoint
 from .edge_contact import edge_contact
+from .edge_contact_adjoint import edge_contact_adjoint
 from .grip import grip, grip_adjoint
-from .internal_friction import internal_friction
+from .internal_friction import internal_friction, internal_friction_adjoint
 from .lanes import (  # noqa: F401  (operators are found by name)
     KERNEL_OPTIONS,
     add,
@@ -37,9 +38,10 @@ from .rigid import rigid
 from .sphere_contact import sphere_contact, sphere_contact_adjoint
 from .structures import structures
 from .table_contact import table_contact, table_contact_adjoint
-from .tape import COUNTERS, GRIP_WORDS, STATE, tape
-from .tether import tether
+from .tape import COUNTERS, GRIP_WORDS, STATE, TRIANGLE_SCALARS, TRIANGLE_WORDS, tape
+from .tether import tether, tether_adjoint
 from .triangle_contact import triangle_contact
+from .triangle_contact_adjoint import triangle_contact_adjoint
 from .watch import watch
 
 __all__ = ["forward_kernel"]
@@ -88,6 +90,10 @@ def forward_kernel(
     record_contact = sphere_contact_adjoint(scalar, lanes).record_contact
     record_finish = table_contact_adjoint(scalar, lanes).record_finish
     record_grip = grip_adjoint(scalar, lanes).record_grip
+    record_tether = tether_adjoint(scalar, lanes).record_tether
+    record_triangles = triangle_contact_adjoint(scalar, lanes).record_triangles
+    record_edges = edge_contact_adjoint(scalar, lanes).record_edges
+    record_spring = internal_friction_adjoint(scalar, lanes).record_spring
     has_room = tape(scalar, lanes).has_room
     Settings, Topology, Group, Particles = t.Settings, t.Topology, t.Group, t.Particles
     Springs, Pairs, Shapes, Near = t.Springs, t.Pairs, t.Shapes, t.Near
@@ -314,8 +320,22 @@ def forward_kernel(
                             held.x[lane] = x.x[lane]
                             held.y[lane] = x.y[lane]
                             held.z[lane] = x.z[lane]
+                    if wp.static(taped):
+                        mark = int(tk)
                     for i in range(n):
-                        project_tether(p0 + i, holding, held, q)
+                        if wp.static(taped):
+                            if record_tether(p0 + i, tx, holding, held, q, tape):
+                                tape.k[tk] = p0 + i
+                                tx += 1
+                                tk += 1
+                        else:
+                            project_tether(p0 + i, holding, held, q)
+                    if wp.static(taped):
+                        tape.k[tk] = tk - mark
+                        tk += 1
+                        for lane in range(wp.static(L)):
+                            tape.k[tk] = grips.particle[w0 + lane]
+                            tk += 1
             if wp.static(taped):
                 mark = int(tk)
             for c in range(near_start, near_start + near_count):
@@ -336,13 +356,33 @@ def forward_kernel(
                 if sheets.first[k + 1] > sheets.first[k]:
                     for lane in range(wp.static(L)):
                         if on[lane] > S(0.0):
-                            hit = project_triangles(
-                                g, lane, p0, grips.particle[w0 + lane], contact_mu[lane], push,
-                                sheets, cells,
-                            )  # fmt: skip
-                            cells.met[w0 + lane] = wp.where(hit, 1, 0)
-                            if wp.static(with_edges):
-                                project_edges(g, lane, p0, push, sheets, cells)
+                            if wp.static(taped):
+                                found = record_triangles(
+                                    g, lane, p0, grips.particle[w0 + lane], tk, ts,
+                                    contact_mu[lane], push, sheets, cells, tape,
+                                )  # fmt: skip
+                                cells.met[w0 + lane] = found % 2
+                                found = found // 2
+                                tk += wp.static(TRIANGLE_WORDS) * found
+                                ts += wp.static(TRIANGLE_SCALARS) * found
+                                tape.k[tk] = found
+                                tk += 1
+                                if wp.static(with_edges):
+                                    found = record_edges(
+                                        g, lane, p0, tk, ts, push, sheets, cells, tape
+                                    )  # fmt: skip
+                                    tk += wp.static(TRIANGLE_WORDS) * found
+                                    ts += wp.static(TRIANGLE_SCALARS) * found
+                                    tape.k[tk] = found
+                                    tk += 1
+                            else:
+                                hit = project_triangles(
+                                    g, lane, p0, grips.particle[w0 + lane], contact_mu[lane],
+                                    push, sheets, cells,
+                                )  # fmt: skip
+                                cells.met[w0 + lane] = wp.where(hit, 1, 0)
+                                if wp.static(with_edges):
+                                    project_edges(g, lane, p0, push, sheets, cells)
             if wp.static(with_bodies):
                 for lane in range(wp.static(L)):
                     if on[lane] > S(0.0):
@@ -371,6 +411,8 @@ def forward_kernel(
                 moved2 = wp.max(moved2, ended2)
             unrest2 = moved2
             drowsy = one
+            if wp.static(taped):
+                sleep = zero
             if wp.static(with_sheets):
                 if st.dry > S(0.0) or st.sleep > S(0.0):
                     sleep = sleep_speed(free_time, st.sleep, st.sleep_ramp)
@@ -382,7 +424,11 @@ def forward_kernel(
                 if st.viscous > S(0.0):
                     for s in range(s0, s1):
                         if springs.limit[s] > S(0.0):
-                            damp_spring(s, p0, st.viscous, on, q, springs)
+                            if wp.static(taped):
+                                record_spring(s, p0, tx, st.viscous, on, q, springs, tape)
+                                tx += 1
+                            else:
+                                damp_spring(s, p0, st.viscous, on, q, springs)
                 free_time = (free_time + V(dt)) * (one - holding)
             if wp.static(with_bodies):
                 for lane in range(wp.static(L)):
@@ -395,7 +441,9 @@ def forward_kernel(
             if wp.static(taped):
                 tape.v[tv] = on
                 tape.v[tv + 1] = fastest
-                tv += 2
+                tape.v[tv + 2] = holding
+                tape.v[tv + 3] = sleep
+                tv += 4
             moved = root(moved2)
             travel = travel + moved
             # the next substep may move by half as much again before its contacts are solved

@@ -76,6 +76,12 @@ def friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return moved2 * cube, budget * cube * S(-0.5)
 
     @wp.func
+    def coulomb_soft_scalar_slopes(moved2: S, budget: S):
+        inverse = S(1.0) / wp.max(wp.sqrt(moved2 + budget * budget), S(1.0e-12))
+        cube = inverse * inverse * inverse
+        return moved2 * cube, budget * cube * S(-0.5)
+
+    @wp.func
     def coulomb_scalar_slopes(moved2: S, budget: S, share: S):
         below = wp.max(moved2, S(1.0e-30))
         ratio = budget * budget / below
@@ -87,4 +93,5 @@ def friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     return SimpleNamespace(
         coulomb_slopes=coulomb_slopes, coulomb_soft_slopes=coulomb_soft_slopes,
         coulomb_scalar_slopes=coulomb_scalar_slopes,
+        coulomb_soft_scalar_slopes=coulomb_soft_scalar_slopes,
     )  # fmt: skip

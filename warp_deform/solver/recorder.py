@@ -35,6 +35,7 @@ _LISTS = {"cells.count": ("cells.particle", "cells.face", "cells.gap"),
           "cells.edge_count": ("cells.edge_a", "cells.edge_b", "cells.edge_gap")}  # fmt: skip
 _MOST = 2**31 - 1  # elements of one stack: whole numbers of 32 bits count them
 _ORDER = KERNEL_ARGUMENTS
+_SWEPT = ("topology", "springs", "pairs", "group", "particles", "grips", "sheets")
 _ADJOINT_OF = {"particles.x": "x", "particles.v": "v"}
 
 
@@ -258,11 +259,9 @@ class Recorder:
             if not full.any():
                 break
             steps = int(tape.arrays["steps"].numpy()[full].min())
+            self._spare = np.maximum(self._spare, self._worst())
             self._restore(checkpoint)
-            if steps == 0:
-                self._spare = 2 * self._spare
-            else:
-                end = begin + steps
+            end = begin + max(steps, 1)
             self._tape = None
         self._learn(tape, end - begin)
         self._kept += _nbytes(checkpoint) + (tape.nbytes if self.storage == "full" else 0)
@@ -285,7 +284,7 @@ class Recorder:
         Raises:
             InputError: it would need more memory than allowed.
         """
-        use = self._spare if self._use is None else 1.1 * self._use
+        use = self._least_room() if self._use is None else 1.1 * self._use
         room = np.ceil(use * length + self._spare).astype(int)
         largest = int((room.sum(axis=0) * (self._sizes() > 0)).max())
         replay = self.storage == "replay"
@@ -305,12 +304,17 @@ class Recorder:
         return tape
 
     def _learn(self, tape: _Tape, steps: int) -> None:
-        """How much of the tape a substep takes, and how much it may take at worst."""
+        """How much of the tape a substep takes."""
+        used = (tape.arrays["top"].numpy() - tape.arrays["first"].numpy()) / steps
+        self._use = used if self._use is None else np.maximum(self._use, used)
+        self._spare = np.maximum(self._spare, self._worst())
+
+    def _worst(self) -> np.ndarray:
+        """How much of the tape (groups, 4) a substep takes at worst with the lists as they are."""
         data = self.solver.data
-        used = tape.arrays["top"].numpy() - tape.arrays["first"].numpy()
-        self._use = used / steps if self._use is None else np.maximum(self._use, used / steps)
-        self._control["counters"].to_host()
-        near = self._control["counters"].view.reshape(-1, COUNTERS)[: data.group_count, 1]
+        counters = self._control["counters"]
+        counters.to_host()
+        near = counters.view.reshape(-1, COUNTERS)[: data.group_count, 1]
         listed = np.zeros(data.group_count)
         if data.has_sheets:
             for name in ("cells.count", "cells.edge_count"):
@@ -318,10 +322,9 @@ class Recorder:
                 counts = data.arrays[name].view[: data.group_count * data.lanes]
                 if len(counts) == data.group_count * data.lanes:
                     listed += counts.reshape(-1, data.lanes).sum(axis=1)
-        worst = self._least_room() + 1.5 * np.stack(
+        return self._least_room() + 1.5 * np.stack(
             [2 * near, near, near + TRIANGLE_WORDS * listed, TRIANGLE_SCALARS * listed], axis=1
         )
-        self._spare = np.maximum(self._spare, worst)
 
     def _launch(self, tape: _Tape, begin: int, end: int, last: bool) -> None:
         tape.struct.resume, tape.struct.last = int(begin > 0), int(last)
@@ -367,8 +370,7 @@ class Recorder:
             mirrored.view[...] = 0
         adjoint["w"].view[...] = self._final["particles.w"]
         struct = self._adjoint_struct()
-        inputs = [self._structs[_ORDER.index(n)] for n in ("topology", "springs", "pairs", "group")]
-        grips = self._structs[_ORDER.index("grips")]
+        inputs = [self._structs[_ORDER.index(n)] for n in _SWEPT]
         for mirrored in adjoint.values():
             mirrored.to_device()
         for number in reversed(range(len(self._segments))):
@@ -380,7 +382,7 @@ class Recorder:
                 tape = self._replay(number)
             wp.launch(
                 self._sweep, dim=data.group_count,
-                inputs=[self._settings(segment.end), *inputs, grips, tape.struct, struct],
+                inputs=[self._settings(segment.end), *inputs, tape.struct, struct],
                 device=self.solver.model.device,
             )  # fmt: skip
         for mirrored in adjoint.values():

@@ -100,6 +100,19 @@ def table_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return V3(x.x - dx * f, x.y - dy * f, x.z + depth)
 
     @wp.func
+    def finish_velocity(x: V3, o: V3, w: V, radius: S, inverse_dt: S, mu: V, fastest: V):
+        """The velocity that `finish` derives for lanes that are on."""
+        y = x
+        if any_less(x.z, radius):
+            y = on_table(x, o, w, radius, mu)
+        d = y - o
+        moved2 = dot(d, d)
+        v = d * inverse_dt
+        if any_less(fastest * fastest - moved2, S(0.0)):
+            v = v * wp.min(V(S(1.0)), fastest / wp.max(root(moved2), V(S(1.0e-12))))
+        return v
+
+    @wp.func
     def sweep_finish(
         i: int, x: V3, o: V3, radius: S, inverse_dt: S, mu: V, fastest: V, on: V, gv: V3,
         counts: int, adj: Adjoint,
@@ -165,5 +178,5 @@ def table_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
 
     return SimpleNamespace(
         record_finish=record_finish, sweep_finish=sweep_finish, sweep_predict=sweep_predict,
-        on_table=on_table,
+        finish_velocity=finish_velocity,
     )  # fmt: skip
