@@ -59,7 +59,7 @@ def closest_point(scalar: Any, lanes: int) -> SimpleNamespace:
 
 @functools.cache
 def closest_point_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`along_two(d, s, e, f, g)`: derivatives by r, e and f, the rows of a matrix, from those g by the
+    """`along_two(d, s, e, f, g)`: derivatives by r, e and f, rows of a matrix, from those g by the
     shares s at which |r - s[0] e - s[1] f| is least; d is the remainder there.
 
     `sweep_barycentric(u, g, d, ...)` does so for `barycentric`: whichever of inside, an edge or a
