@@ -88,14 +88,13 @@ def adjoint_kernel(
         push = st.recovery * dt
         kept = wp.max(zero, one - group.damping[g] * dt)
         fall = group.gravity[g] * dt
-        stiffness = group.stiffness[g]
-        inverse_dt2 = one * (inverse_dt * inverse_dt) / stiffness
+        inverse_dt2 = one * (inverse_dt * inverse_dt) / group.stiffness[g]
         table_mu = group.table_friction[g]
         contact_mu = group.contact_friction[g]
-        by_kept = zero
-        by_inverse_dt2 = zero
-        by_table = zero
-        by_contact = zero
+        by_kept = adj.damping[g]
+        by_inverse_dt2 = adj.stiffness[g]
+        by_table = adj.table_friction[g]
+        by_contact = adj.contact_friction[g]
         bends = int(0)
         stretches = int(0)
         damped = int(0)
@@ -188,7 +187,7 @@ def adjoint_kernel(
                 tx -= 2
                 by_contact = by_contact + sweep_contact(
                     tape.k[tk], p0, tape.x[tx], tape.x[tx + 1], tape.v[tv], contact_mu, push,
-                    pairs, counts, adj,
+                    pairs, counts, on, adj,
                 )  # fmt: skip
             # tethers
             if wp.static(with_sheets):
@@ -202,7 +201,7 @@ def adjoint_kernel(
                         tk -= 1
                         tx -= 1
                         by_held = by_held + sweep_tether(
-                            tape.k[tk], tape.x[tx], holding, counts, q, adj
+                            tape.k[tk], tape.x[tx], holding, counts, on, q, adj
                         )
                     for lane in range(wp.static(L)):
                         if tape.k[at + lane] >= 0:
@@ -232,7 +231,7 @@ def adjoint_kernel(
                     if acted:
                         tx -= 1
                         by_inverse_dt2 = by_inverse_dt2 + sweep_distance(
-                            s, p0, tape.x[tx], inverse_dt2, springs, counts, adj
+                            s, p0, tape.x[tx], inverse_dt2, springs, counts, on, adj
                         )
             # grips
             tk -= 1
@@ -255,9 +254,9 @@ def adjoint_kernel(
                 by_kept = by_kept + sweep_predict(
                     p0 + i, tape.x[finished + 3 * i + 2], dt, kept, fall, adj
                 )
-        adj.damping[g] = adj.damping[g] - select(kept, by_kept * dt, zero)
-        adj.table_friction[g] = adj.table_friction[g] + by_table
-        adj.contact_friction[g] = adj.contact_friction[g] + by_contact
-        adj.stiffness[g] = adj.stiffness[g] - by_inverse_dt2 * inverse_dt2 / stiffness
+        adj.damping[g] = by_kept
+        adj.table_friction[g] = by_table
+        adj.contact_friction[g] = by_contact
+        adj.stiffness[g] = by_inverse_dt2
 
     return sweep

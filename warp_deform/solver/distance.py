@@ -109,7 +109,7 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
 
     @wp.func
     def sweep_distance(
-        k: int, p0: int, d: V3, inverse_dt2: V, springs: Springs, counts: int, adj: Adjoint
+        k: int, p0: int, d: V3, inverse_dt2: V, springs: Springs, counts: int, on: V, adj: Adjoint
     ):
         ij = springs.ij[k]
         i = p0 + ij[0]
@@ -127,7 +127,7 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
             c = wp.min(c, zero)
             acts = less(c, zero)
             kind = counts + wp.static(int(Kind.FOLD_LIMIT))
-            adj.fired[kind] = adj.fired[kind] + acts
+            adj.fired[kind] = adj.fired[kind] + acts * on
         elif mode == 2:
             c = wp.max(c, zero)
             acts = less(zero, c)
@@ -144,7 +144,7 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
             other = (l - V(limit)) / (w * safe)
             tight = less(s, other)
             kind = counts + wp.static(int(Kind.STRAIN_LIMIT))
-            adj.fired[kind] = adj.fired[kind] + tight
+            adj.fired[kind] = adj.fired[kind] + tight * on
             s = wp.max(s, other)
             acts = wp.max(acts, tight)
             target = select(tight, V(limit), target)
@@ -156,7 +156,7 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
                 other = (l - V(floor)) / (w * safe)
                 tight = less(other, s)
                 kind = counts + wp.static(int(Kind.STRAIN_LIMIT))
-                adj.fired[kind] = adj.fired[kind] + tight
+                adj.fired[kind] = adj.fired[kind] + tight * on
                 s = wp.min(s, other)
                 acts = wp.max(acts, tight)
                 target = select(tight, V(floor), target)

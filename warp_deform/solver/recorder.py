@@ -388,7 +388,10 @@ class Recorder:
         for mirrored in adjoint.values():
             mirrored.to_host()
         self._restore(self._final)
-        out = {name: mirrored.view for name, mirrored in adjoint.items()}
+        out = {name: mirrored.view.copy() for name, mirrored in adjoint.items()}
+        views, dt = data.views, self.solver.config.dt
+        out["damping"] *= np.where(views["group.damping"] * dt < 1.0, -dt, 0.0)
+        out["stiffness"] *= -1.0 / (views["group.stiffness"] * dt) ** 2
         out["fired"] = out["fired"].reshape(data.group_count, len(Kind), data.lanes)
         return out
 

@@ -164,7 +164,7 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def sweep_contact(
         pair: int, p0: int, d: V3, moved: V3, mask: V, mu: V, push: S, pairs: Pairs, counts: int,
-        adj: Adjoint,
+        on: V, adj: Adjoint,
     ):  # fmt: skip
         ij = pairs.ij[pair]
         h = pairs.distance[pair]
@@ -192,9 +192,9 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         acts = less(zero, depth)
         slowed = less(allowed, overlap) * acts
         kind = counts + wp.static(int(Kind.CONTACT))
-        adj.fired[kind] = adj.fired[kind] + acts
+        adj.fired[kind] = adj.fired[kind] + acts * on
         kind = counts + wp.static(int(Kind.CONTACT_SLOWED))
-        adj.fired[kind] = adj.fired[kind] + slowed
+        adj.fired[kind] = adj.fired[kind] + slowed * on
         gi = adj.x[i]
         gj = adj.x[j]
         # step = n * (depth * share) - slip * (f * share)

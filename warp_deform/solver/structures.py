@@ -293,10 +293,10 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         xp: wp.array(dtype=V3)  # by position at the start of the substep
         w: wp.array(dtype=V)  # not a derivative: inverse masses as they were in the substep
         mass: wp.array(dtype=V)  # by free inverse mass
-        damping: wp.array(dtype=V)  # by group, as those below
+        damping: wp.array(dtype=V)  # by the share of velocity kept; per group, as those below
         table_friction: wp.array(dtype=V)
         contact_friction: wp.array(dtype=V)
-        stiffness: wp.array(dtype=V)
+        stiffness: wp.array(dtype=V)  # by 1 / (stiffness dt^2)
         time: wp.array(dtype=S)  # of each knot, as those below
         position: wp.array(dtype=R3)
         rotation: wp.array(dtype=Q)

@@ -63,12 +63,12 @@ def tether_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return project_tether(i, holding, held, q)
 
     @wp.func
-    def sweep_tether(i: int, d: V3, holding: V, counts: int, q: Particles, adj: Adjoint):
+    def sweep_tether(i: int, d: V3, holding: V, counts: int, on: V, q: Particles, adj: Adjoint):
         longest = select(holding, q.tether[i], V(S(NO_TETHER)))
         l2 = dot(d, d)
         over = less(longest * longest, l2) * less(V(S(0.0)), adj.w[i])
         kind = counts + wp.static(int(Kind.TETHER))
-        adj.fired[kind] = adj.fired[kind] + over
+        adj.fired[kind] = adj.fired[kind] + over * on
         g = adj.x[i]
         taken = g * over
         inverse = V(S(1.0)) / wp.max(root(l2), V(S(1.0e-12)))
