@@ -105,6 +105,7 @@ class Recorder:
             ]
         self._adjoint = self._new_adjoint()
         self._tape: _Tape | None = None
+        self._spent: list[_Tape] = []
         self._use: np.ndarray | None = None
         self._spare = 2.0 * self._least_room()
         self.nbytes = 0
@@ -236,6 +237,8 @@ class Recorder:
         for mirrored in data.arrays.values():
             mirrored.to_device()
         self._structs = data.structs()[:-1]
+        # tapes of the last rollout are used again: fresh memory is dear
+        self._spent = [segment.tape for segment in self._segments]
         self._segments, self.states = [], {}
         self._kept, self._on_tape = 0, -1
         begin, last = 0, self._marks[-1]
@@ -275,6 +278,8 @@ class Recorder:
             return 16
         if self.storage == "full":
             return last
+        if not self._segments:
+            return 16
         per_substep = float((self._use * self._sizes()).sum())
         return max(16, round(np.sqrt(last * self._kept / len(self._segments) / per_substep)))
 
@@ -288,6 +293,10 @@ class Recorder:
         room = np.ceil(use * length + self._spare).astype(int)
         largest = int((room.sum(axis=0) * (self._sizes() > 0)).max())
         replay = self.storage == "replay"
+        for spent in () if replay else self._spent:
+            if (spent.room >= room).all() and (spent.room <= 4 * room + 64).all():
+                self._spent.remove(spent)
+                return spent
         if replay and self._tape is not None:
             room = np.maximum(room, self._tape.room)
             if (room == self._tape.room).all():
