@@ -41,21 +41,20 @@ def adjoint_kernel(
 
     `Adjoint` holds the derivatives by the state after the tape's last substep and leaves with those
     by the state before its first; derivatives by parameters are added to. `Adjoint.w` takes the
-    inverse masses of the state likewise.
+    inverse masses of the state likewise. With `leave`, the prediction of the tape's first substep is
+    left to the sweep of the tape before (`pending`): it would cost a velocity on the tape.
     """
     t = structures(scalar, lanes)
     S, V, V3, L = t.S, t.V, t.V3, t.L
     sweep_distance = distance_adjoint(scalar, lanes, with_sheets).sweep_distance
     sweep_bend = bending_adjoint(scalar, lanes).sweep_bend
     sweep_contact = sphere_contact_adjoint(scalar, lanes).sweep_contact
-    table_ = table_contact_adjoint(scalar, lanes)
+    table_ = table_contact_adjoint(scalar, lanes, with_sheets)
     sweep_finish, sweep_predict = table_.sweep_finish, table_.sweep_predict
-    finish_velocity = table_.finish_velocity
     sweep_tether = tether_adjoint(scalar, lanes).sweep_tether
     sweep_triangle = triangle_contact_adjoint(scalar, lanes).sweep_triangle
     sweep_edge = edge_contact_adjoint(scalar, lanes).sweep_edge
-    calms = internal_friction_adjoint(scalar, lanes)
-    sweep_spring, sweep_calm = calms.sweep_spring, calms.sweep_calm
+    sweep_spring = internal_friction_adjoint(scalar, lanes).sweep_spring
     grips_ = grip_adjoint(scalar, lanes)
     sweep_grip, held_again = grips_.sweep_grip, grips_.held_again
     Settings, Topology, Springs, Pairs = t.Settings, t.Topology, t.Springs, t.Pairs
@@ -132,29 +131,31 @@ def adjoint_kernel(
                         if springs.limit[s] > S(0.0):
                             tx -= 1
                             sweep_spring(s, p0, tape.x[tx], st.viscous, on, springs, adj)
-            tx -= 3 * n
+            all_on = not any_less(on, S(0.5))
+            again = back > 0 or adj.pending[g] > 0
+            if wp.static(with_sheets):
+                tx -= 3 * n
+            else:
+                tx -= n
+                tv -= n
             for i in range(n):
-                gv = adj.v[p0 + i]
-                frozen = gv
-                if not any_less(on, S(0.5)):
-                    adj.v[p0 + i] = V3(zero, zero, zero)
-                else:
-                    gv = gv * on
-                    adj.v[p0 + i] = frozen - gv
-                x = tape.x[tx + 3 * i]
-                start = tape.x[tx + 3 * i + 1]
-                radius = top.radius[radii + i]
+                d = tape.x[tx]
+                z = zero
+                sleep = zero
                 if wp.static(with_sheets):
-                    if st.dry > S(0.0) or st.sleep > S(0.0):
-                        v = finish_velocity(
-                            x, start, adj.w[p0 + i], radius, inverse_dt, table_mu, fastest
-                        )
-                        gv = sweep_calm(
-                            p0 + i, v, gv, st.dry, tape.v[tv + 3], on, counts, adj
-                        )  # fmt: skip
-                by_table = by_table + sweep_finish(
-                    p0 + i, x, start, radius, inverse_dt, table_mu, fastest, on, gv, counts, adj
-                )
+                    x = tape.x[tx + 3 * i]
+                    d = x - tape.x[tx + 3 * i + 1]
+                    z = x.z
+                    sleep = tape.v[tv + 3]
+                else:
+                    d = tape.x[tx + i]
+                    z = tape.v[tv + i]
+                by_mu, by_share = sweep_finish(
+                    p0 + i, d, z, top.radius[radii + i], inverse_dt, table_mu, fastest, on, all_on,
+                    again, dt, kept, fall, st.dry, sleep, counts, adj,
+                )  # fmt: skip
+                by_table = by_table + by_mu
+                by_kept = by_kept + by_share
             finished = int(tx)
             tv_end = int(tv)
             # contacts of fabrics
@@ -249,11 +250,20 @@ def adjoint_kernel(
                     by_kept[lane] = by_kept[lane] + (
                         gx.x[lane] * kick[0] + gx.y[lane] * kick[1] + gx.z[lane] * kick[2]
                     )
-            # predict
-            for i in range(n):
-                by_kept = by_kept + sweep_predict(
-                    p0 + i, tape.x[finished + 3 * i + 2], dt, kept, fall, adj
-                )
+            # prediction; without fabrics it is taken back with the substep before
+            if wp.static(with_sheets):
+                for i in range(n):
+                    by_kept = by_kept + sweep_predict(
+                        p0 + i, tape.x[finished + 3 * i + 2], dt, kept, fall, adj
+                    )
+        if wp.static(not with_sheets):
+            if tape.steps[g] > 0:
+                adj.pending[g] = adj.leave
+            if tape.steps[g] > 0 and adj.leave == 0:
+                for i in range(n):
+                    by_kept = by_kept + sweep_predict(
+                        p0 + i, tape.x[tx - n + i], dt, kept, fall, adj
+                    )
         adj.damping[g] = by_kept
         adj.table_friction[g] = by_table
         adj.contact_friction[g] = by_contact

@@ -89,16 +89,19 @@ def bending_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         gj = adj.x[j]
         ge = adj.x[e]
         b = gi * (wi * half) + ge * (we * half) - gj * wj
-        gs = dot(d, b)
+        di = dot(d, gi) * half
+        dj = dot(d, gj)
+        de = dot(d, ge) * half
+        gs = di * wi + de * we - dj * wj
         gd = b * s + d * (gs * rest * less(tiny, exact) / (l * l * l * w))
         adj.x[i] = gi - gd * half
         adj.x[e] = ge - gd * half
         adj.x[j] = gj + gd
         gw = zero - gs * s / w
         quarter = gw * S(0.25)
-        adj.mass[i] = adj.mass[i] + select(wi, quarter + s * half * dot(d, gi), zero)
-        adj.mass[e] = adj.mass[e] + select(we, quarter + s * half * dot(d, ge), zero)
-        adj.mass[j] = adj.mass[j] + select(wj, gw - s * dot(d, gj), zero)
+        adj.mass[i] = adj.mass[i] + select(wi, quarter + s * di, zero)
+        adj.mass[e] = adj.mass[e] + select(we, quarter + s * de, zero)
+        adj.mass[j] = adj.mass[j] + select(wj, gw - s * dj, zero)
         return gw * springs.compliance[k]
 
     return SimpleNamespace(record_bend=record_bend, sweep_bend=sweep_bend)

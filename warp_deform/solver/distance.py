@@ -137,10 +137,12 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
         safe = wp.max(l, tiny)
         soft = one * springs.compliance[k]
         below = w + inverse_dt2 * soft
-        s = c / (below * safe)
+        inverse = one / (below * safe)
+        s = c * inverse
         target = V(rest)
         limit = springs.limit[k]
         if limit > S(0.0) and any_less(V(limit * limit) - l2, S(0.0)):
+            s = c / (below * safe)
             other = (l - V(limit)) / (w * safe)
             tight = less(s, other)
             kind = counts + wp.static(int(Kind.STRAIN_LIMIT))
@@ -150,6 +152,7 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
             target = select(tight, V(limit), target)
             below = select(tight, w, below)
             soft = select(tight, zero, soft)
+            inverse = one / (below * safe)
         if wp.static(with_floors):
             floor = springs.floor[k]
             if any_less(l2, floor * floor):
@@ -162,18 +165,22 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
                 target = select(tight, V(floor), target)
                 below = select(tight, w, below)
                 soft = select(tight, zero, soft)
+                inverse = one / (below * safe)
         gi = adj.x[i]
         gj = adj.x[j]
         b = gj * wj - gi * wi
-        gs = dot(d, b) * acts
+        di = dot(d, gi)
+        dj = dot(d, gj)
+        gs = (dj * wj - di * wi) * acts
         # at length 0 the spring has no direction, and none to turn to
-        gl = gs * target * less(tiny, l) / (below * safe * safe * safe)
+        along = inverse * below
+        gl = gs * target * less(tiny, l) * inverse * along * along
         gd = b * s + d * gl
         adj.x[i] = gi + gd
         adj.x[j] = gj - gd
-        gw = zero - gs * s / below
-        adj.mass[i] = adj.mass[i] + select(wi, gw - s * dot(d, gi), zero)
-        adj.mass[j] = adj.mass[j] + select(wj, gw + s * dot(d, gj), zero)
+        gw = zero - gs * s * inverse * safe
+        adj.mass[i] = adj.mass[i] + select(wi, gw - s * di, zero)
+        adj.mass[j] = adj.mass[j] + select(wj, gw + s * dj, zero)
         return gw * soft
 
     return SimpleNamespace(record_distance=record_distance, sweep_distance=sweep_distance)

@@ -88,7 +88,7 @@ def forward_kernel(
     record_distance = distance_adjoint(scalar, lanes, with_sheets).record_distance
     record_bend = bending_adjoint(scalar, lanes).record_bend
     record_contact = sphere_contact_adjoint(scalar, lanes).record_contact
-    record_finish = table_contact_adjoint(scalar, lanes).record_finish
+    record_finish = table_contact_adjoint(scalar, lanes, with_sheets).record_finish
     record_grip = grip_adjoint(scalar, lanes).record_grip
     record_tether = tether_adjoint(scalar, lanes).record_tether
     record_triangles = triangle_contact_adjoint(scalar, lanes).record_triangles
@@ -184,6 +184,10 @@ def forward_kernel(
                 substep = tape.counters[at]
                 near_count = tape.counters[at + 1]
                 longest_push = tape.counters[at + 2]
+            if wp.static(not with_sheets):
+                for i in range(n):
+                    tape.x[tx] = q.v[p0 + i]
+                    tx += 1
             tape.steps[g] = -substep
             tape.full[g] = 0
         while substep < st.max_steps and any_less(zero - on, S(0.0)):
@@ -401,9 +405,13 @@ def forward_kernel(
                 ended2 = zero
                 if wp.static(taped):
                     ended2 = record_finish(
-                        p0 + i, tx, radius, inverse_dt, table_mu, fastest, all_on, on, q, tape
+                        p0 + i, tx, tv, radius, inverse_dt, table_mu, fastest, all_on, on, q, tape
                     )
-                    tx += 3
+                    if wp.static(with_sheets):
+                        tx += 3
+                    else:
+                        tx += 1
+                        tv += 1
                 else:
                     ended2 = finish(
                         p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q

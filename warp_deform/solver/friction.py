@@ -51,44 +51,45 @@ def friction(scalar: Any, lanes: int) -> SimpleNamespace:
 
 @functools.cache
 def friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
-    """Slopes of `coulomb` and `coulomb_soft` by their budget and by `moved2`, as a pair.
+    """The shares of `friction` and their slopes by the budget and by moved2: `coulomb_slopes`,
+    `coulomb_soft_slopes` and their scalar forms.
 
-    With the ratio r = b^2 / d^2 the share is f = sqrt(r / sqrt(1 + r^2)), so df/db =
-    f / (b (1 + r^2)) and df/d(d^2) = -f / (2 d^2 (1 + r^2)); where r is bounded, both are 0.
+    With d the step, b the budget and h = (d^4 + b^4)^(-1/4) the share is f = b h, so df/db =
+    h (d h)^4 and df/d(d^2) = -f d^2 h^4 / 2.
     """
     t = structures(scalar, lanes)
     S, V = t.S, t.V
+    # the least fourth power of a length that the precision can divide by
+    TINY = 1.0e-36 if scalar is wp.float32 else 1.0e-200
 
     @wp.func
-    def coulomb_slopes(moved2: V, budget: V, share: V):
-        tiny = V(S(1.0e-30))
-        bound = V(S(1.0e8))
-        below = wp.max(moved2, tiny)
-        ratio = wp.min(budget * budget / below, bound)
-        one = V(S(1.0))
-        slope = less(ratio, bound) * share / (one + ratio * ratio)
-        return slope / wp.max(budget, tiny), slope / below * S(-0.5)
+    def coulomb_slopes(moved2: V, budget: V):
+        square = budget * budget
+        fourth = V(S(1.0)) / wp.max(moved2 * moved2 + square * square, V(S(TINY)))
+        h = root(root(fourth))
+        share = budget * h
+        turn = moved2 * fourth
+        return share, h * moved2 * turn, share * turn * S(-0.5)
 
     @wp.func
     def coulomb_soft_slopes(moved2: V, budget: V):
         inverse = V(S(1.0)) / wp.max(root(moved2 + budget * budget), V(S(1.0e-12)))
         cube = inverse * inverse * inverse
-        return moved2 * cube, budget * cube * S(-0.5)
+        return budget * inverse, moved2 * cube, budget * cube * S(-0.5)
 
     @wp.func
     def coulomb_soft_scalar_slopes(moved2: S, budget: S):
         inverse = S(1.0) / wp.max(wp.sqrt(moved2 + budget * budget), S(1.0e-12))
         cube = inverse * inverse * inverse
-        return moved2 * cube, budget * cube * S(-0.5)
+        return budget * inverse, moved2 * cube, budget * cube * S(-0.5)
 
     @wp.func
-    def coulomb_scalar_slopes(moved2: S, budget: S, share: S):
-        below = wp.max(moved2, S(1.0e-30))
-        ratio = budget * budget / below
-        slope = S(0.0)
-        if ratio < S(1.0e8):
-            slope = share / (S(1.0) + ratio * ratio)
-        return slope / wp.max(budget, S(1.0e-30)), slope / below * S(-0.5)
+    def coulomb_scalar_slopes(moved2: S, budget: S):
+        square = budget * budget
+        fourth = S(1.0) / wp.max(moved2 * moved2 + square * square, S(TINY))
+        h = wp.sqrt(wp.sqrt(fourth))
+        turn = moved2 * fourth
+        return budget * h, h * moved2 * turn, budget * h * turn * S(-0.5)
 
     return SimpleNamespace(
         coulomb_slopes=coulomb_slopes, coulomb_soft_slopes=coulomb_soft_slopes,

@@ -129,6 +129,7 @@ class Recorder:
         arrays["position"] = self._mirrored(knots, t.R3, (3,))
         arrays["rotation"] = self._mirrored(knots, t.Q, (4,))
         arrays["shift"] = self._mirrored(groups * L, t.R3, (3,))
+        arrays["pending"] = Mirrored(groups, wp.int32, data.device, np.int32, ())
         arrays["fired"] = self._mirrored(groups * len(Kind), t.V, (L,))
         return arrays
 
@@ -171,7 +172,7 @@ class Recorder:
             top = data.topologies[k]
             springs, particles = len(top.spring_ij), top.particle_count
             words = springs + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
-            rows.append((2 * springs + 4 * particles, 8, words, 0))
+            rows.append((2 * springs + 4 * particles, particles + 8, words, 0))
         return np.array(rows)
 
     # -- checkpoints
@@ -389,6 +390,7 @@ class Recorder:
             tape = segment.tape
             if self.storage == "replay":
                 tape = self._replay(number)
+            struct.leave = int(segment.begin > 0 and segment.begin not in self._marks)
             wp.launch(
                 self._sweep, dim=data.group_count,
                 inputs=[self._settings(segment.end), *inputs, tape.struct, struct],

@@ -143,7 +143,6 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     S, V, V3 = t.S, t.V, t.V3
     Pairs, Particles, Near, Tape, Adjoint = t.Pairs, t.Particles, t.Near, t.Tape, t.Adjoint
     project_contact = sphere_contact(scalar, lanes).project_contact
-    coulomb_soft = friction(scalar, lanes).coulomb_soft
     coulomb_soft_slopes = friction_adjoint(scalar, lanes).coulomb_soft_slopes
 
     @wp.func
@@ -187,8 +186,7 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         slip = moved - n * approach
         slip2 = dot(slip, slip)
         budget = depth * mu
-        f = coulomb_soft(slip2, budget)
-        by_budget, by_slip2 = coulomb_soft_slopes(slip2, budget)
+        f, by_budget, by_slip2 = coulomb_soft_slopes(slip2, budget)
         acts = less(zero, depth)
         slowed = less(allowed, overlap) * acts
         kind = counts + wp.static(int(Kind.CONTACT))
@@ -199,8 +197,12 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         gj = adj.x[j]
         # step = n * (depth * share) - slip * (f * share)
         b = (gi * wi - gj * wj) * acts
-        along = dot(n, b)
-        across = zero - dot(slip, b)
+        ni = dot(n, gi)
+        nj = dot(n, gj)
+        si = dot(slip, gi)
+        sj = dot(slip, gj)
+        along = (ni * wi - nj * wj) * acts
+        across = (sj * wj - si * wi) * acts
         gf = across * share
         g_budget = gf * by_budget
         g_depth = along * share + g_budget * mu
@@ -216,9 +218,9 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         adj.xp[i] = adj.xp[i] - g_moved
         adj.xp[j] = adj.xp[j] + g_moved
         gw = zero - (along * depth + across * f) * share * share
-        step = (n * depth - slip * f) * (share * acts)
-        adj.mass[i] = adj.mass[i] + select(wi, gw + dot(step, gi), zero)
-        adj.mass[j] = adj.mass[j] + select(wj, gw - dot(step, gj), zero)
+        given = share * acts
+        adj.mass[i] = adj.mass[i] + select(wi, gw + (ni * depth - si * f) * given, zero)
+        adj.mass[j] = adj.mass[j] + select(wj, gw - (nj * depth - sj * f) * given, zero)
         return g_budget * depth
 
     return SimpleNamespace(record_contact=record_contact, sweep_contact=sweep_contact)

@@ -301,6 +301,8 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         position: wp.array(dtype=R3)
         rotation: wp.array(dtype=Q)
         shift: wp.array(dtype=R3)  # by group * L + lane
+        leave: int  # 1: the tape before takes back the prediction of this tape's first substep
+        pending: wp.array(dtype=int)  # 1: the tape after has left that to this one, by group
         fired: wp.array(dtype=V)  # by group * KINDS: constraints that acted, by kind
         # the same memory as arrays of V3 and V, scalar by scalar (see `lane_access`)
         x_flat: wp.array(dtype=S)

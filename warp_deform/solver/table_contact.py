@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from .friction import friction, friction_adjoint
+from .internal_friction import internal_friction_adjoint
 from .lanes import add, any_less, div, dot, less, mul, root, select, sub  # noqa: F401
 from .structures import structures
 from .tape import Kind
@@ -64,107 +65,118 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 
 
 @functools.cache
-def table_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`record_finish` ends a substep and leaves a particle's position, that at the start of the
-    substep and its old velocity on the tape. `sweep_finish` and `sweep_predict` take that back and
-    return the derivatives by friction and by the share of velocity that air damping keeps.
+def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) -> SimpleNamespace:
+    """`record_finish` ends a substep and leaves a particle's step and height on the tape (with
+    fabrics: its position, that at the start of the substep, and its old velocity).
+
+    `sweep_finish` takes that back, and with it the prediction of the next substep (`again`), whose
+    velocity it finds; with fabrics, dry friction and sleep. Returns the derivatives by friction and
+    by the share of velocity that air damping keeps. `sweep_predict` takes back a prediction alone.
 
     Branches: above or on the table (its push acts on z only, friction across), the speed clamp, and
-    lanes that are frozen. A stick is the smooth end of friction, no branch.
+    lanes that are frozen. Sticking is the smooth end of friction, no branch.
     """
     t = structures(scalar, lanes)
     S, V, V3 = t.S, t.V, t.V3
     Particles, Tape, Adjoint = t.Particles, t.Tape, t.Adjoint
     finish = table_contact(scalar, lanes).finish
-    coulomb = friction(scalar, lanes).coulomb
     coulomb_slopes = friction_adjoint(scalar, lanes).coulomb_slopes
+    sweep_calm = internal_friction_adjoint(scalar, lanes).sweep_calm
 
     @wp.func
     def record_finish(
-        i: int, at: int, radius: S, inverse_dt: S, mu: V, fastest: V, all_on: bool, on: V,
-        q: Particles, tape: Tape,
+        i: int, at: int, at_height: int, radius: S, inverse_dt: S, mu: V, fastest: V, all_on: bool,
+        on: V, q: Particles, tape: Tape,
     ):  # fmt: skip
-        tape.x[at] = q.x[i]
-        tape.x[at + 1] = q.xp[i]
-        tape.x[at + 2] = q.v[i]
+        if wp.static(with_sheets):
+            tape.x[at] = q.x[i]
+            tape.x[at + 1] = q.xp[i]
+            tape.x[at + 2] = q.v[i]
+        else:
+            x = q.x[i]
+            tape.x[at] = x - q.xp[i]
+            tape.v[at_height] = x.z
         return finish(i, radius, inverse_dt, mu, fastest, all_on, on, q)
 
     @wp.func
-    def on_table(x: V3, o: V3, w: V, radius: S, mu: V):
-        """Position after the table and friction."""
-        zero = V(S(0.0))
-        depth = select(w, wp.max(V(radius) - x.z, zero), zero)
-        dx = x.x - o.x
-        dy = x.y - o.y
-        f = coulomb(dx * dx + dy * dy, depth * mu)
-        return V3(x.x - dx * f, x.y - dy * f, x.z + depth)
-
-    @wp.func
-    def finish_velocity(x: V3, o: V3, w: V, radius: S, inverse_dt: S, mu: V, fastest: V):
-        """The velocity that `finish` derives for lanes that are on."""
-        y = x
-        if any_less(x.z, radius):
-            y = on_table(x, o, w, radius, mu)
-        d = y - o
-        moved2 = dot(d, d)
-        v = d * inverse_dt
-        if any_less(fastest * fastest - moved2, S(0.0)):
-            v = v * wp.min(V(S(1.0)), fastest / wp.max(root(moved2), V(S(1.0e-12))))
-        return v
-
-    @wp.func
     def sweep_finish(
-        i: int, x: V3, o: V3, radius: S, inverse_dt: S, mu: V, fastest: V, on: V, gv: V3,
-        counts: int, adj: Adjoint,
+        i: int, d: V3, z: V, radius: S, inverse_dt: S, mu: V, fastest: V, on: V, all_on: bool,
+        again: bool, dt: S, kept: V, fall: V3, dry: S, sleep: V, counts: int, adj: Adjoint,
     ):  # fmt: skip
-        """`gv`: derivative by the velocity where the lane is on, 0 elsewhere."""
         zero = V(S(0.0))
         one = V(S(1.0))
         w = adj.w[i]
-        touches = any_less(x.z, radius)
-        y = x
+        g = adj.x[i]
+        gv = adj.v[i]
+        go = adj.xp[i]
+        # the step as it ended
+        touches = any_less(z, radius)
+        depth = zero
+        share = zero
+        by_budget = zero
+        by_d2 = zero
+        e = d
         if touches:
-            y = on_table(x, o, w, radius, mu)
-        d = y - o
-        moved2 = dot(d, d)
-        gd = gv * inverse_dt
+            depth = select(w, wp.max(V(radius) - z, zero), zero)
+            share, by_budget, by_d2 = coulomb_slopes(d.x * d.x + d.y * d.y, depth * mu)
+            e = V3(d.x - d.x * share, d.y - d.y * share, d.z + depth)
+        moved2 = dot(e, e)
+        slower = one
+        bent = zero
         if any_less(fastest * fastest - moved2, S(0.0)):
             l = wp.max(root(moved2), V(S(1.0e-12)))
+            slower = wp.min(one, fastest / l)
             over = less(fastest, l)
+            bent = over * slower / (l * l)
             kind = counts + wp.static(int(Kind.SPEED_CLAMP))
             adj.fired[kind] = adj.fired[kind] + over * on
-            slower = wp.min(one, fastest / l)
-            gd = gd * slower - d * (over * slower * dot(gd, d) / (l * l))
-        g = adj.x[i]
+        by_kept = zero
+        if wp.static(not with_sheets):
+            if again:
+                free = select(w, V(dt), zero)
+                by_kept = dot(g, e * (slower * inverse_dt) + fall) * free
+                gv = gv + g * (kept * free)
+                g = g + go
+                go = V3(zero, zero, zero)
         # what is frozen ends where it began
-        back = V3(select(on, zero, g.x), select(on, zero, g.y), select(on, zero, g.z))
-        g = g - back + gd
-        go = back - gd
-        gmu = zero
+        frozen = V3(zero, zero, zero)
+        if not all_on:
+            frozen = gv * (one - on)
+            gv = gv * on
+            back = g * (one - on)
+            g = g * on
+            go = go + back
+        adj.v[i] = frozen
+        if wp.static(with_sheets):
+            if dry > S(0.0) or any_less(zero - sleep, S(0.0)):
+                adj.x[i] = g
+                adj.xp[i] = go
+                gv = sweep_calm(i, e * (slower * inverse_dt), gv, dry, sleep, on, counts, adj)
+                g = adj.x[i]
+                go = adj.xp[i]
+        gd = gv * inverse_dt
+        gd = gd * slower - e * (bent * dot(gd, e))
+        g = g + gd
+        go = go - gd
+        by_mu = zero
         if touches:
-            depth = select(w, wp.max(V(radius) - x.z, zero), zero)
-            dx = x.x - o.x
-            dy = x.y - o.y
-            d2 = dx * dx + dy * dy
-            f = coulomb(d2, depth * mu)
-            by_budget, by_d2 = coulomb_slopes(d2, depth * mu, f)
             down = less(zero, depth)
             kind = counts + wp.static(int(Kind.TABLE))
             adj.fired[kind] = adj.fired[kind] + down * on
             kind = counts + wp.static(int(Kind.TABLE_SLIP))
-            adj.fired[kind] = adj.fired[kind] + less(f, V(S(0.5))) * down * on
-            gf = zero - dx * g.x - dy * g.y
-            g_budget = gf * by_budget
-            turn = gf * by_d2 * S(2.0)
-            gx = dx * turn - g.x * f
-            gy = dy * turn - g.y * f
+            adj.fired[kind] = adj.fired[kind] + less(share, V(S(0.5))) * down * on
+            g_share = zero - d.x * g.x - d.y * g.y
+            g_budget = g_share * by_budget
+            turn = g_share * by_d2 * S(2.0)
+            gx = d.x * turn - g.x * share
+            gy = d.y * turn - g.y * share
             gz = down * (g.z + g_budget * mu)
-            gmu = g_budget * depth
+            by_mu = g_budget * depth
             g = V3(g.x + gx, g.y + gy, g.z - gz)
             go = V3(go.x - gx, go.y - gy, go.z)
         adj.x[i] = g
-        adj.xp[i] = adj.xp[i] + go
-        return gmu
+        adj.xp[i] = go
+        return by_mu, by_kept
 
     @wp.func
     def sweep_predict(i: int, v: V3, dt: S, kept: V, fall: V3, adj: Adjoint):
@@ -177,6 +189,5 @@ def table_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return dot(g, v + fall) * free
 
     return SimpleNamespace(
-        record_finish=record_finish, sweep_finish=sweep_finish, sweep_predict=sweep_predict,
-        finish_velocity=finish_velocity,
-    )  # fmt: skip
+        record_finish=record_finish, sweep_finish=sweep_finish, sweep_predict=sweep_predict
+    )

@@ -73,7 +73,7 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
         words += wp.static(2 * L * (GRIP_WORDS + 4) + 8)
         return (
             tx + 2 * springs + 4 * particles + 2 * near <= end[0]
-            and tv + near + 8 <= end[1]
+            and tv + near + particles + 8 <= end[1]
             and tk + words <= end[2]
             and ts + wp.static(TRIANGLE_SCALARS) * listed <= end[3]
         )

@@ -142,8 +142,7 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         slip2 = wp.dot(slip, slip)
         rub = mu * sheets.friction[face]
         budget = depth * rub
-        share = budget / wp.max(wp.sqrt(slip2 + budget * budget), S(1.0e-12))
-        by_budget, by_slip2 = soft_slopes(slip2, budget)
+        share, by_budget, by_slip2 = soft_slopes(slip2, budget)
         step = (n * depth - slip * share) / w
 
         gp = get(adj.x_flat, i, lane)
