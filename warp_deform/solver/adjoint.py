@@ -22,7 +22,7 @@ from .lanes import KERNEL_OPTIONS, add, any_less, div, less, mul, select, sub  #
 from .sphere_contact import sphere_contact_adjoint
 from .structures import structures
 from .table_contact import table_contact_adjoint
-from .tape import GRIP_WORDS, TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind
+from .tape import GRIP_WORDS, TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind, tape
 from .tether import tether_adjoint
 from .triangle_contact_adjoint import triangle_contact_adjoint
 
@@ -41,8 +41,8 @@ def adjoint_kernel(
 
     `Adjoint` holds the derivatives by the state after the tape's last substep and leaves with those
     by the state before its first; derivatives by parameters are added to. `Adjoint.w` takes the
-    inverse masses of the state likewise. With `leave`, the prediction of the tape's first substep is
-    left to the sweep of the tape before (`pending`): it would cost a velocity on the tape.
+    inverse masses of the state likewise. With `leave`, the prediction of the first substep is left
+    to the sweep of the tape before (`pending`), which finds the velocity without a tape.
     """
     t = structures(scalar, lanes)
     S, V, V3, L = t.S, t.V, t.V3, t.L
@@ -61,6 +61,8 @@ def adjoint_kernel(
     Group, Grips, Tape, Adjoint = t.Group, t.Grips, t.Tape, t.Adjoint
     Particles, Sheets = t.Particles, t.Sheets
     KINDS = len(Kind)
+    BYTES = 3 * lanes * (4 if scalar is wp.float32 else 8)
+    fetch_ahead = tape(scalar, lanes).fetch_ahead
 
     @wp.func
     def count(kind: int, on: V, amount: int, adj: Adjoint):
@@ -115,8 +117,13 @@ def adjoint_kernel(
             tk -= 2
             if tape.k[tk + 1] >= 0:
                 held_again(tape.k[tk], tape.k[tk + 1], p0, adj)
+        last = int(tx)
         for back in range(tape.steps[g]):
             substep = tape.until[g] - 1 - back
+            # two substeps ahead, as long as the last one
+            used = last - tx
+            fetch_ahead(tape.x, tx - 3 * used, used * wp.static(BYTES))
+            last = int(tx)
             tv -= 4
             on = tape.v[tv]
             fastest = tape.v[tv + 1]

@@ -282,7 +282,7 @@ class Recorder:
         if not self._segments:
             return 16
         per_substep = float((self._use * self._sizes()).sum())
-        return max(16, round(np.sqrt(last * self._kept / len(self._segments) / per_substep)))
+        return max(64, round(np.sqrt(last * self._kept / len(self._segments) / per_substep)))
 
     def _tape_for(self, length: int) -> _Tape:
         """A tape with room for `length` substeps: the one in use where it suffices.

@@ -32,8 +32,7 @@ __all__ = ["sphere_contact", "sphere_contact_adjoint"]
 
 @functools.cache
 def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`list_near` makes the list of a group, `project_contact` solves one of its pairs and returns
-    whether it touched.
+    """`list_near` makes the list of a group, `project_contact` solves one of its pairs.
 
     A correction may stop an approach, but it separates a pair at `recovery` at most, counting what
     already separates it: an overlap that takes many substeps to undo does not gather speed.
@@ -89,8 +88,7 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         xj = q.x[j]
         d = xi - xj
         l2 = dot(d, d)
-        touching = any_less(l2, h * h)
-        if touching:
+        if any_less(l2, h * h):
             zero = V(S(0.0))
             one = V(S(1.0))
             tiny = V(S(1.0e-9))
@@ -108,7 +106,6 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             step = n * (depth * share) - slip * (f * share)
             q.x[i] = xi + step * wi
             q.x[j] = xj - step * wj
-        return touching
 
     @wp.func
     def touches(
@@ -134,7 +131,8 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 @functools.cache
 def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     """`record_contact` solves a pair and leaves its offset d, its step since the substep began and
-    its mask on the tape; `sweep_contact` takes it back and returns the derivative by friction.
+    its mask on the tape, or returns False where it does not touch. `sweep_contact` takes it back
+    and returns the derivative by friction.
 
     Branches: apart or touching; depth limited by the overlap or by `recovery` (then its slope is
     that of the approach, or 0 while the pair separates as fast as it may).
@@ -150,15 +148,21 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         k: int, p0: int, at: int, at_mask: int, mu: V, push: S, q: Particles, pairs: Pairs,
         near: Near, tape: Tape,
     ):  # fmt: skip
-        ij = pairs.ij[near.pair[k]]
+        pair = near.pair[k]
+        ij = pairs.ij[pair]
+        h = pairs.distance[pair]
         i = p0 + ij[0]
         j = p0 + ij[1]
         xi = q.x[i]
         xj = q.x[j]
-        tape.x[at] = xi - xj
-        tape.x[at + 1] = (xi - q.xp[i]) - (xj - q.xp[j])
-        tape.v[at_mask] = near.mask[k]
-        return project_contact(k, p0, mu, push, q, pairs, near)
+        d = xi - xj
+        touching = any_less(dot(d, d), h * h)
+        if touching:
+            tape.x[at] = d
+            tape.x[at + 1] = (xi - q.xp[i]) - (xj - q.xp[j])
+            tape.v[at_mask] = near.mask[k]
+            project_contact(k, p0, mu, push, q, pairs, near)
+        return touching
 
     @wp.func
     def sweep_contact(

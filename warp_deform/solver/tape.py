@@ -57,11 +57,19 @@ class Kind(IntEnum):
 
 @functools.cache
 def tape(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`has_room(...)`: whether a substep with so many springs, particles, near pairs and listed
+    """`fetch_ahead(x, begin, bytes)`: have a part of the stack of V3 brought near the processor, as
+    the sweep reads backwards, which hardware foresees badly.
+
+    `has_room(...)`: whether a substep with so many springs, particles, near pairs and listed
     pairs of triangles and edges fits on the tape, and the grips of the next substep with it.
     """
     t = structures(scalar, lanes)
-    L, Tape = t.L, t.Tape
+    L, V3, Tape = t.L, t.V3, t.Tape
+    far = "const char* p = (const char*)(x.data + (begin > 0 ? begin : 0));"
+    lines = "for (int i = 0; i < bytes; i += 64) __builtin_prefetch(p + i, 0, 2);"
+
+    @wp.func_native(f"#if !defined(__CUDA_ARCH__)\n{far} {lines}\n#endif\n")
+    def fetch_ahead(x: wp.array(dtype=V3), begin: int, bytes: int): ...
 
     @wp.func
     def has_room(
@@ -78,4 +86,4 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
             and ts + wp.static(TRIANGLE_SCALARS) * listed <= end[3]
         )
 
-    return SimpleNamespace(has_room=has_room)
+    return SimpleNamespace(has_room=has_room, fetch_ahead=fetch_ahead)
