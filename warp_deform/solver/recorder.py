@@ -265,8 +265,9 @@ class Recorder:
             steps = int(tape.arrays["steps"].numpy()[full].min())
             self._spare = np.maximum(self._spare, self._worst())
             self._restore(checkpoint)
+            if steps == 0 and end == begin + 1:
+                self._spare = 2 * self._spare
             end = begin + max(steps, 1)
-            self._tape = None
         self._learn(tape, end - begin)
         self._kept += _nbytes(checkpoint) + (tape.nbytes if self.storage == "full" else 0)
         self._segments.append(_Segment(begin, end, checkpoint, tape))
@@ -414,6 +415,7 @@ class Recorder:
             self._restore(segment.checkpoint)
             last = number == len(self._segments) - 1
             self._launch(tape, segment.begin, segment.end, last)
+            assert not tape.arrays["full"].numpy().any()
             self._on_tape = number
         return tape
 
