@@ -142,12 +142,12 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
         target = V(rest)
         limit = springs.limit[k]
         if limit > S(0.0) and any_less(V(limit * limit) - l2, S(0.0)):
-            s = c / (below * safe)
+            # compared as in the forward pass; what is not tight keeps the bits it has alone
             other = (l - V(limit)) / (w * safe)
-            tight = less(s, other)
+            tight = less(c / (below * safe), other)
             kind = counts + wp.static(int(Kind.STRAIN_LIMIT))
             adj.fired[kind] = adj.fired[kind] + tight * on
-            s = wp.max(s, other)
+            s = select(tight, other, s)
             acts = wp.max(acts, tight)
             target = select(tight, V(limit), target)
             below = select(tight, w, below)
@@ -157,10 +157,10 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
             floor = springs.floor[k]
             if any_less(l2, floor * floor):
                 other = (l - V(floor)) / (w * safe)
-                tight = less(other, s)
+                tight = less(other, (l - target) * acts / (below * safe))
                 kind = counts + wp.static(int(Kind.STRAIN_LIMIT))
                 adj.fired[kind] = adj.fired[kind] + tight * on
-                s = wp.min(s, other)
+                s = select(tight, other, s)
                 acts = wp.max(acts, tight)
                 target = select(tight, V(floor), target)
                 below = select(tight, w, below)

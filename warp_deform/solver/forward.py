@@ -11,14 +11,10 @@ from typing import Any
 
 import warp as wp
 
-from ..objects.attributes import SpringMode
 from ..objects.push import MOST_PUSHES
-from .bending import bending, bending_adjoint
 from .body_solve import body_solve
 from .cell_list import cell_list
-from .distance import distance, distance_adjoint
 from .edge_contact import edge_contact
-from .edge_contact_adjoint import edge_contact_adjoint
 from .grip import grip, grip_adjoint
 from .internal_friction import internal_friction, internal_friction_adjoint
 from .lanes import (  # noqa: F401  (operators are found by name)
@@ -34,14 +30,12 @@ from .lanes import (  # noqa: F401  (operators are found by name)
     select,
     sub,
 )
+from .particle_solve import particle_solve
 from .rigid import rigid
-from .sphere_contact import sphere_contact, sphere_contact_adjoint
+from .sphere_contact import sphere_contact
 from .structures import structures
 from .table_contact import table_contact, table_contact_adjoint
-from .tape import COUNTERS, GRIP_WORDS, STATE, TRIANGLE_SCALARS, TRIANGLE_WORDS, tape
-from .tether import tether, tether_adjoint
-from .triangle_contact import triangle_contact
-from .triangle_contact_adjoint import triangle_contact_adjoint
+from .tape import COUNTERS, GRIP_WORDS, tape
 from .watch import watch
 
 __all__ = ["forward_kernel"]
@@ -65,36 +59,26 @@ def forward_kernel(
     t = structures(scalar, lanes)
     S, V, R3, L = t.S, t.V, t.R3, t.L
     predict, finish = (getattr(table_contact(scalar, lanes), n) for n in ("predict", "finish"))
-    project_distance = distance(scalar, lanes, with_sheets).project_distance
-    project_bend = bending(scalar, lanes).project_bend
-    contact = sphere_contact(scalar, lanes)
-    list_near, project_contact = contact.list_near, contact.project_contact
+    list_near = sphere_contact(scalar, lanes).list_near
     cells_ = cell_list(scalar, lanes)
     moved_since, list_triangles = cells_.moved_since, cells_.list_triangles
-    project_triangles = triangle_contact(scalar, lanes).project_triangles
-    edges_ = edge_contact(scalar, lanes)
-    list_edges, project_edges = edges_.list_edges, edges_.project_edges
+    list_edges = edge_contact(scalar, lanes).list_edges
+    solve_particles = particle_solve(scalar, lanes, with_sheets, with_edges, taped).solve_particles
     calms = internal_friction(scalar, lanes)
     sleep_speed, calm_particle, damp_spring = (
         getattr(calms, n) for n in ("sleep_speed", "calm_particle", "damp_spring")
     )
-    project_tether = tether(scalar, lanes).project_tether
     grips_ = grip(scalar, lanes)
     follow_path, take, let_go = grips_.follow_path, grips_.take, grips_.let_go
     body = rigid(scalar, lanes)
     predict_body, finish_body = body.predict_body, body.finish_body
     solve_bodies = body_solve(scalar, lanes, with_sheets).solve_bodies
     watch_group = watch(scalar, lanes, with_bodies).watch_group
-    record_distance = distance_adjoint(scalar, lanes, with_sheets).record_distance
-    record_bend = bending_adjoint(scalar, lanes).record_bend
-    record_contact = sphere_contact_adjoint(scalar, lanes).record_contact
     record_finish = table_contact_adjoint(scalar, lanes, with_sheets).record_finish
     record_grip = grip_adjoint(scalar, lanes).record_grip
-    record_tether = tether_adjoint(scalar, lanes).record_tether
-    record_triangles = triangle_contact_adjoint(scalar, lanes).record_triangles
-    record_edges = edge_contact_adjoint(scalar, lanes).record_edges
     record_spring = internal_friction_adjoint(scalar, lanes).record_spring
-    has_room = tape(scalar, lanes).has_room
+    tapes = tape(scalar, lanes)
+    has_room, load_state, save_state = tapes.has_room, tapes.load_state, tapes.save_state
     Settings, Topology, Group, Particles = t.Settings, t.Topology, t.Group, t.Particles
     Springs, Pairs, Shapes, Near = t.Springs, t.Pairs, t.Shapes, t.Near
     Bodies, Contacts, Grips, Watch = t.Bodies, t.Contacts, t.Grips, t.Watch
@@ -161,33 +145,22 @@ def forward_kernel(
         # the table hides at once that a particle started under it
         watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
         substep = int(0)
+        tops = wp.vec4i()
         if wp.static(taped):
             tops = tape.first[g]
-            tx = int(tops[0])
-            tv = int(tops[1])
-            tk = int(tops[2])
-            ts = int(tops[3])
             if not begins:
-                at = g * wp.static(STATE)
-                on = tape.state[at]
-                steps = tape.state[at + 1]
-                quiet = tape.state[at + 2]
-                holding = tape.state[at + 3]
-                calm = tape.state[at + 4]
-                stale = tape.state[at + 5]
-                fresh = tape.state[at + 6]
-                travel = tape.state[at + 7]
-                clamped = tape.state[at + 8]
-                free_time = tape.state[at + 9]
-                least = tape.state[at + 10]
+                (
+                    on, steps, quiet, holding, calm, stale, fresh, travel, clamped, free_time,
+                    least,
+                ) = load_state(g, tape)  # fmt: skip
                 at = g * wp.static(COUNTERS)
                 substep = tape.counters[at]
                 near_count = tape.counters[at + 1]
                 longest_push = tape.counters[at + 2]
             if wp.static(not with_sheets):
                 for i in range(n):
-                    tape.x[tx] = q.v[p0 + i]
-                    tx += 1
+                    tape.x[tops[0]] = q.v[p0 + i]
+                    tops[0] += 1
             tape.steps[g] = -substep
             tape.full[g] = 0
         while substep < st.max_steps and any_less(zero - on, S(0.0)):
@@ -225,7 +198,7 @@ def forward_kernel(
                         q.x[p0 + i] = x
             # grips
             if wp.static(taped):
-                mark = int(tk)
+                mark = int(tops[2])
             if any_less(zero - holding, S(0.0)):
                 for lane in range(wp.static(L)):
                     if holding[lane] > S(0.0) and on[lane] > S(0.0):
@@ -247,8 +220,8 @@ def forward_kernel(
                         )  # fmt: skip
                         if wp.static(taped):
                             released = wp.where(goes_on, 0, 1)
-                            record_grip(tk, w, lane, tick, knot, released, grips, tape)
-                            tk += wp.static(GRIP_WORDS)
+                            record_grip(tops[2], w, lane, tick, knot, released, grips, tape)
+                            tops[2] += wp.static(GRIP_WORDS)
                         if not goes_on:
                             let_go(w, lane, p0, bl, q, bodies, grips)
                             holding[lane] = S(0.0)
@@ -280,113 +253,23 @@ def forward_kernel(
                             over[lane] = wp.max(over[lane], S(left))
                             watch.overflow[g] = over
             if wp.static(taped):
-                tape.k[tk] = (tk - mark) // wp.static(GRIP_WORDS)
-                tk += 1
+                tape.k[tops[2]] = (tops[2] - mark) // wp.static(GRIP_WORDS)
+                tops[2] += 1
                 listed = int(0)
                 if wp.static(with_sheets):
                     for lane in range(wp.static(L)):
                         listed += cells.count[w0 + lane]
                         if wp.static(with_edges):
                             listed += cells.edge_count[w0 + lane]
-                if not has_room(g, tx, tv, tk, ts, s1 - s0, n, near_count, listed, tape):
+                if not has_room(g, tops, s1 - s0, n, near_count, listed, tape):
                     tape.full[g] = 1
                     break
-                mark = int(tk)
             # constraints
-            # always in the same order: sweeping backwards in every other substep makes tight heaps
-            # crawl for ever, and shells jitter
-            for s in range(s0, s1):
-                if wp.static(taped):
-                    if springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                        record_bend(s, p0, tx, inverse_dt2, q, springs, tape)
-                        tx += 1
-                    else:
-                        acted = record_distance(s, p0, tx, inverse_dt2, q, springs, tape)
-                        if acted:
-                            tx += 1
-                            if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
-                                tape.k[tk] = s
-                                tk += 1
-                elif springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                    project_bend(s, p0, inverse_dt2, q, springs)
-                else:
-                    project_distance(s, p0, inverse_dt2, q, springs)
-            if wp.static(taped):
-                tape.k[tk] = tk - mark
-                tk += 1
-            if wp.static(with_sheets):
-                if any_less(zero - holding, S(0.0)):
-                    held = q.x[p0]
-                    for lane in range(wp.static(L)):
-                        i = grips.particle[w0 + lane]
-                        if i >= 0:
-                            x = q.x[p0 + i]
-                            held.x[lane] = x.x[lane]
-                            held.y[lane] = x.y[lane]
-                            held.z[lane] = x.z[lane]
-                    if wp.static(taped):
-                        mark = int(tk)
-                    for i in range(n):
-                        if wp.static(taped):
-                            if record_tether(p0 + i, tx, holding, held, q, tape):
-                                tape.k[tk] = p0 + i
-                                tx += 1
-                                tk += 1
-                        else:
-                            project_tether(p0 + i, holding, held, q)
-                    if wp.static(taped):
-                        tape.k[tk] = tk - mark
-                        tk += 1
-                        for lane in range(wp.static(L)):
-                            tape.k[tk] = grips.particle[w0 + lane]
-                            tk += 1
-            if wp.static(taped):
-                mark = int(tk)
-            for c in range(near_start, near_start + near_count):
-                if wp.static(taped):
-                    if record_contact(
-                        c, p0, tx, tv, contact_mu, push, q, pairs, near, tape
-                    ):  # fmt: skip
-                        tape.k[tk] = near.pair[c]
-                        tx += 2
-                        tv += 1
-                        tk += 1
-                else:
-                    project_contact(c, p0, contact_mu, push, q, pairs, near)
-            if wp.static(taped):
-                tape.k[tk] = tk - mark
-                tk += 1
-            if wp.static(with_sheets):
-                if sheets.first[k + 1] > sheets.first[k]:
-                    for lane in range(wp.static(L)):
-                        if on[lane] > S(0.0):
-                            if wp.static(taped):
-                                found = record_triangles(
-                                    g, lane, p0, grips.particle[w0 + lane], tk, ts,
-                                    contact_mu[lane], push, sheets, cells, tape,
-                                )  # fmt: skip
-                                cells.met[w0 + lane] = found % 2
-                                found = found // 2
-                                tk += wp.static(TRIANGLE_WORDS) * found
-                                ts += wp.static(TRIANGLE_SCALARS) * found
-                                tape.k[tk] = found
-                                tk += 1
-                                if wp.static(with_edges):
-                                    found = record_edges(
-                                        g, lane, p0, tk, ts, push, sheets, cells, tape
-                                    )  # fmt: skip
-                                    tk += wp.static(TRIANGLE_WORDS) * found
-                                    ts += wp.static(TRIANGLE_SCALARS) * found
-                                    tape.k[tk] = found
-                                    tk += 1
-                            else:
-                                hit = project_triangles(
-                                    g, lane, p0, grips.particle[w0 + lane], contact_mu[lane],
-                                    push, sheets, cells,
-                                )  # fmt: skip
-                                cells.met[w0 + lane] = wp.where(hit, 1, 0)
-                                if wp.static(with_edges):
-                                    project_edges(g, lane, p0, push, sheets, cells)
+            tops = solve_particles(
+                g, n, p0, s0, s1, near_start, near_count, sheets.first[k + 1] - sheets.first[k],
+                inverse_dt2, contact_mu, push, holding, on, tops, q, springs, pairs, near, grips,
+                sheets, cells, tape,
+            )  # fmt: skip
             if wp.static(with_bodies):
                 for lane in range(wp.static(L)):
                     if on[lane] > S(0.0):
@@ -405,13 +288,23 @@ def forward_kernel(
                 ended2 = zero
                 if wp.static(taped):
                     ended2 = record_finish(
-                        p0 + i, tx, tv, radius, inverse_dt, table_mu, fastest, all_on, on, q, tape
+                        p0 + i,
+                        tops[0],
+                        tops[1],
+                        radius,
+                        inverse_dt,
+                        table_mu,
+                        fastest,
+                        all_on,
+                        on,
+                        q,
+                        tape,
                     )
                     if wp.static(with_sheets):
-                        tx += 3
+                        tops[0] += 3
                     else:
-                        tx += 1
-                        tv += 1
+                        tops[0] += 1
+                        tops[1] += 1
                 else:
                     ended2 = finish(
                         p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q
@@ -433,8 +326,8 @@ def forward_kernel(
                     for s in range(s0, s1):
                         if springs.limit[s] > S(0.0):
                             if wp.static(taped):
-                                record_spring(s, p0, tx, st.viscous, on, q, springs, tape)
-                                tx += 1
+                                record_spring(s, p0, tops[0], st.viscous, on, q, springs, tape)
+                                tops[0] += 1
                             else:
                                 damp_spring(s, p0, st.viscous, on, q, springs)
                 free_time = (free_time + V(dt)) * (one - holding)
@@ -447,11 +340,11 @@ def forward_kernel(
                             moved2[lane] = wp.max(moved2[lane], m)
                             unrest2[lane] = wp.max(unrest2[lane], m)
             if wp.static(taped):
-                tape.v[tv] = on
-                tape.v[tv + 1] = fastest
-                tape.v[tv + 2] = holding
-                tape.v[tv + 3] = sleep
-                tv += 4
+                tape.v[tops[1]] = on
+                tape.v[tops[1] + 1] = fastest
+                tape.v[tops[1] + 2] = holding
+                tape.v[tops[1] + 3] = sleep
+                tops[1] += 4
             moved = root(moved2)
             travel = travel + moved
             # the next substep may move by half as much again before its contacts are solved
@@ -473,18 +366,10 @@ def forward_kernel(
         watch.clamped[g] = clamped
         ends = bool(True)
         if wp.static(taped):
-            at = g * wp.static(STATE)
-            tape.state[at] = on
-            tape.state[at + 1] = steps
-            tape.state[at + 2] = quiet
-            tape.state[at + 3] = holding
-            tape.state[at + 4] = calm
-            tape.state[at + 5] = stale
-            tape.state[at + 6] = fresh
-            tape.state[at + 7] = travel
-            tape.state[at + 8] = clamped
-            tape.state[at + 9] = free_time
-            tape.state[at + 10] = least
+            save_state(
+                g, on, steps, quiet, holding, calm, stale, fresh, travel, clamped, free_time, least,
+                tape,
+            )  # fmt: skip
             at = g * wp.static(COUNTERS)
             tape.counters[at] = substep
             tape.counters[at + 1] = near_count
@@ -492,18 +377,18 @@ def forward_kernel(
             tape.steps[g] = tape.steps[g] + substep
             tape.until[g] = substep
             ends = tape.last > 0
-            mark = int(tk)
+            mark = int(tops[2])
         # a world cut off while it held something lets go: nothing is held between launches
         for lane in range(wp.static(L)):
             if ends and holding[lane] > S(0.0):
                 if wp.static(taped):
-                    tape.k[tk] = lane
-                    tape.k[tk + 1] = grips.particle[w0 + lane]
-                    tk += 2
+                    tape.k[tops[2]] = lane
+                    tape.k[tops[2] + 1] = grips.particle[w0 + lane]
+                    tops[2] += 2
                 let_go(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
         if wp.static(taped):
-            tape.k[tk] = (tk - mark) // 2
-            tk += 1
-            tape.top[g] = wp.vec4i(tx, tv, tk, ts)
+            tape.k[tops[2]] = (tops[2] - mark) // 2
+            tops[2] += 1
+            tape.top[g] = tops
 
     return forward

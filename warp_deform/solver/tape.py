@@ -62,9 +62,11 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
 
     `has_room(...)`: whether a substep with so many springs, particles, near pairs and listed
     pairs of triangles and edges fits on the tape, and the grips of the next substep with it.
+
+    `load_state(g, tape)`, `save_state(g, ..., tape)`: the kernel's own state between launches.
     """
     t = structures(scalar, lanes)
-    L, V3, Tape = t.L, t.V3, t.Tape
+    L, V, V3, Tape = t.L, t.V, t.V3, t.Tape
     far = "const char* p = (const char*)(x.data + (begin > 0 ? begin : 0));"
     lines = "for (int i = 0; i < bytes; i += 64) __builtin_prefetch(p + i, 0, 2);"
 
@@ -73,17 +75,45 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def has_room(
-        g: int, tx: int, tv: int, tk: int, ts: int, springs: int, particles: int, near: int,
-        listed: int, tape: Tape,
-    ):  # fmt: skip
+        g: int, tops: wp.vec4i, springs: int, particles: int, near: int, listed: int, tape: Tape
+    ):
         end = tape.end[g]
         words = springs + particles + near + wp.static(TRIANGLE_WORDS) * listed
         words += wp.static(2 * L * (GRIP_WORDS + 4) + 8)
         return (
-            tx + 2 * springs + 4 * particles + 2 * near <= end[0]
-            and tv + near + particles + 8 <= end[1]
-            and tk + words <= end[2]
-            and ts + wp.static(TRIANGLE_SCALARS) * listed <= end[3]
+            tops[0] + 2 * springs + 4 * particles + 2 * near <= end[0]
+            and tops[1] + near + particles + 8 <= end[1]
+            and tops[2] + words <= end[2]
+            and tops[3] + wp.static(TRIANGLE_SCALARS) * listed <= end[3]
         )
 
-    return SimpleNamespace(has_room=has_room, fetch_ahead=fetch_ahead)
+    @wp.func
+    def load_state(g: int, tape: Tape):
+        at = g * wp.static(STATE)
+        return (
+            tape.state[at], tape.state[at + 1], tape.state[at + 2], tape.state[at + 3],
+            tape.state[at + 4], tape.state[at + 5], tape.state[at + 6], tape.state[at + 7],
+            tape.state[at + 8], tape.state[at + 9], tape.state[at + 10],
+        )  # fmt: skip
+
+    @wp.func
+    def save_state(
+        g: int, on: V, steps: V, quiet: V, holding: V, calm: V, stale: V, fresh: V, travel: V,
+        clamped: V, free_time: V, least: V, tape: Tape,
+    ):  # fmt: skip
+        at = g * wp.static(STATE)
+        tape.state[at] = on
+        tape.state[at + 1] = steps
+        tape.state[at + 2] = quiet
+        tape.state[at + 3] = holding
+        tape.state[at + 4] = calm
+        tape.state[at + 5] = stale
+        tape.state[at + 6] = fresh
+        tape.state[at + 7] = travel
+        tape.state[at + 8] = clamped
+        tape.state[at + 9] = free_time
+        tape.state[at + 10] = least
+
+    return SimpleNamespace(
+        has_room=has_room, fetch_ahead=fetch_ahead, load_state=load_state, save_state=save_state
+    )
