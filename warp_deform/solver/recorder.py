@@ -11,6 +11,7 @@ import warp as wp
 
 from ..errors import InputError
 from .adjoint import adjoint_kernel
+from .checkpoint import Checkpoints
 from .data import KERNEL_ARGUMENTS
 from .forward import forward_kernel
 from .mirrored import Mirrored
@@ -22,17 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Recorder"]
 
-_STATE = (
-    "particles.x", "particles.v", "particles.xp", "particles.xr", "particles.w", "near.pair",
-    "near.mask", "grips.particle", "grips.body", "grips.tick", "grips.knot", "grips.shift",
-    "bodies.x", "bodies.q", "bodies.v", "bodies.omega", "bodies.xp", "bodies.qp", "bodies.w",
-    "bodies.touching", "bodies.support", "watch.steps", "watch.nonfinite", "watch.stretch",
-    "watch.depth", "watch.clamped", "watch.overflow",
-)  # fmt: skip
-"""What a launch changes and a later one needs; the lists of fabrics are trimmed to their length."""
-_SHEET_STATE = ("cells.count", "cells.met", "cells.xr", "cells.slack", "cells.place")
-_LISTS = {"cells.count": ("cells.particle", "cells.face", "cells.gap"),
-          "cells.edge_count": ("cells.edge_a", "cells.edge_b", "cells.edge_gap")}  # fmt: skip
 _MOST = 2**31 - 1  # elements of one stack: whole numbers of 32 bits count them
 _ORDER = KERNEL_ARGUMENTS
 _SWEPT = ("topology", "springs", "pairs", "group", "particles", "grips", "sheets")
@@ -86,6 +76,8 @@ class Recorder:
             raise InputError(f"storage must be replay or full, not {storage!r}")
         self.solver, self.storage, self.memory, self.sleep = solver, storage, memory, sleep
         data = solver.data
+        if data.has_bodies:
+            raise InputError("rollouts with rigid bodies cannot be differentiated")
         variant = (
             data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets, data.has_edges
         )  # fmt: skip
@@ -97,12 +89,7 @@ class Recorder:
             "state": self._mirrored(data.group_count * STATE, data.types.V, (data.lanes,)),
             "counters": Mirrored(data.group_count * COUNTERS, wp.int32, data.device, np.int32, ()),
         }
-        self._held = [name for name in _STATE if name in data.arrays]
-        if data.has_sheets:
-            self._held += [
-                *_SHEET_STATE,
-                *(["cells.edge_count", "cells.edge_ball"] if data.has_edges else []),
-            ]
+        self._checkpoints = Checkpoints(data, self._control)
         self._adjoint = self._new_adjoint()
         self._tape: _Tape | None = None
         self._spent: list[_Tape] = []
@@ -175,49 +162,6 @@ class Recorder:
             rows.append((2 * springs + 4 * particles, particles + 8, words, 0))
         return np.array(rows)
 
-    # -- checkpoints
-
-    def _checkpoint(self) -> dict[str, Any]:
-        """A copy of everything that the next substep depends on."""
-        data = self.solver.data
-        saved: dict[str, Any] = {}
-        for name in self._held:
-            data.arrays[name].to_host()
-            saved[name] = data.arrays[name].view.copy()
-        for name, mirrored in self._control.items():
-            mirrored.to_host()
-            saved[name] = mirrored.view.copy()
-        for count, lists in _LISTS.items():
-            if count in saved:
-                rows = self._rows(saved[count])
-                for name in lists:
-                    data.arrays[name].to_host()
-                    saved[name] = data.arrays[name].view[rows]
-        return saved
-
-    def _rows(self, counts: np.ndarray) -> np.ndarray:
-        """Rows of the lists of fabrics that hold something, of all worlds."""
-        data = self.solver.data
-        start = data.views["cells.list_start"][:, None]
-        first = (start + np.arange(data.lanes) * data.views["cells.capacity"][:, None]).ravel()
-        counts = counts[: len(first)]
-        return np.concatenate([np.arange(a, a + c) for a, c in zip(first, counts, strict=True)])
-
-    def _restore(self, saved: dict[str, Any]) -> None:
-        data = self.solver.data
-        for name in self._held:
-            data.arrays[name].view[...] = saved[name]
-            data.arrays[name].to_device()
-        for name, mirrored in self._control.items():
-            mirrored.view[...] = saved[name]
-            mirrored.to_device()
-        for count, lists in _LISTS.items():
-            if count in saved:
-                rows = self._rows(saved[count])
-                for name in lists:
-                    data.arrays[name].view[rows] = saved[name]
-                    data.arrays[name].to_device()
-
     # -- running
 
     def forward(self, marks: Sequence[int]) -> list[WatchValues]:
@@ -238,6 +182,8 @@ class Recorder:
         for mirrored in data.arrays.values():
             mirrored.to_device()
         self._structs = data.structs()[:-1]
+        if len(self._adjoint["time"].view) != max(data.knot_room, 1):
+            self._adjoint = self._new_adjoint()
         # tapes of the last rollout are used again: fresh memory is dear
         self._spent = [segment.tape for segment in self._segments]
         self._segments, self.states = [], {}
@@ -248,14 +194,14 @@ class Recorder:
             begin = self._record_segment(begin, min(mark, begin + self._length(last)), last)
             if begin == mark:
                 self.states[mark] = self._read()
-        self._final = self._checkpoint()
+        self._final = self._checkpoints.save()
         for mirrored in data.arrays.values():
             mirrored.to_host()
         return self.solver._values()
 
     def _record_segment(self, begin: int, end: int, last: int) -> int:
         """Tape substeps `begin` to `end`, or as many as have room; returns where it ends."""
-        checkpoint = self._checkpoint()
+        checkpoint = self._checkpoints.save()
         while True:
             tape = self._tape_for(end - begin)
             self._launch(tape, begin, end, end == last)
@@ -264,7 +210,7 @@ class Recorder:
                 break
             steps = int(tape.arrays["steps"].numpy()[full].min())
             self._spare = np.maximum(self._spare, self._worst())
-            self._restore(checkpoint)
+            self._checkpoints.restore(checkpoint)
             if steps == 0 and end == begin + 1:
                 self._spare = 2 * self._spare
             end = begin + max(steps, 1)
@@ -399,7 +345,7 @@ class Recorder:
             )  # fmt: skip
         for mirrored in adjoint.values():
             mirrored.to_host()
-        self._restore(self._final)
+        self._checkpoints.restore(self._final)
         out = {name: mirrored.view.copy() for name, mirrored in adjoint.items()}
         views, dt = data.views, self.solver.config.dt
         out["damping"] *= np.where(views["group.damping"] * dt < 1.0, -dt, 0.0)
@@ -412,7 +358,7 @@ class Recorder:
         segment, tape = self._segments[number], self._tape
         assert tape is not None
         if self._on_tape != number:
-            self._restore(segment.checkpoint)
+            self._checkpoints.restore(segment.checkpoint)
             last = number == len(self._segments) - 1
             self._launch(tape, segment.begin, segment.end, last)
             assert not tape.arrays["full"].numpy().any()
