@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Recorder"]
 
+_NEAR = 4 * 2**20  # bytes of a tape that is replayed, where memory allows
 _MOST = 2**31 - 1  # elements of one stack: whole numbers of 32 bits count them
 _ORDER = KERNEL_ARGUMENTS
 _SWEPT = ("topology", "springs", "pairs", "group", "particles", "grips", "sheets")
@@ -229,7 +230,12 @@ class Recorder:
         if not self._segments:
             return 16
         per_substep = float((self._use * self._sizes()).sum())
-        return max(64, round(np.sqrt(last * self._kept / len(self._segments) / per_substep)))
+        least = round(np.sqrt(last * self._kept / len(self._segments) / per_substep))
+        # every segment costs a launch and a checkpoint: a tape that the processor's cache holds is
+        # no dearer when it is long
+        return max(
+            8, min(max(least, round(_NEAR / per_substep)), round(self.memory / 4 / per_substep))
+        )
 
     def _tape_for(self, length: int) -> _Tape:
         """A tape with room for `length` substeps: the one in use where it suffices.
