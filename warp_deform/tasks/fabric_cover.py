@@ -14,7 +14,7 @@ from ..objects.cloth import Cloth, ClothConfig, add_cloth, cloth_sheet
 from ..rendering.pixels import PIXEL_SIZE
 from .cloth_physics import FABRIC, FABRIC_PRIMITIVE, FABRIC_SOLVER, FABRIC_SPEED
 from .demonstrators import pick_place
-from .fabric_pull import beyond, corners, on_table, takes
+from .fabric_pull import beyond, corners, first_taken, on_table
 from .free_space import FreeSpace
 from .ground_truth import pose_rows, quaternion_yaw
 from .metrics import wrap_angle
@@ -103,8 +103,7 @@ class FabricCover(Task):
         if len(snapshot.actions) == 0:
             return self._put(snapshot)
         folds = self._folds(snapshot, rng, self.overshoot)
-        taken = [v for v in folds if takes(v, self.fabric, snapshot, self.primitive)]
-        return next((folds[v] for v in [*taken, *folds]), None)
+        return first_taken(folds, self.fabric, snapshot, self.primitive)
 
     def candidates(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int

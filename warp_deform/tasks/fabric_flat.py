@@ -14,7 +14,7 @@ from ..objects.cloth import Cloth, ClothConfig, add_cloth, cloth_sheet
 from ..objects.zone import square_zone
 from .cloth_physics import FABRIC, FABRIC_PRIMITIVE, FABRIC_SOLVER, FABRIC_SPEED
 from .demonstrators import pick_place
-from .fabric_pull import beyond, corners, on_table, takes
+from .fabric_pull import beyond, corners, first_taken, on_table
 from .fabric_shape import fold_corner, square_corners, square_mask
 from .free_space import FreeSpace, NoFreeSpace
 from .ground_truth import pose_rows
@@ -127,8 +127,7 @@ class FabricFlat(Task):
     ) -> Action | None:
         """The first such pull whose corner the tip really takes, if there is one."""
         pulls = self._pulls(layout, snapshot)
-        taken = [v for v in pulls if takes(v, self.fabric, snapshot, self.primitive)]
-        return next((pulls[v] for v in [*taken, *pulls]), None)
+        return first_taken(pulls, self.fabric, snapshot, self.primitive)
 
     def candidates(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
