@@ -61,14 +61,15 @@ def forward_kernel(
     `with_sheets` False that of triangles, `with_edges` False that of their edges.
     """
     t = structures(scalar, lanes)
-    S, V, R3, L = t.S, t.V, t.R3, t.L
+    S, V, V3, R3, L = t.S, t.V, t.V3, t.R3, t.L
     predict, finish = (getattr(table_contact(scalar, lanes), n) for n in ("predict", "finish"))
     project_distance = distance(scalar, lanes, with_sheets).project_distance
     project_bend = bending(scalar, lanes).project_bend
     contact = sphere_contact(scalar, lanes)
     list_near, project_contact = contact.list_near, contact.project_contact
     cells_ = cell_list(scalar, lanes)
-    moved_since, list_triangles = cells_.moved_since, cells_.list_triangles
+    common_step, moved_since = cells_.common_step, cells_.moved_since
+    list_triangles = cells_.list_triangles
     project_triangles = triangle_contact(scalar, lanes).project_triangles
     edges_ = edge_contact(scalar, lanes)
     list_edges, project_edges = edges_.list_edges, edges_.project_edges
@@ -83,7 +84,7 @@ def forward_kernel(
     predict_body, finish_body = body.predict_body, body.finish_body
     list_table = box_table(scalar, lanes).list_table
     project_box_particle = box_particle(scalar, lanes).project_box_particle
-    project_box_triangle = box_triangle(scalar, lanes).project_box_triangle
+    project_box_triangles = box_triangle(scalar, lanes).project_box_triangles
     list_boxes = box_box(scalar, lanes).list_boxes
     bodies_ = body_contact(scalar, lanes)
     begin_body, solve_contacts, end_body = (
@@ -113,8 +114,10 @@ def forward_kernel(
             b = b0 + shapes.body[shape]
             far = wp.length(shapes.half[shape])
             center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
+            thickest = S(0.0)
             for i in range(top.particle_count[k]):
                 radius = top.radius[radii + i]
+                thickest = wp.max(thickest, radius)
                 x = q.x[p0 + i]
                 d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
                 if wp.dot(d, d) < (far + radius) * (far + radius):
@@ -122,10 +125,10 @@ def forward_kernel(
                         p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
                     )
             if wp.static(with_sheets):
-                for f in range(sheets.first[k], sheets.first[k + 1]):
-                    project_box_triangle(
-                        f, lane, p0, radii, shape, b, mu, push, top, shapes, bodies, sheets, cells
-                    )
+                project_box_triangles(
+                    lane, k, p0, radii, shape, b, far + thickest, mu, push, top, shapes, bodies,
+                    sheets, cells,
+                )  # fmt: skip
         for b in range(b0, b0 + count):
             begin_body(b, bodies)
         start = group.contact_start[g]
@@ -210,6 +213,7 @@ def forward_kernel(
         holding = zero
         calm = group.calm_steps[g]
         stale = on
+        drift = V3(zero, zero, zero)  # of the frame in which triangles are listed
         fresh = zero  # lanes whose triangles have been listed in this launch
         travel = zero
         clamped = zero
@@ -294,14 +298,16 @@ def forward_kernel(
                 travel = select(stale, zero, travel)
             if wp.static(with_sheets):
                 if sheets.first[k + 1] > sheets.first[k]:
-                    far = moved_since(p0, n, q, cells)
+                    common = common_step(p0, n, dt, q)
+                    drift = drift + common * on
+                    far = moved_since(p0, n, drift, q, cells)
                     for lane in range(wp.static(L)):
                         if on[lane] > S(0.0) and (fresh[lane] < S(0.5) or far[lane] > S(0.0)):
                             anew = fresh[lane] < S(0.5)
                             fresh[lane] = S(1.0)
                             left = list_triangles(
-                                g, lane, k, p0, st.margin, anew, top, sheets, cells
-                            )  # fmt: skip
+                                g, lane, k, p0, st.margin, anew, drift, common, top, sheets, cells
+                            )
                             if wp.static(with_edges):
                                 left += list_edges(
                                     g, lane, k, p0, anew, top, sheets, cells
@@ -400,6 +406,9 @@ def forward_kernel(
                 watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
             on = on * (one - done)
         watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
+        if wp.static(with_sheets):
+            for i in range(p0, p0 + n):
+                cells.xr[i] = cells.xr[i] + drift
         watch.steps[g] = steps
         watch.clamped[g] = clamped
         # a world cut off while it held something lets go: nothing is held between launches
