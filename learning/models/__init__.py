@@ -1,4 +1,4 @@
-"""Networks: fully convolutional Transporters in their goal variants, and the ground-truth baselines.
+"""Networks: Transporters and their goal-conditioned variants, and the ground-truth baselines.
 
 Every class has one import path, its own module: `transporter` (agents over images), `gt_state`
 (agents over state vectors), and below them `attention`, `transport`, `lift` and `resnet`.

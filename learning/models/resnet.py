@@ -9,8 +9,8 @@ What their code does, and this file keeps:
 - weights start Glorot-uniform, biases at zero;
 - maps grow by bilinear interpolation with half-pixel centres.
 
-One rewriting, which changes rounding only: a 1x1 convolution and bilinear interpolation commute (the
-weights of interpolation sum to 1), so the decoder convolves first and interpolates the fewer
+One rewriting, which changes rounding only: a 1x1 convolution and bilinear interpolation commute
+(the weights of interpolation sum to 1), so the decoder convolves first and interpolates the fewer
 channels of the smaller result.
 """
 
@@ -19,8 +19,8 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn import functional
 
 from warp_deform.errors import InputError
 
@@ -35,8 +35,8 @@ _HEAD_CHANNELS = 16
 class ResNet43(nn.Module):
     """Image (B, C, H, W) -> map (B, out, H, W) float32 of the same height and width.
 
-    57 convolutions; 9,833,203 parameters for 6 channels -> 1 at width 1. `width` scales the 64, 128,
-    256 and 512 channels of the stages, 8 at least; the last stage keeps its 16.
+    57 convolutions; 9,833,203 parameters for 6 channels -> 1 at width 1. `width` scales the 64,
+    128, 256 and 512 channels of the stages, 8 at least; the last stage keeps its 16.
 
     Args:
         in_channels: channels of the image
@@ -94,7 +94,7 @@ class ResNet43(nn.Module):
         # On CPUs convolutions and interpolation of few channels run up to 4 times faster so.
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.bfloat16):
-            x = F.relu(self.stem(x), inplace=True)
+            x = functional.relu(self.stem(x), inplace=True)
             for stage in self.stages:
                 x = stage(x)
         return x.float()
@@ -126,8 +126,8 @@ class _Stage(nn.Module):
         self.identity = _Block(out_channels, middle, out_channels, activate=activate)
 
     def forward(self, x: Tensor) -> Tensor:
-        x = self.identity(self.project(x))
-        return x
+        y: Tensor = self.identity(self.project(x))
+        return y
 
 
 class _Block(nn.Module):
@@ -148,34 +148,40 @@ class _Block(nn.Module):
         activate: bool,
     ) -> None:
         super().__init__()
-        self.reduce = _convolution(in_channels, middle, 1, stride=stride)
+        self.reduce = _convolution(in_channels, middle, 1)
         self.spatial = _convolution(middle, middle, 3)
         self.expand = _convolution(middle, out_channels, 1)
-        self.shortcut = _convolution(in_channels, out_channels, 1, stride=stride) if shortcut else None
+        self.shortcut = _convolution(in_channels, out_channels, 1) if shortcut else None
+        self.stride = stride
         self.upsample = upsample
         self.activate = activate
 
     def forward(self, x: Tensor) -> Tensor:
+        if self.stride > 1:
+            # In place of convolutions with a stride: for fewer than 16 channels stored last, their
+            # weight gradient writes out of bounds (uxlfoundation/oneDNN issue 6035, torch 2.13).
+            x = x[:, :, :: self.stride, :: self.stride]
+            x = x.contiguous(memory_format=torch.channels_last)
         y = self.reduce(x)
         if self.shortcut is not None:
             x = self.shortcut(x)
         if self.upsample:
             x, y = _twice(x), _twice(y)
-        y = F.relu(self.spatial(F.relu(y, inplace=True)), inplace=True)
+        y = functional.relu(self.spatial(functional.relu(y, inplace=True)), inplace=True)
         y = self.expand(y) + x
-        return F.relu(y, inplace=True) if self.activate else y
+        return functional.relu(y, inplace=True) if self.activate else y
 
 
-def _convolution(in_channels: int, out_channels: int, size: int, *, stride: int = 1) -> nn.Conv2d:
+def _convolution(in_channels: int, out_channels: int, size: int) -> nn.Conv2d:
     """A convolution whose weights are still unset, so that no global generator draws them."""
     convolution: nn.Conv2d = nn.utils.skip_init(
-        nn.Conv2d, in_channels, out_channels, size, stride=stride, padding=size // 2
+        nn.Conv2d, in_channels, out_channels, size, padding=size // 2
     )
     return convolution
 
 
 def _twice(x: Tensor) -> Tensor:
-    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+    return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 
 def receptive_span(start: int, stop: int) -> tuple[int, int]:
@@ -184,7 +190,7 @@ def receptive_span(start: int, stop: int) -> tuple[int, int]:
     The result may reach outside of the image, where the network sees its own zero padding.
 
     >>> receptive_span(160, 161)
-    (93, 230)
+    (89, 224)
     """
     first, last = start, stop - 1
     for _ in range(3):  # the three stages after an interpolation: two 3x3 convolutions, then twice
