@@ -55,6 +55,23 @@ class PandaKinematics:
         """Return base_T_tcp (4, 4) [m] of joint positions [rad] (7,)."""
         return self._chain(q)[0]
 
+    def poses(self, q: np.ndarray) -> np.ndarray:
+        """Return base_T_tcp (N, 4, 4) [m] of many joint positions [rad] (N, 7) at once."""
+        q = np.asarray(q, dtype=np.float64)
+        cosines, sines = np.cos(q), np.sin(q)
+        T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+        for i, (a, d, alpha) in enumerate(zip(DH_A, DH_D, DH_ALPHA, strict=True)):
+            ca, sa, ct, st = np.cos(alpha), np.sin(alpha), cosines[:, i], sines[:, i]
+            link = np.zeros((len(q), 4, 4))
+            link[:, 0, 0], link[:, 0, 1], link[:, 0, 3] = ct, -st, a
+            link[:, 1, 0], link[:, 1, 1], link[:, 1, 2], link[:, 1, 3] = st * ca, ct * ca, -sa, -d * sa
+            link[:, 2, 0], link[:, 2, 1], link[:, 2, 2], link[:, 2, 3] = st * sa, ct * sa, ca, d * ca
+            link[:, 3, 3] = 1.0
+            T = T @ link
+        flange = np.eye(4)
+        flange[2, 3] = FLANGE
+        return T @ (flange @ flange_T_tcp())
+
     def jacobian(self, q: np.ndarray) -> np.ndarray:
         """Return the TCP's Jacobian in the base frame, shape (6, 7) [m, rad]."""
         base_T_tcp, axes, origins = self._chain(q)
