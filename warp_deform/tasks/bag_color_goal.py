@@ -23,6 +23,9 @@ from .task import Action, Layout, Snapshot, Stage
 if TYPE_CHECKING:
     import newton
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 __all__ = ["BagColorGoal"]
 
 COLORS: tuple[Color, ...] = (PURPLE, BLUE, YELLOW, RED, GREEN, CYAN)
@@ -212,6 +215,14 @@ class BagColorGoal(BagTask):
         """The score, then how far the target bag is open."""
         opened = self.opening(snapshot) - 0.5 * self.map_distance(layout, snapshot)
         return 2.0 * self.score(layout, snapshot) + opened
+
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """Distance [m] of the block from the target bag's opening, and how far that is not open."""
+        centre = particle_q[list(self.bag_of(snapshot).ring), :2].mean(0)
+        away = ((body_q[0, :2] - centre).square().sum() + 1e-8).sqrt()
+        return self.opening_loss(layout, snapshot, particle_q) + away
 
     def privileged_stage(self, segment: int, snapshot: Snapshot, previous: Stage | None) -> Stage:
         """A pick on the block is to insert it, any other to open the bag."""

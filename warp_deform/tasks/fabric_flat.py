@@ -23,6 +23,10 @@ from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:
     import newton
+from .losses import grid_maps, mean_distance
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 __all__ = ["FabricFlat", "FabricFlatNotarget"]
 
@@ -146,6 +150,14 @@ class FabricFlat(Task):
         """Coverage, less the corners' mean distance from their places [m]."""
         mean = self._distances(layout, snapshot).mean(axis=1).min()
         return self.score(layout, snapshot) - float(mean)
+
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """Mean distance [m] of the vertices from a fabric that lies flat on the square."""
+        flat = cloth_sheet(self.fabric, tuple(layout.targets[0, :2]), yaw=layout.targets[0, 2])
+        maps = grid_maps(self.fabric.rows, self.fabric.columns)
+        return mean_distance(particle_q[:, :2], flat[:, :2], maps)
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(303,): x, y, -yaw / 15 of the square, then x, y, z of every vertex."""
