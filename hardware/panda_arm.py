@@ -63,9 +63,13 @@ class PandaKinematics:
         for i, (a, d, alpha) in enumerate(zip(DH_A, DH_D, DH_ALPHA, strict=True)):
             ca, sa, ct, st = np.cos(alpha), np.sin(alpha), cosines[:, i], sines[:, i]
             link = np.zeros((len(q), 4, 4))
-            link[:, 0, 0], link[:, 0, 1], link[:, 0, 3] = ct, -st, a
-            link[:, 1, 0], link[:, 1, 1], link[:, 1, 2], link[:, 1, 3] = st * ca, ct * ca, -sa, -d * sa
-            link[:, 2, 0], link[:, 2, 1], link[:, 2, 2], link[:, 2, 3] = st * sa, ct * sa, ca, d * ca
+            for row, (cosine, sine, shift) in enumerate(
+                [(1.0, 0.0, a), (ca, -sa, -d * sa), (sa, ca, d * ca)]
+            ):
+                link[:, row, 0] = (ct if row == 0 else st) * cosine
+                link[:, row, 1] = (-st if row == 0 else ct) * cosine
+                link[:, row, 2] = sine
+                link[:, row, 3] = shift
             link[:, 3, 3] = 1.0
             T = T @ link
         flange = np.eye(4)
