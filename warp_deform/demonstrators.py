@@ -2,7 +2,8 @@
 
 `scripted` is the task's own; `visible` picks only what the tip would really meet; `mpc` (model
 predictive control, over a horizon of one action) simulates the task's candidates, each from a copy
-of the present state, and takes the most promising. All three see the simulator's state.
+of the present state, and takes the most promising; `planner` searches two actions ahead. All see
+the simulator's state.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from .spaces import action_space
 from .tasks.task import Action
 from .worlds import Worlds
 
-__all__ = ["DEMONSTRATORS", "demonstrator"]
+__all__ = ["DEMONSTRATORS", "demonstrator", "planner"]
 
 CANDIDATES = 8
 """Candidates an episode and action: one group of SIMD lanes."""
@@ -83,13 +84,18 @@ def _candidates(worlds: Worlds, slot: int, run: Run[Any]) -> list[Action]:
     return [action for action in different.values() if action_space().contains(action)][:CANDIDATES]
 
 
-def _planner(worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, Action | None]:
-    """What a search two actions ahead finds, in every slot."""
-    chosen: dict[int, Action | None] = {}
-    for slot, run in runs.items():
-        found = search(_lookahead(worlds), worlds.task, worlds.state(slot), run.rng, SearchConfig())
-        chosen[slot] = found[0].action if found else None
-    return chosen
+def planner(config: SearchConfig) -> Act[Any]:
+    """Who takes, in every slot, the best action of a search."""
+
+    def act(worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, Action | None]:
+        chosen: dict[int, Action | None] = {}
+        for slot, run in runs.items():
+            state = worlds.state(slot)
+            found = search(_lookahead(worlds), worlds.task, state, run.rng, config)
+            chosen[slot] = found[0].action if found else None
+        return chosen
+
+    return act
 
 
 def _lookahead(worlds: Worlds) -> Lookahead:
@@ -101,6 +107,6 @@ DEMONSTRATORS: dict[str, Act[Any]] = {
     "scripted": _scripted,
     "visible": _visible,
     "mpc": _mpc,
-    "planner": _planner,
+    "planner": planner(SearchConfig()),
 }
 """The demonstrators by name."""
