@@ -1,7 +1,42 @@
-"""The cable task on a Franka arm: what will calibrate, collect, run and score stands here.
+"""The cable task on a Franka arm: robots behind one protocol, and an emulated one to rehearse on.
 
-Nothing public yet. The package depends on `warp_deform` and never the other way round; importing it
-loads no vendor's library and opens no device.
+The backends stand in `hardware.backends`, the emulator in `hardware.emulator`. The package depends
+on `warp_deform` and never the other way round; importing it loads no vendor's library and opens no
+device.
 """
 
-__all__: list[str] = []
+from .robot import (
+    BackendMissing,
+    ConnectionFailed,
+    ConnectionLost,
+    GraspError,
+    IncompatibleVersion,
+    MotionError,
+    MoveResult,
+    ReflexError,
+    Robot,
+    RobotError,
+    RobotMode,
+    RobotState,
+    SafetyViolation,
+    UnreachablePose,
+    UserStopped,
+)
+
+__all__ = [
+    "BackendMissing",
+    "ConnectionFailed",
+    "ConnectionLost",
+    "GraspError",
+    "IncompatibleVersion",
+    "MotionError",
+    "MoveResult",
+    "ReflexError",
+    "Robot",
+    "RobotError",
+    "RobotMode",
+    "RobotState",
+    "SafetyViolation",
+    "UnreachablePose",
+    "UserStopped",
+]

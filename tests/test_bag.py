@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -275,6 +276,22 @@ def test_a_box_is_lowered_into_a_bag_and_carried_in_it(box):
         assert max(pokes) < 3e-3
         for a in x[::60]:
             assert np.percentile(edge_ratios(a, SHELL.vertices, bag.faces), 99) < 1.15
+
+
+def test_a_bead_lowered_onto_the_heap_pierces_less_than_one_pressed_to_the_table():
+    solver, (bag,) = bag_solver(8, lanes=8)
+    start = {w: solver.particle_q(w)[bag.ring[4 * w]] for w in range(8)}
+    paths = {w: carry(start[w], bag.ring[4 * w], (0.2, 0.1 - 0.03 * w)) for w in range(8)}
+    counts = {}
+    for meets in (True, False):
+        solver.data.reset()
+        if not meets:
+            paths = {w: replace(path, lower=None) for w, path in paths.items()}
+        results = rollout(solver, range(8), paths=paths, least=0.2, most=9.0)
+        assert all(r.at_rest for r in results.values())
+        counts[meets] = [pierced(solver.particle_q(w), bag.faces) for w in range(8)]
+    assert np.mean(counts[True]) < 0.02 * len(edges_of(bag.faces))
+    assert 3 * np.mean(counts[True]) < np.mean(counts[False])
 
 
 def test_a_box_pushed_against_a_bag_from_outside_stays_outside():

@@ -247,6 +247,39 @@ def test_color_goal_inserts_the_block_and_opens_else() -> None:
             assert task.privileged_stage(ids.start, state, previous) is OPEN
 
 
+def color_goal_with_opening(width: float, actions: int) -> tuple[BagColorGoal, Layout, Snapshot]:
+    """The target bag with its opening squeezed to a share `width`, after pulls."""
+    task, layout = start(BagColorGoal, 3)
+    x, y = layout.targets[0, :2]
+    points, bag = layout.particle_q.copy(), task.upright(x, y)
+    bag[:, 0] = x + width * (bag[:, 0] - x)
+    points[: len(bag)] = bag
+    return task, layout, snapshot(task, layout, points, lifts=(OPEN.lift,) * actions)
+
+
+@pytest.mark.parametrize(("name", "patience"), [("demonstrate", 6), ("demonstrate_visible", 3)])
+def test_a_demonstrator_waits_for_room_and_then_takes_what_there_is(name, patience) -> None:
+    def insertions(width: float) -> list[bool]:
+        stages = []
+        for actions in range(BagColorGoal.max_actions):
+            task, layout, state = color_goal_with_opening(width, actions)
+            action = getattr(task, name)(layout, state, np.random.default_rng(0))
+            stages.append(task.stage_of(float(action[6])) is INSERT)
+        return stages
+
+    assert all(insertions(1.0))
+    assert insertions(0.6) == [False] * patience + [True] * (8 - patience)
+    assert not any(insertions(0.2))  # the block does not fit
+
+
+def test_the_block_is_put_where_the_opening_has_most_room() -> None:
+    task, layout, state = color_goal_with_opening(0.6, 7)
+    action = task.demonstrate(layout, state, np.random.default_rng(0))
+    assert np.linalg.norm(action[3:5] - layout.targets[0, :2]) < 0.03
+    offered = task.candidates(layout, state, np.random.default_rng(0), 8)
+    assert [task.stage_of(float(a[6])) for a in offered] == [INSERT] * 4 + [OPEN] * 4
+
+
 # -- simulated
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -17,9 +16,9 @@ from warp_deform.collect import CollectConfig, collect
 from warp_deform.demonstrators import CANDIDATES, DEMONSTRATORS, demonstrator
 from warp_deform.episode_loop import SOLVED, Run, play
 from warp_deform.episodes import EpisodeReader
-from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.errors import InputError
+from warp_deform.planning import Outlook
 from warp_deform.replay import verify
-from warp_deform.robots.primitive import Outcome
 from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.tasks.demonstrators import met_particle
 from warp_deform.tasks.registry import TASKS
@@ -97,9 +96,9 @@ def test_states_that_do_not_fit_are_refused() -> None:
 # -- names
 
 
-@pytest.mark.parametrize("bad", ["", "oracle", "planner"])
+@pytest.mark.parametrize("bad", ["", "oracle", "Planner"])
 def test_an_unknown_demonstrator_is_named_with_the_choices(bad: str) -> None:
-    assert list(DEMONSTRATORS) == ["scripted", "visible", "mpc"]
+    assert list(DEMONSTRATORS) == ["scripted", "visible", "mpc", "planner"]
     with pytest.raises(InputError, match=f"no demonstrator '{bad}'; there are: scripted, visible"):
         demonstrator(bad)
 
@@ -181,7 +180,12 @@ def test_mpc_takes_the_best_outcome_and_the_first_of_equals(
     monkeypatch.setattr(side.task, "candidates", lambda *_: proposed, raising=False)
 
     def choose(ranks: list[tuple[int, float]]) -> int:
-        monkeypatch.setattr(demonstrating, "_outcomes", lambda worlds, jobs: ranks)
+        class Told:
+            def try_each(self, jobs: list[Any]) -> list[Outlook]:
+                pairs = zip(jobs, ranks, strict=True)
+                return [Outlook(action, *rank, 0.0, None) for (_, action), rank in pairs]
+
+        monkeypatch.setattr(demonstrating, "_lookahead", lambda worlds: Told())
         action = demonstrator("mpc")(side, runs)[0]
         return next(i for i, one in enumerate(proposed) if np.array_equal(one, action))
 
@@ -190,20 +194,6 @@ def test_mpc_takes_the_best_outcome_and_the_first_of_equals(
     assert choose([(1, 9.0), (2, 0.1), (2, 0.3), (2, 0.3), *[worst] * 4]) == 2
     assert choose([(2, 9.0), (3, 0.1), *[worst] * 6]) == 1
     assert choose([worst] * 8) == 0
-
-
-def test_outcomes_rank_solved_placed_idle_untrusted(monkeypatch: pytest.MonkeyPatch) -> None:
-    side = worlds(LINE, 2)
-    side.reset({0: 1})
-    rank: Callable[[Outcome], tuple[int, float]] = lambda what: demonstrating._rank(side, 0, what)  # noqa: E731
-    placed, invalid = rank(Outcome.PLACED), rank(Outcome.INVALID)
-    idle = [rank(Outcome.MISSED), rank(Outcome.UNREACHABLE)]
-    monkeypatch.setattr(side, "solved", lambda slot: True)
-    assert rank(Outcome.PLACED) > placed > max(idle) and min(idle) > invalid
-    monkeypatch.setattr(side.task, "promise", lambda *_: float("nan"), raising=False)
-    assert rank(Outcome.INVALID) == invalid
-    with pytest.raises(WarpDeformError, match="promise of a state is nan"):
-        rank(Outcome.PLACED)
 
 
 def test_candidates_are_different_allowed_and_at_most_eight(
@@ -241,8 +231,8 @@ def test_environments_demonstrate_by_name() -> None:
     scripted = env.demonstrate()
     env.reset(seed=4)
     assert np.array_equal(env.demonstrate("scripted"), scripted)
-    with pytest.raises(InputError, match="no demonstrator 'planner'"):
-        env.demonstrate("planner")
+    with pytest.raises(InputError, match="no demonstrator 'oracle'"):
+        env.demonstrate("oracle")
     env.reset(seed=4)
     terminated = False
     while not terminated:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import newton
 import numpy as np
 import pytest
@@ -134,6 +136,16 @@ def test_what_would_be_pressed_into_the_table_is_lowered_no_further_than_the_lif
     _, path = carry_to(0.0, floor=0.06)
     assert path.positions[-1, 2] == 0.04
     assert path.lower is not None and path.lower[0] == path.lower[1]
+
+
+def test_a_vertex_of_a_fabric_ends_its_descent_on_what_it_meets_only_where_it_is_to() -> None:
+    action = np.array([0.5, 0.0, 0.0, 0.5, 0.2, 0.0, 0.04])
+    grasp = replace(HELD, sheet=True)
+    for meets in (False, True):
+        config = PrimitiveConfig(sheet_meets=meets, sheet_release=0.006)
+        _, path = carry(action, grasp, STAGE, 0.004, 0.30, config)
+        assert (path.lower is not None) is meets
+        assert path.positions[-1, 2] == pytest.approx(0.01)
 
 
 def test_the_arm_goes_on_from_where_it_is_unless_its_wrist_is_wound_up() -> None:

@@ -36,7 +36,7 @@ __all__ = [
 _Task = Annotated[Positional[str], arg(metavar="TASK")]
 _Folder = Annotated[Positional[Path], arg(metavar="DIR")]
 _Count = Annotated[int, arg(aliases=["-n"], metavar="N")]
-_Demonstrator = Literal["scripted", "visible", "mpc"]
+_Demonstrator = Literal["scripted", "visible", "mpc", "planner"]
 _File = Annotated[Path | None, arg(metavar="FILE")]
 
 
@@ -86,7 +86,8 @@ class DemoOptions(CommandOptions):
     """Folder for the episodes; complete ones that are there already are kept."""
     demonstrator: _Demonstrator = "scripted"
     """Who acts: "scripted", the paper's; "visible", which picks only what the tip would really
-    meet; or "mpc", which simulates eight candidates and takes the best. All see the state."""
+    meet; "mpc", which simulates eight candidates and takes the best; "planner", which searches two
+    actions ahead. All see the state."""
     workers: Annotated[int | None, arg(metavar="W")] = None
     """Processes; left out, one per core, fewer for few episodes. The result is the same."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None

@@ -103,7 +103,7 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         return observation(self.worlds, 0), reward, terminated, truncated, info
 
     def demonstrate(self, demonstrator: str = "scripted") -> Action | None:
-        """What a demonstrator would do now: "scripted", "visible" or "mpc"; it sees the state.
+        """What a demonstrator (scripted, visible, mpc or planner) would do; it sees the state.
 
         None when it sees nothing to do or would reach beyond the action space.
 

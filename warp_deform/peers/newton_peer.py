@@ -8,7 +8,7 @@ its kernels one by one.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import newton
 import numpy as np
@@ -16,6 +16,7 @@ import warp as wp
 
 from ..errors import InputError
 from ..objects.box import add_box, l_block
+from .newton_frame import record_frame
 from .scene import PeerScene
 from .timing import FRAME_RATE, PeerTiming, measure
 
@@ -154,21 +155,7 @@ class NewtonWorld:
         self._control = model.control()
         self._state, self._next = model.state(), model.state()
         newton.eval_fk(model, model.joint_q, model.joint_qd, self._state)
-        self._graph = self._record()
-
-    def _record(self) -> Any:
-        """Record a frame after running one for its allocations; then put the start back."""
-        moving = ("particle_q", "particle_qd", "body_q", "body_qd")
-        start = {name: getattr(self._state, name) for name in moving}
-        start = {name: wp.clone(array) for name, array in start.items() if array is not None}
-        with wp.ScopedDevice("cpu"):
-            self._simulate()
-            with wp.ScopedCapture(device="cpu") as capture:
-                self._simulate()
-        self._solver.reset(self._state)
-        for name, array in start.items():
-            wp.copy(getattr(self._state, name), array)
-        return capture.graph
+        self._graph = record_frame(self._simulate, self._solver, self._state)
 
     def _simulate(self) -> None:
         dt = 1 / (FRAME_RATE * self._settings.substeps)

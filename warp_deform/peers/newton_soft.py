@@ -9,7 +9,6 @@ Every frame is recorded once as a CPU graph and replayed.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import newton
 import numpy as np
@@ -17,6 +16,7 @@ import warp as wp
 
 from ..errors import InputError
 from ..objects.cloth import ClothConfig
+from .newton_frame import record_frame
 from .soft_scene import SoftScene
 from .soft_timing import measure_soft
 from .timing import FRAME_RATE, PeerTiming
@@ -142,21 +142,7 @@ class NewtonSoftWorld:
         if model.body_count:
             newton.eval_fk(model, model.joint_q, model.joint_qd, self._state)
         self._step = wp.zeros(1, dtype=wp.vec3, device="cpu")
-        self._graph = self._record()
-
-    def _record(self) -> Any:
-        """Record a frame after running one for its allocations; then put the start back."""
-        moving = ("particle_q", "particle_qd", "body_q", "body_qd")
-        start = {name: getattr(self._state, name) for name in moving}
-        start = {name: wp.clone(array) for name, array in start.items() if array is not None}
-        with wp.ScopedDevice("cpu"):
-            self._simulate()
-            with wp.ScopedCapture(device="cpu") as capture:
-                self._simulate()
-        self._solver.reset(self._state)
-        for name, array in start.items():
-            wp.copy(getattr(self._state, name), array)
-        return capture.graph
+        self._graph = record_frame(self._simulate, self._solver, self._state)
 
     def _simulate(self) -> None:
         dt = 1 / (FRAME_RATE * self._settings.substeps)
@@ -182,10 +168,7 @@ class NewtonSoftWorld:
         if target is not None:
             step = (target - self._state.particle_q.numpy()[0]) / self._settings.substeps
         self._step.numpy()[0] = step
-        if self._graph is None:
-            self._simulate()
-        else:
-            wp.capture_launch(self._graph)
+        wp.capture_launch(self._graph)
 
     def vertices(self) -> np.ndarray:
         """Positions of the mesh (V, 3) [m]."""

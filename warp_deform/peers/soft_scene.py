@@ -21,7 +21,7 @@ SOFT_SCENES: tuple[str, ...] = get_args(SoftSceneName)
 _CENTRE = (0.5, 0.0)
 _CLOTH_DROP = 0.03  # [m]
 _CLOTH_MASS = 0.5  # [kg]
-_SETTLE, _FOLD, _LIE = 0.8, 1.3, 1.2  # [s], as `bench_cloth` plays it
+_SETTLE, _FOLD, _LIE = 0.8, 1.3, 1.2  # [s], as `bench.cloth` plays it
 _FOLD_TIMES = (0.0, 0.3, 1.0, _FOLD)  # [s]
 _LIFT, _LOW = 0.08, 0.01  # [m]; heights of the corner above where it lay
 
@@ -107,7 +107,7 @@ def soft_scene(name: str, *, seed: int = 0) -> SoftScene:
 def _sheet(name: str, rows: int, rng: np.random.Generator) -> SoftScene:
     config = ClothConfig(rows=rows, columns=rows)
     number = np.arange(rows * rows).reshape(rows, rows)
-    way = rng.uniform(0.08, 0.16, 2)  # drawn as `bench_cloth` draws it
+    way = rng.uniform(0.08, 0.16, 2)  # drawn as `bench.cloth` draws it
     return SoftScene(
         name=name,
         vertices=cloth_sheet(config, _CENTRE, height=_CLOTH_DROP),

@@ -64,6 +64,8 @@ class PrimitiveConfig:
     """Wait between lowering and letting go [s]; without it a dragged bead hops when released."""
     sheet_release: float = 0.0
     """Height above the table at which a vertex of a fabric or a bag is let go [m]."""
+    sheet_meets: bool = False
+    """Whether a vertex of a fabric or a bag is let go as soon as it meets something below it."""
     tip_radius: float = 0.001
     """Radius of the suction tip [m]."""
     spacing: float = 0.10
@@ -191,9 +193,9 @@ def carry(
 
     stage: speeds and pauses
     floor: lowest height of the tip over the place point [m], where what is held rests on the table
-    A bead or a body is lowered until it meets something, a vertex of a fabric or a bag to a fixed
-    height: it hangs on what it would meet. The retreat to `hover` follows the release and is in the
-    motion only.
+    A bead or a body is lowered until it meets something, a vertex of a fabric or a bag only where
+    `sheet_meets` says so, else to a fixed height. The retreat to `hover` follows the release and is
+    in the motion only.
     """
     pick, place, lift = action[:3], action[3:6], float(action[6])
     yaw = pick[2] + _half_turn(place[2] - pick[2])
@@ -221,7 +223,7 @@ def carry(
         body=grasp.body,
         offset=grasp.offset,
         turn=grasp.turn,
-        lower=None if grasp.sheet else lower,
+        lower=lower if config.sheet_meets or not grasp.sheet else None,
     )
     above = np.array([place[0], place[1], hover, yaw])
     retreat = abs(hover - bottom) / config.unloaded_speed

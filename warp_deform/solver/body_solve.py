@@ -25,7 +25,7 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     Bodies, Contacts, Sheets, Cells = t.Bodies, t.Contacts, t.Sheets, t.Cells
     list_table = box_table(scalar, lanes).list_table
     project_box_particle = box_particle(scalar, lanes).project_box_particle
-    project_box_triangle = box_triangle(scalar, lanes).project_box_triangle
+    project_box_triangles = box_triangle(scalar, lanes).project_box_triangles
     list_boxes = box_box(scalar, lanes).list_boxes
     bodies_ = body_contact(scalar, lanes)
     begin_body, solve_contacts, end_body = (
@@ -51,8 +51,10 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
             b = b0 + shapes.body[shape]
             far = wp.length(shapes.half[shape])
             center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
+            thickest = S(0.0)
             for i in range(top.particle_count[k]):
                 radius = top.radius[radii + i]
+                thickest = wp.max(thickest, radius)
                 x = q.x[p0 + i]
                 d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
                 if wp.dot(d, d) < (far + radius) * (far + radius):
@@ -60,10 +62,10 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
                         p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
                     )
             if wp.static(with_sheets):
-                for f in range(sheets.first[k], sheets.first[k + 1]):
-                    project_box_triangle(
-                        f, lane, p0, radii, shape, b, mu, push, top, shapes, bodies, sheets, cells
-                    )
+                project_box_triangles(
+                    lane, k, p0, radii, shape, b, far + thickest, mu, push, top, shapes, bodies,
+                    sheets, cells,
+                )  # fmt: skip
         for b in range(b0, b0 + count):
             begin_body(b, bodies)
         start = group.contact_start[g]

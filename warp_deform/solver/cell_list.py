@@ -13,10 +13,10 @@ from typing import Any
 
 import warp as wp
 
-from .cell_sort import cell_sort
+from .cell_sort import RUN, cell_sort
 from .closest_point import closest_point
 from .lane_access import lane_access
-from .lanes import add, dot, mul, sub  # noqa: F401  (operators are found by name)
+from .lanes import add, any_less, dot, mul, sub  # noqa: F401  (operators are found by name)
 from .structures import structures
 
 __all__ = ["cell_list"]
@@ -33,27 +33,53 @@ SOON = 0.4
 
 @functools.cache
 def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`moved_since(p0, n, q, cells)` and `list_triangles(...)`.
+    """`common_step(p0, n, dt, q)`, `moved_since(p0, n, drift, q, cells)` and `list_triangles(...)`.
 
-    `moved_since` is positive for lanes in which a particle has used up its slack.
+    `common_step` is what all particles do in this substep, along each axis the step of the slowest,
+    or 0 where they do not go the same way. Summed up it is the `drift`, with which the frame of the
+    lists goes along: a sheet that falls or is carried as a whole keeps its list.
+    `moved_since` is positive for lanes in which a particle has used up its slack in that frame.
     `list_triangles` brings the list of one lane up to date, or makes it `anew`, and returns how
     many pairs found no room in it.
     """
     t = structures(scalar, lanes)
-    S, V, R3, L = t.S, t.V, t.R3, t.L
+    S, V, V3, R3, L = t.S, t.V, t.V3, t.R3, t.L
     M33, V4 = t.M33, t.V4
     cells_ = cell_sort(scalar, lanes)
-    cell_of, sort_cells, next_in_box = cells_.cell_of, cells_.sort_cells, cells_.next_in_box
+    cell_of, sort_cells = cells_.cell_of, cells_.sort_cells
+    hits_in_box, first_hit = cells_.hits_in_box, cells_.first_hit
     Topology, Sheets, Cells, Particles = t.Topology, t.Sheets, t.Cells, t.Particles
     access = lane_access(scalar, lanes)
     get, put, get_mass, put_scalar = access.get, access.put, access.get_mass, access.put_scalar
     barycentric = closest_point(scalar, lanes).barycentric
 
     @wp.func
-    def moved_since(p0: int, n: int, q: Particles, cells: Cells):
+    def common_step(p0: int, n: int, dt: S, q: Particles):
+        low = q.v[p0]
+        high = low
+        zero = V(S(0.0))
+        i = p0 + 1
+        alike = bool(True)
+        while alike and i < p0 + n:
+            v = q.v[i]
+            low = V3(wp.min(low.x, v.x), wp.min(low.y, v.y), wp.min(low.z, v.z))
+            high = V3(wp.max(high.x, v.x), wp.max(high.y, v.y), wp.max(high.z, v.z))
+            apart = wp.max(wp.max(low.x, zero - high.x), wp.max(low.y, zero - high.y))
+            alike = any_less(zero - wp.max(apart, wp.max(low.z, zero - high.z)), S(0.0))
+            i += 1
+        return (
+            V3(
+                wp.max(low.x, wp.min(high.x, zero)), wp.max(low.y, wp.min(high.y, zero)),
+                wp.max(low.z, wp.min(high.z, zero)),
+            )
+            * dt
+        )  # fmt: skip
+
+    @wp.func
+    def moved_since(p0: int, n: int, drift: V3, q: Particles, cells: Cells):
         worst = V(S(0.0))
         for i in range(p0, p0 + n):
-            d = q.x[i] - cells.xr[i]
+            d = q.x[i] - drift - cells.xr[i]
             slack = cells.slack[i]
             worst = wp.max(worst, dot(d, d) - mul(slack, slack))
         return worst
@@ -63,7 +89,10 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         return R3(p[0], p[1], p[2])
 
     @wp.func
-    def follow(lane: int, p0: int, count: int, links: int, most: S, anew: bool, cells: Cells):
+    def follow(
+        lane: int, p0: int, count: int, links: int, most: S, anew: bool, drift: R3, common: R3,
+        cells: Cells,
+    ):  # fmt: skip
         """Moves the references of particles that have gone far, and renews their slack.
 
         That is `most` [m] at most. Returns the lower and the upper corner of the box around those,
@@ -73,14 +102,15 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         high = -low
         loosest = S(0.0)
         for i in range(count):
-            x = get(cells.x, p0 + i, lane)
+            now = get(cells.x, p0 + i, lane)
+            x = now - drift
             d = x - point(cells.place[links + i])
             slack = get_mass(cells.slack_flat, p0 + i, lane)
             moved = int(0)
             # those that would have to follow soon come along
             if anew or wp.dot(d, d) > S(SOON * SOON) * slack * slack:
                 moved = 1
-                step = wp.length(x - get(cells.xp, p0 + i, lane))
+                step = wp.length(now - get(cells.xp, p0 + i, lane) - common)
                 slack = wp.clamp(S(STEPS) * step, S(LEAST) * most, most)
                 put_scalar(cells.slack_flat, p0 + i, lane, slack)
                 put(cells.xr_flat, p0 + i, lane, x)
@@ -122,8 +152,8 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def list_triangles(
-        g: int, lane: int, k: int, p0: int, margin: S, anew: bool, top: Topology, sheets: Sheets,
-        cells: Cells,
+        g: int, lane: int, k: int, p0: int, margin: S, anew: bool, drift: V3, common: V3,
+        top: Topology, sheets: Sheets, cells: Cells,
     ):  # fmt: skip
         count = top.particle_count[k]
         base = top.particle_start[k]
@@ -133,7 +163,9 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         start = cells.list_start[g] + lane * cells.capacity[g]
         slot = g * wp.static(L) + lane
         most = wp.min(margin, S(MOST) * sheets.cell[k])
-        box = follow(lane, p0, count, links, most, anew, cells)
+        gone = R3(drift.x[lane], drift.y[lane], drift.z[lane])
+        going = R3(common.x[lane], common.y[lane], common.z[lane])
+        box = follow(lane, p0, count, links, most, anew, gone, going, cells)
         near = R3(box[0, 0], box[0, 1], box[0, 2])  # box around the moved particles
         far = R3(box[1, 0], box[1, 1], box[1, 2])
         loosest = box[2, 0]
@@ -174,6 +206,8 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
             wide = thick + sheets.widest[k] + slack + loosest
             low = wp.min(a, wp.min(b, c)) - R3(wide, wide, wide)
             high = wp.max(a, wp.max(b, c)) + R3(wide, wide, wide)
+            m = wp.cross(b - a, c - a)
+            m2 = wp.length_sq(m)
             moved = moved_corners(links, tri, cells)
             if moved > 0 or (
                 low[2] < far[2] and high[2] > near[2]
@@ -189,33 +223,40 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
                 for row in range(cell_of(low[0], low0, inverse, grid), last0 + 1):
                     end = links + cells.head[last1 + row * grid]
                     at = links + cells.head[first1 + row * grid]
-                    at = next_in_box(cells.sorted, at, end, low, high)
                     while at < end:
-                        if cells.key[at] >= least:
-                            if not stamped:
-                                exempt(f, tri, base, links, sheets, cells)
-                                stamped = True
-                            i = cells.key[at]
+                        hits = hits_in_box(cells.sorted, cells.key, at, end, low, high, least)
+                        if hits != 0 and not stamped:
+                            exempt(f, tri, base, links, sheets, cells)
+                            stamped = True
+                        while hits != 0:
+                            hit = at + first_hit(hits)
+                            hits = hits & (hits - 1)
+                            i = cells.key[hit]
                             if i < 0:
                                 i = -1 - i
                             if cells.stamp[links + i] != f + 1:
-                                p4 = cells.sorted[at]
+                                p4 = cells.sorted[hit]
                                 p = point(p4)
-                                u = barycentric(p, a, b, c)
-                                d = p - (a * u[0] + b * u[1] + c * u[2])
                                 gap = sheets.skin[base + i] + thick
                                 reach = gap + slack + p4[3]
-                                if wp.dot(d, d) < reach * reach:
-                                    if listed < cells.capacity[g]:
-                                        above = wp.dot(wp.cross(b - a, c - a), d) >= S(0.0)
-                                        cells.particle[start + listed] = i
-                                        cells.face[start + listed] = f
-                                        cells.gap[start + listed] = wp.where(above, gap, -gap)
-                                        listed += 1
-                                    else:
-                                        left_out += 1
-                        at = next_in_box(cells.sorted, at + 1, end, low, high)
+                                # distance from the plane, before anything dear
+                                off = wp.dot(m, p - a)
+                                if off * off < reach * reach * m2:
+                                    u = barycentric(p, a, b, c)
+                                    d = p - (a * u[0] + b * u[1] + c * u[2])
+                                    if wp.dot(d, d) < reach * reach:
+                                        if listed < cells.capacity[g]:
+                                            above = wp.dot(m, d) >= S(0.0)
+                                            cells.particle[start + listed] = i
+                                            cells.face[start + listed] = f
+                                            cells.gap[start + listed] = wp.where(above, gap, -gap)
+                                            listed += 1
+                                        else:
+                                            left_out += 1
+                        at += wp.static(RUN)
         cells.count[slot] = listed
         return left_out
 
-    return SimpleNamespace(moved_since=moved_since, list_triangles=list_triangles)
+    return SimpleNamespace(
+        common_step=common_step, moved_since=moved_since, list_triangles=list_triangles
+    )

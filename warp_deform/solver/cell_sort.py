@@ -12,7 +12,10 @@ import warp as wp
 
 from .structures import structures
 
-__all__ = ["cell_sort"]
+__all__ = ["RUN", "cell_sort"]
+
+RUN = 31
+"""Points that `hits_in_ball` looks at: one bit each of an int."""
 
 
 @functools.cache
@@ -23,6 +26,11 @@ def cell_sort(scalar: Any, lanes: int) -> SimpleNamespace:
     cells of side 1 / inverse from `low` on. Cell c = row * grid + column holds the points
     `links + head[heads + c]` to `links + head[heads + c + 1]` of `sorted`, and of `key` their
     numbers n, as -1 - n where `moved[links + n]` is 0.
+
+    `hits_in_ball(sorted, key, at, end, ball, below)`: which of the next RUN points, as bits, reach
+    the ball (both have their fourth number as radius) and have a key less than `below`.
+    `hits_in_box` likewise, in the box from l to h, with keys of at least `least`. `first_hit` is
+    the lowest of the bits.
     """
     t = structures(scalar, lanes)
     S, R3, V4 = t.S, t.R3, t.V4
@@ -67,29 +75,41 @@ def cell_sort(scalar: Any, lanes: int) -> SimpleNamespace:
                 sorted[links + to] = p
                 key[links + to] = wp.where(moved[links + n] > 0, n, -1 - n)
 
-    # searches spend their time here: as loops over indexed arrays they would take twice as long
-
-    ball = "p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < p[3] * p[3]"
+    # Searches spend their time here. Without branches: which points are hits cannot be foreseen.
     c_type = {wp.float32: "float", wp.float64: "double"}[scalar]
 
     @wp.func_native(f"""
-        for (; at < end; ++at) {{
-            const wp::vec_t<4, {c_type}>& o = x.data[at];
+        const int count = end - at < {RUN} ? end - at : {RUN};
+        unsigned hits = 0;
+        for (int k = 0; k < count; ++k) {{
+            const wp::vec_t<4, {c_type}>& o = x.data[at + k];
             const {c_type} p[] = {{o[0] - b[0], o[1] - b[1], o[2] - b[2], o[3] + b[3]}};
-            if ({ball}) break;
+            const bool in = p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < p[3] * p[3];
+            hits |= (unsigned)(in & (key.data[at + k] < below)) << k;
         }}
-        return at;""")
-    def next_in_ball(x: wp.array(dtype=V4), at: int, end: int, b: V4) -> int: ...
+        return (int)hits;""")
+    def hits_in_ball(
+        x: wp.array(dtype=V4), key: wp.array(dtype=int), at: int, end: int, b: V4, below: int
+    ) -> int: ...  # fmt: skip
 
-    @wp.func_native("""
-        for (; at < end; ++at) {
-            const auto& o = x.data[at];
-            if ((o[2] > l[2]) & (o[2] < h[2]) & (o[0] > l[0]) & (o[0] < h[0]) & (o[1] > l[1])
-                & (o[1] < h[1])) break;
-        }
-        return at;""")
-    def next_in_box(x: wp.array(dtype=V4), at: int, end: int, l: R3, h: R3) -> int: ...
+    @wp.func_native("return __builtin_ctz((unsigned)hits);")
+    def first_hit(hits: int) -> int: ...
+
+    @wp.func_native(f"""
+        const int count = end - at < {RUN} ? end - at : {RUN};
+        unsigned hits = 0;
+        for (int k = 0; k < count; ++k) {{
+            const auto& o = x.data[at + k];
+            const bool in = (o[2] > l[2]) & (o[2] < h[2]) & (o[0] > l[0]) & (o[0] < h[0])
+                & (o[1] > l[1]) & (o[1] < h[1]);
+            hits |= (unsigned)(in & (key.data[at + k] >= least)) << k;
+        }}
+        return (int)hits;""")
+    def hits_in_box(
+        x: wp.array(dtype=V4), key: wp.array(dtype=int), at: int, end: int, l: R3, h: R3, least: int
+    ) -> int: ...  # fmt: skip
 
     return SimpleNamespace(
-        cell_of=cell_of, sort_cells=sort_cells, next_in_ball=next_in_ball, next_in_box=next_in_box
-    )
+        cell_of=cell_of, sort_cells=sort_cells, first_hit=first_hit, hits_in_ball=hits_in_ball,
+        hits_in_box=hits_in_box,
+    )  # fmt: skip

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from .cell_sort import cell_sort
+from .cell_sort import RUN, cell_sort
 from .lane_access import lane_access
 from .structures import structures
 
@@ -35,7 +35,8 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     S, R3, L = t.S, t.R3, t.L
     R2, V4 = wp.types.vector(2, S), t.V4
     cells_ = cell_sort(scalar, lanes)
-    cell_of, sort_cells, next_in_ball = cells_.cell_of, cells_.sort_cells, cells_.next_in_ball
+    cell_of, sort_cells = cells_.cell_of, cells_.sort_cells
+    hits_in_ball, first_hit = cells_.hits_in_ball, cells_.first_hit
     Topology, Sheets, Cells = t.Topology, t.Sheets, t.Cells
     access = lane_access(scalar, lanes)
     get, put, get_mass = access.get, access.put, access.get_mass
@@ -98,13 +99,18 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             c = point(c4)
             d = point(d4)
             h = S(0.5) * (sheets.edge_gap[base + e[0]] + sheets.edge_gap[base + f[0]])
-            at = nearest(a, b, c, d)
-            way = a + (b - a) * at[0] - c - (d - c) * at[1]
             far = h + wp.max(a4[3], b4[3]) + wp.max(c4[3], d4[3])
-            if wp.length_sq(way) < far * far:
-                h = touching_distance(base, e, f, h, sheets)
-                if h > S(1.0e-5):
-                    gap = wp.where(wp.dot(wp.cross(b - a, d - c), way) >= S(0.0), h, -h)
+            # most are apart along the line between their middles, which is cheap to see
+            way = a + b - c - d
+            w2 = wp.length_sq(way)
+            apart = w2 - wp.abs(wp.dot(b - a, way)) - wp.abs(wp.dot(d - c, way))
+            if apart < S(0.0) or apart * apart < S(4.0) * far * far * w2:
+                at = nearest(a, b, c, d)
+                way = a + (b - a) * at[0] - c - (d - c) * at[1]
+                if wp.length_sq(way) < far * far:
+                    h = touching_distance(base, e, f, h, sheets)
+                    if h > S(1.0e-5):
+                        gap = wp.where(wp.dot(wp.cross(b - a, d - c), way) >= S(0.0), h, -h)
         return gap
 
     @wp.func
@@ -183,11 +189,12 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
                 for row in range(cell_of(ball[0] - wide, low0, inverse, grid), last0 + 1):
                     end = links + cells.head[last1 + row * grid]
                     at = links + cells.head[first1 + row * grid]
-                    at = next_in_ball(cells.edge_sorted, at, end, ball)
                     while at < end:
-                        m = cells.edge_key[at]
                         # two moved ones meet once
-                        if m < n:
+                        hits = hits_in_ball(cells.edge_sorted, cells.edge_key, at, end, ball, n)
+                        while hits != 0:
+                            m = cells.edge_key[at + first_hit(hits)]
+                            hits = hits & (hits - 1)
                             if m < 0:
                                 m = -1 - m
                             gap = meeting(base, places, e, sheets.edge[first + m], sheets, cells)
@@ -199,7 +206,7 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
                                     listed += 1
                                 else:
                                     left_out += 1
-                        at = next_in_ball(cells.edge_sorted, at + 1, end, ball)
+                        at += wp.static(RUN)
         cells.edge_count[slot] = listed
         return left_out
 

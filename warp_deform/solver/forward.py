@@ -57,11 +57,12 @@ def forward_kernel(
     tape for the backward sweep (see `tape`) and can continue a launch, to the same bits.
     """
     t = structures(scalar, lanes)
-    S, V, R3, L = t.S, t.V, t.R3, t.L
+    S, V, V3, R3, L = t.S, t.V, t.V3, t.R3, t.L
     predict, finish = (getattr(table_contact(scalar, lanes), n) for n in ("predict", "finish"))
     list_near = sphere_contact(scalar, lanes).list_near
     cells_ = cell_list(scalar, lanes)
-    moved_since, list_triangles = cells_.moved_since, cells_.list_triangles
+    common_step, moved_since = cells_.common_step, cells_.moved_since
+    list_triangles = cells_.list_triangles
     list_edges = edge_contact(scalar, lanes).list_edges
     solve_particles = particle_solve(scalar, lanes, with_sheets, with_edges, taped).solve_particles
     calms = internal_friction(scalar, lanes)
@@ -121,6 +122,7 @@ def forward_kernel(
         holding = zero
         calm = group.calm_steps[g]
         stale = on
+        drift = V3(zero, zero, zero)  # of the frame in which triangles are listed
         fresh = zero  # lanes whose triangles have been listed in this launch
         travel = zero
         clamped = zero
@@ -151,7 +153,7 @@ def forward_kernel(
             if not begins:
                 (
                     on, steps, quiet, holding, calm, stale, fresh, travel, clamped, free_time,
-                    least,
+                    least, drift,
                 ) = load_state(g, tape)  # fmt: skip
                 at = g * wp.static(COUNTERS)
                 substep = tape.counters[at]
@@ -237,14 +239,16 @@ def forward_kernel(
                 travel = select(stale, zero, travel)
             if wp.static(with_sheets):
                 if sheets.first[k + 1] > sheets.first[k]:
-                    far = moved_since(p0, n, q, cells)
+                    common = common_step(p0, n, dt, q)
+                    drift = drift + common * on
+                    far = moved_since(p0, n, drift, q, cells)
                     for lane in range(wp.static(L)):
                         if on[lane] > S(0.0) and (fresh[lane] < S(0.5) or far[lane] > S(0.0)):
                             anew = fresh[lane] < S(0.5)
                             fresh[lane] = S(1.0)
                             left = list_triangles(
-                                g, lane, k, p0, st.margin, anew, top, sheets, cells
-                            )  # fmt: skip
+                                g, lane, k, p0, st.margin, anew, drift, common, top, sheets, cells
+                            )
                             if wp.static(with_edges):
                                 left += list_edges(
                                     g, lane, k, p0, anew, top, sheets, cells
@@ -368,7 +372,7 @@ def forward_kernel(
         if wp.static(taped):
             save_state(
                 g, on, steps, quiet, holding, calm, stale, fresh, travel, clamped, free_time, least,
-                tape,
+                drift, tape,
             )  # fmt: skip
             at = g * wp.static(COUNTERS)
             tape.counters[at] = substep
@@ -378,6 +382,10 @@ def forward_kernel(
             tape.until[g] = substep
             ends = tape.last > 0
             mark = int(tops[2])
+        if wp.static(with_sheets):
+            if ends:
+                for i in range(p0, p0 + n):
+                    cells.xr[i] = cells.xr[i] + drift
         # a world cut off while it held something lets go: nothing is held between launches
         for lane in range(wp.static(L)):
             if ends and holding[lane] > S(0.0):

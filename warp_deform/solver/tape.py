@@ -19,7 +19,7 @@ from .structures import structures
 
 __all__ = ["COUNTERS", "GRIP_WORDS", "STATE", "TRIANGLE_SCALARS", "TRIANGLE_WORDS", "Kind", "tape"]
 
-STATE = 11
+STATE = 14
 """Lane vectors of the kernel's own state per group."""
 COUNTERS = 3
 """Whole numbers of the kernel's own state per group."""
@@ -94,12 +94,13 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
             tape.state[at], tape.state[at + 1], tape.state[at + 2], tape.state[at + 3],
             tape.state[at + 4], tape.state[at + 5], tape.state[at + 6], tape.state[at + 7],
             tape.state[at + 8], tape.state[at + 9], tape.state[at + 10],
+            V3(tape.state[at + 11], tape.state[at + 12], tape.state[at + 13]),
         )  # fmt: skip
 
     @wp.func
     def save_state(
         g: int, on: V, steps: V, quiet: V, holding: V, calm: V, stale: V, fresh: V, travel: V,
-        clamped: V, free_time: V, least: V, tape: Tape,
+        clamped: V, free_time: V, least: V, drift: V3, tape: Tape,
     ):  # fmt: skip
         at = g * wp.static(STATE)
         tape.state[at] = on
@@ -113,6 +114,9 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
         tape.state[at + 8] = clamped
         tape.state[at + 9] = free_time
         tape.state[at + 10] = least
+        tape.state[at + 11] = drift.x
+        tape.state[at + 12] = drift.y
+        tape.state[at + 13] = drift.z
 
     return SimpleNamespace(
         has_room=has_room, fetch_ahead=fetch_ahead, load_state=load_state, save_state=save_state

@@ -25,6 +25,9 @@ from .task import Action, Layout, Snapshot, Stage
 if TYPE_CHECKING:
     import newton
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 __all__ = ["BagItems1", "BagItems2"]
 
 _ZONE = 0.26  # [m] outer side
@@ -203,6 +206,18 @@ class BagItems1(BagTask):
             return 2.0 * inside
         return 2.0 * inside + self.opening(snapshot) - 0.5 * self.map_distance(layout, snapshot)
 
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """Distance [m] of the items from the zone; of those that are outside first from the bag."""
+        outside = self._outside(snapshot)
+        if not outside:
+            goal = body_q.new_tensor(_frame(layout)[:2])
+            return _mean_length(body_q[:, :2] - goal)
+        centre = particle_q[list(self.bag_of(snapshot).ring), :2].mean(0)
+        opened = self.opening_loss(layout, snapshot, particle_q)
+        return opened + _mean_length(body_q[outside, :2] - centre)
+
     def privileged_stage(self, segment: int, snapshot: Snapshot, previous: Stage | None) -> Stage:
         """A pick on an item is to insert it; the next pick on anything else carries, and so on."""
         items = snapshot.segments[-len(self.cubes) :]
@@ -300,3 +315,8 @@ def _frame(layout: Layout) -> np.ndarray:
     if layout.frame is None:
         raise ValueError("bag-items needs the pose of its zone")
     return layout.frame
+
+
+def _mean_length(offsets: Tensor) -> Tensor:
+    """Mean length () of `offsets` (n, 2)."""
+    return (offsets.square().sum(-1) + 1e-8).sqrt().mean()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import cv2
 import numpy as np
@@ -22,9 +22,13 @@ from ..robots.primitive import PrimitiveConfig, find_grasp
 from .bag_physics import BAG_PRIMITIVE, BAG_SOLVER, INSERT, OPEN
 from .demonstrators import farthest_bead, pick_place, ring_maps, visible_point
 from .ground_truth import pose_rows
+from .losses import mean_distance, ring_area
 from .metrics import hull_area
 from .shapes import chain_yaw
 from .task import Action, Layout, Snapshot, Task
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 __all__ = ["BagTask", "bag_mask", "enclosed"]
 
@@ -158,6 +162,22 @@ class BagTask(Task):
     def _segments(self, layout: Layout, snapshot: Snapshot, item: object) -> range:
         """Segmentation ids of an object: of a bag, first the shell's, then those of its beads."""
         return snapshot.segments[len(layout.zones) + snapshot.objects.index(item)]
+
+    # -- gradients
+
+    def opening_loss(self, layout: Layout, snapshot: Snapshot, particle_q: Tensor) -> Tensor:
+        """How far the first bag's beads are from their targets, less how far it is open."""
+        radius = self.bag.opening_radius
+        beads = particle_q[list(self.bag_of(snapshot).ring)]
+        maps = ring_maps(len(beads), reversals=False)
+        away = mean_distance(beads[:, :2], self.ring_targets_of(layout), maps) / radius
+        return 0.5 * away - ring_area(beads) / (math.pi * radius**2)
+
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """Of opening the first bag."""
+        return self.opening_loss(layout, snapshot, particle_q)
 
     # -- opening
 

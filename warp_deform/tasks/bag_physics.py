@@ -31,4 +31,7 @@ INSERT = Stage(lift=0.30, speed=0.5, lower_speed=0.15, gentle=True)
 CARRY = Stage(lift=0.40, speed=0.25, pause=0.3, gentle=True)
 """The whole bag with what is in it, which calms before it is moved and before it is lowered."""
 
-BAG_PRIMITIVE = PrimitiveConfig(hover=0.10)
+BAG_PRIMITIVE = PrimitiveConfig(hover=0.10, sheet_meets=True)
+"""A bead is let go on the heap that it is lowered onto. What holds it is stronger than any contact:
+on its way to the table it would be pressed through the layers below, and tear its neighbours along.
+"""

@@ -23,6 +23,9 @@ from .task import Action, Layout, Snapshot, Stage, Task
 if TYPE_CHECKING:
     import newton
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 __all__ = ["BlockNotarget"]
 
 _ROOM = 0.1  # [m] side of the square that the block is given
@@ -86,6 +89,17 @@ class BlockNotarget(Task):
         """The score, less the distance from the target [m] and the turn from it [rad] by 100."""
         distance, turn = pose_error(self._pose(snapshot), layout.targets)
         return self.score(layout, snapshot) - distance - turn / 100
+
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """Distance from the target [m], and 5 cm for each radian of turn from it."""
+        x, y, yaw = layout.targets
+        away = (body_q[0, :2] - body_q.new_tensor([x, y])).square().sum()
+        qx, qy, qz, qw = body_q[0, 3:]
+        across, along = 2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)
+        cosine = along * np.cos(yaw) + across * np.sin(yaw)
+        return (away + 1e-8).sqrt() + 0.05 * (2 * (1 - cosine) + 1e-8).sqrt()
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(6,): x, y, -yaw / 15 of the block, then of the goal."""

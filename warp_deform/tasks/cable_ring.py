@@ -24,6 +24,10 @@ from .task import Action, Layout, Snapshot, Task
 
 if TYPE_CHECKING:
     import newton
+from .losses import mean_distance
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 __all__ = ["CableRing", "CableRingNotarget"]
 
@@ -111,6 +115,13 @@ class CableRing(Task):
         """Share of the circle that is spanned, less half the beads' mean distance in radii."""
         _, distances = self._mapped(layout, snapshot)
         return self.score(layout, snapshot) - 0.5 * float(distances.mean()) / self.cable.ring_radius
+
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """Mean distance [m] of the beads from their targets under the best of 64 maps."""
+        maps = ring_maps(self.cable.beads, reversals=True)
+        return mean_distance(particle_q[:, :2], layout.targets, maps)
 
     def _mapped(self, layout: Layout, snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
         """Bead of every target (32,) under the best of 64 maps, and its distance (32,) [m]."""

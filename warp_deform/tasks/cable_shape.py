@@ -24,6 +24,10 @@ from .task import Action, Layout, Snapshot, Task
 
 if TYPE_CHECKING:
     import newton
+from .losses import mean_distance
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 __all__ = ["CableShape", "CableShapeNotarget"]
 
@@ -115,6 +119,14 @@ class CableShape(Task):
         ways = np.stack([layout.targets, layout.targets[::-1]])
         distances = np.linalg.norm(snapshot.particle_q[:, :2] - ways, axis=2).mean(axis=1)
         return self.score(layout, snapshot) - float(distances.min()) / self.cable.length
+
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """Mean distance [m] of the beads from their targets, the cable the better way round."""
+        forwards = np.arange(self.cable.beads)
+        maps = np.stack([forwards, forwards[::-1]])
+        return mean_distance(particle_q[:, :2], layout.targets, maps)
 
     def _moves(
         self,

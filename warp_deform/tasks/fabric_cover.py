@@ -14,7 +14,7 @@ from ..objects.cloth import Cloth, ClothConfig, add_cloth, cloth_sheet
 from ..rendering.pixels import PIXEL_SIZE
 from .cloth_physics import FABRIC, FABRIC_PRIMITIVE, FABRIC_SOLVER, FABRIC_SPEED
 from .demonstrators import pick_place
-from .fabric_pull import beyond, corners, on_table, takes
+from .fabric_pull import beyond, corners, first_taken, on_table
 from .free_space import FreeSpace
 from .ground_truth import pose_rows, quaternion_yaw
 from .metrics import wrap_angle
@@ -23,6 +23,10 @@ from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:
     import newton
+from .losses import cover_distance
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 __all__ = ["FabricCover"]
 
@@ -103,8 +107,7 @@ class FabricCover(Task):
         if len(snapshot.actions) == 0:
             return self._put(snapshot)
         folds = self._folds(snapshot, rng, self.overshoot)
-        taken = [v for v in folds if takes(v, self.fabric, snapshot, self.primitive)]
-        return next((folds[v] for v in [*taken, *folds]), None)
+        return first_taken(folds, self.fabric, snapshot, self.primitive)
 
     def candidates(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
@@ -129,6 +132,20 @@ class FabricCover(Task):
         seen = np.count_nonzero(snapshot.images.segmentation == snapshot.segments[0][0])
         face = np.prod(self.cube.parts[0].size[:2]) / PIXEL_SIZE**2
         return 1.0 - min(1.0, seen / face) - self._distance(snapshot)
+
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """Soft distance [m] of the fabric from points of the cube's face, and of the centres."""
+        half = self.cube.parts[0].size[0] / 2
+        spots = half * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+        points = body_q[0, :2] + body_q.new_tensor(spots)
+        upper = particle_q[particle_q[:, 2] > float(body_q[0, 2])]
+        centre = particle_q[list(self.fabric.inner_corners), :2].mean(0)
+        apart = ((body_q[0, :2] - centre).square().sum() + 1e-8).sqrt()
+        cell = self.fabric.side / self.fabric.columns
+        hidden = cover_distance(upper, points, cell / 4) if len(upper) else apart
+        return hidden + apart
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(303,): x, y, -yaw / 15 of the cube, then x, y, z of every vertex."""

@@ -14,7 +14,7 @@ from ..objects.cloth import Cloth, ClothConfig, add_cloth, cloth_sheet
 from ..objects.zone import square_zone
 from .cloth_physics import FABRIC, FABRIC_PRIMITIVE, FABRIC_SOLVER, FABRIC_SPEED
 from .demonstrators import pick_place
-from .fabric_pull import beyond, corners, on_table, takes
+from .fabric_pull import beyond, corners, first_taken, on_table
 from .fabric_shape import fold_corner, square_corners, square_mask
 from .free_space import FreeSpace, NoFreeSpace
 from .ground_truth import pose_rows
@@ -23,6 +23,10 @@ from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:
     import newton
+from .losses import grid_maps, mean_distance
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 __all__ = ["FabricFlat", "FabricFlatNotarget"]
 
@@ -127,8 +131,7 @@ class FabricFlat(Task):
     ) -> Action | None:
         """The first such pull whose corner the tip really takes, if there is one."""
         pulls = self._pulls(layout, snapshot)
-        taken = [v for v in pulls if takes(v, self.fabric, snapshot, self.primitive)]
-        return next((pulls[v] for v in [*taken, *pulls]), None)
+        return first_taken(pulls, self.fabric, snapshot, self.primitive)
 
     def candidates(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
@@ -147,6 +150,14 @@ class FabricFlat(Task):
         """Coverage, less the corners' mean distance from their places [m]."""
         mean = self._distances(layout, snapshot).mean(axis=1).min()
         return self.score(layout, snapshot) - float(mean)
+
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """Mean distance [m] of the vertices from a fabric that lies flat on the square."""
+        flat = cloth_sheet(self.fabric, tuple(layout.targets[0, :2]), yaw=layout.targets[0, 2])
+        maps = grid_maps(self.fabric.rows, self.fabric.columns)
+        return mean_distance(particle_q[:, :2], flat[:, :2], maps)
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(303,): x, y, -yaw / 15 of the square, then x, y, z of every vertex."""

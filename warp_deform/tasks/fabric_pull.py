@@ -8,9 +8,9 @@ from ..objects.cloth import ClothConfig
 from ..rendering.pixels import BOUNDS
 from ..robots.primitive import PrimitiveConfig
 from .demonstrators import met_particle
-from .task import Snapshot
+from .task import Action, Snapshot
 
-__all__ = ["beyond", "corners", "on_table", "takes"]
+__all__ = ["beyond", "corners", "first_taken", "on_table", "takes"]
 
 _LOW, _HIGH = np.array(BOUNDS[:2]).T
 
@@ -49,3 +49,11 @@ def takes(vertex: int, fabric: ClothConfig, snapshot: Snapshot, primitive: Primi
         return False
     cells = np.subtract(divmod(taken, fabric.columns), divmod(vertex, fabric.columns))
     return bool(np.abs(cells).max() <= 1)
+
+
+def first_taken(
+    pulls: dict[int, Action], fabric: ClothConfig, snapshot: Snapshot, primitive: PrimitiveConfig
+) -> Action | None:
+    """The first of `pulls`, by vertex, whose vertex the tip really takes; else the first."""
+    taken = [v for v in pulls if takes(v, fabric, snapshot, primitive)]
+    return next((pulls[v] for v in [*taken, *pulls]), None)

@@ -19,6 +19,7 @@ from ..solver.config import SolverConfig
 
 if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     import newton
+    from torch import Tensor
 
     from ..objects.bag import BagConfig
     from ..objects.box import BoxConfig
@@ -175,6 +176,16 @@ class Task(abc.ABC):
     def promise(self, layout: Layout, snapshot: Snapshot) -> float:
         """How good a state is to go on from; `mpc` takes the action whose outcome has the most."""
         return self.score(layout, snapshot)
+
+    def loss(
+        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    ) -> Tensor:
+        """A smooth measure () of what is left to do after an action from `snapshot`.
+
+        particle_q (P, 3) [m], body_q (B, 7): the state the action leaves; only for tasks that say
+        so are there gradients to plan by.
+        """
+        raise TypeError(f"{self.name} has no loss to differentiate")
 
     @abc.abstractmethod
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:

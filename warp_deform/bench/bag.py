@@ -7,18 +7,20 @@ the original's mesh of 353 vertices; ours is the bag of the tasks, with edge con
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import newton
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .objects.bag import BagConfig, add_bag, bag_shell
-from .objects.box import BoxConfig, BoxPart, add_box
-from .peers.soft_scene import TILT, soft_scene
-from .rollout import rollout
-from .solver.solver import SolverFusedXPBD
-from .tasks.bag_physics import BAG_SOLVER
+from ..objects.bag import BagConfig, add_bag, bag_shell
+from ..objects.box import BoxConfig, BoxPart, add_box
+from ..peers.soft_scene import TILT, soft_scene
+from ..rollout import rollout
+from ..solver.solver import SolverFusedXPBD
+from ..tasks.bag_physics import BAG_SOLVER
+from .timing import Played, time_worlds
 
 __all__ = ["BAG_SCENES", "run_bag"]
 
@@ -33,36 +35,14 @@ def run_bag(*, scene: str, lanes: int = 8, worlds: int = 8, repeats: int = 3) ->
     `ms_per_sim_second` is that of the fall, which ends crumpled; `rest_ms_per_sim_second` that of
     what follows, simulated to the end although everything may be at rest.
     """
-    worlds = min(worlds, _MOST_WORLDS)
-    begin = time.process_time()
-    lone, many = _solver(scene, 1, 1), _solver(scene, worlds, lanes)
-    for solver in (lone, many):
-        solver.run(20)
-    start_up = time.process_time() - begin
-    alone = [_play(lone, scene, [seed]) for seed in range(repeats)]
-    together = [_play(many, scene, list(range(worlds))) for _ in range(repeats)]
-    same = all(
-        np.array_equal(end, together[0][3][seed])
-        for seed, (_, _, _, (end,)) in enumerate(alone[:worlds])
+    return time_worlds(
+        scene,
+        partial(_solver, scene),
+        partial(_play, scene),
+        lanes=lanes,
+        worlds=min(worlds, _MOST_WORLDS),
+        repeats=repeats,
     )
-    report: dict[str, Any] = {
-        "scene": scene,
-        "lanes": lanes,
-        "worlds": worlds,
-        "dt": lone.config.dt,
-        "substeps": round(1 / 60 / lone.config.dt),
-        "particles": int(lone.model.particle_count),
-        "stretch": max(t[2] for t in alone),
-        "same_bits": same,
-        "start_up_seconds": start_up,
-    }
-    for suffix, times, count in (("", alone, 1), ("_lanes", together, worlds)):
-        for k, kind in enumerate(("", "rest_")):
-            values = [(t[0], t[1])[k] for t in times]
-            name = f"{kind}ms_per_sim_second{suffix}"
-            report[name] = float(np.median(values)) / count
-            report[f"{name}_p95"] = float(np.percentile(values, 95)) / count
-    return report
 
 
 def _solver(scene: str, worlds: int, lanes: int) -> SolverFusedXPBD:
@@ -76,10 +56,8 @@ def _solver(scene: str, worlds: int, lanes: int) -> SolverFusedXPBD:
     return SolverFusedXPBD(builder.finalize(device="cpu"), BAG_SOLVER, lanes=lanes)
 
 
-def _play(
-    solver: SolverFusedXPBD, scene: str, seeds: list[int]
-) -> tuple[float, float, float, list[np.ndarray]]:
-    """CPU ms per simulated second falling and after, the largest stretch, and the ends."""
+def _play(scene: str, solver: SolverFusedXPBD, seeds: list[int]) -> Played:
+    """Fall, each turned as its seed says, then lie."""
     data, shell = solver.data, bag_shell(BagConfig())
     data.reset()
     starts = [soft_scene(scene, seed=seed) for seed in seeds]
@@ -97,6 +75,11 @@ def _play(
     middle = time.process_time()
     done.append(rollout(solver, worlds, least=1e3, most=lie))
     end = time.process_time()
-    stretch = max(result.watch.stretch for part in done for result in part.values())
-    ends = [data.lane("particles.x", w).copy() for w in worlds]
-    return 1e3 * (middle - begin) / fall, 1e3 * (end - middle) / lie, stretch, ends
+    return Played(
+        cpu=middle - begin,
+        seconds=fall,
+        rest_cpu=end - middle,
+        rest_seconds=lie,
+        stretch=max(result.watch.stretch for part in done for result in part.values()),
+        ends=tuple(data.lane("particles.x", w).copy() for w in worlds),
+    )

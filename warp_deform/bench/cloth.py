@@ -7,16 +7,18 @@ rows fold without contact between edges and, in scenes named so, with it.
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import newton
 import numpy as np
 
-from .errors import InputError
-from .objects.cloth import ClothConfig, add_cloth, cloth_sheet
-from .rollout import GripPath, rollout
-from .solver.solver import SolverFusedXPBD
-from .tasks.cloth_physics import CLOTH_SOLVER
+from ..errors import InputError
+from ..objects.cloth import ClothConfig, add_cloth, cloth_sheet
+from ..rollout import GripPath, rollout
+from ..solver.solver import SolverFusedXPBD
+from ..tasks.cloth_physics import CLOTH_SOLVER
+from .timing import Played, time_worlds
 
 __all__ = ["CLOTH_SCENES", "run_cloth"]
 
@@ -47,33 +49,14 @@ def run_cloth(*, scene: str, lanes: int = 8, worlds: int = 8, repeats: int = 3) 
         raise InputError(f"no scene {scene!r} to time; choose from {', '.join(CLOTH_SCENES)}")
     rows, edge_contact = CLOTH_SCENES[scene]
     config = ClothConfig(rows=rows, columns=rows, edge_contact=edge_contact)
-    worlds = min(worlds, _MOST_WORLDS[rows])
-    begin = time.process_time()
-    lone, many = _solver(config, 1, 1), _solver(config, worlds, lanes)
-    for solver in (lone, many):
-        solver.run(20)
-    start_up = time.process_time() - begin
-    alone = [_play(lone, [seed]) for seed in range(repeats)]
-    together = [_play(many, list(range(worlds))) for _ in range(repeats)]
-    same = all(
-        np.array_equal(end, together[0][3][seed])
-        for seed, (_, _, _, (end,)) in enumerate(alone[:worlds])
+    return time_worlds(
+        scene,
+        partial(_solver, config),
+        _play,
+        lanes=lanes,
+        worlds=min(worlds, _MOST_WORLDS[rows]),
+        repeats=repeats,
     )
-    return {
-        "scene": scene,
-        **_percentiles("ms_per_sim_second", [t[0] for t in alone], 1),
-        **_percentiles("rest_ms_per_sim_second", [t[1] for t in alone], 1),
-        **_percentiles("ms_per_sim_second_lanes", [t[0] for t in together], worlds),
-        **_percentiles("rest_ms_per_sim_second_lanes", [t[1] for t in together], worlds),
-        "lanes": lanes,
-        "worlds": worlds,
-        "dt": lone.config.dt,
-        "substeps": round(1 / 60 / lone.config.dt),
-        "particles": int(lone.model.particle_count),
-        "stretch": max(t[2] for t in alone),
-        "same_bits": same,
-        "start_up_seconds": start_up,
-    }
 
 
 def _solver(config: ClothConfig, worlds: int, lanes: int) -> SolverFusedXPBD:
@@ -85,10 +68,8 @@ def _solver(config: ClothConfig, worlds: int, lanes: int) -> SolverFusedXPBD:
     return SolverFusedXPBD(builder.finalize(device="cpu"), CLOTH_SOLVER, lanes=lanes)
 
 
-def _play(
-    solver: SolverFusedXPBD, seeds: list[int]
-) -> tuple[float, float, float, list[np.ndarray]]:
-    """CPU ms per simulated second in all and lying folded, the largest stretch, and the ends."""
+def _play(solver: SolverFusedXPBD, seeds: list[int]) -> Played:
+    """Settle, fold one corner over, lie folded."""
     data = solver.data
     data.reset()
     worlds = range(len(seeds))
@@ -104,14 +85,11 @@ def _play(
     middle = time.process_time()
     done.append(rollout(solver, worlds, least=_LIE, most=_LIE))
     end = time.process_time()
-    stretch = max(result.watch.stretch for part in done for result in part.values())
-    ends = [data.lane("particles.x", w).copy() for w in worlds]
-    total = _SETTLE + _FOLD + _LIE
-    return 1e3 * (end - begin) / total, 1e3 * (end - middle) / _LIE, stretch, ends
-
-
-def _percentiles(name: str, times: list[float], worlds: int) -> dict[str, float]:
-    return {
-        name: float(np.median(times)) / worlds,
-        f"{name}_p95": float(np.percentile(times, 95)) / worlds,
-    }
+    return Played(
+        cpu=end - begin,
+        seconds=_SETTLE + _FOLD + _LIE,
+        rest_cpu=end - middle,
+        rest_seconds=_LIE,
+        stretch=max(result.watch.stretch for part in done for result in part.values()),
+        ends=tuple(data.lane("particles.x", w).copy() for w in worlds),
+    )

@@ -1,0 +1,62 @@
+"""Blocking calls into a vendor's library that must neither hang nor swallow Ctrl-C."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+__all__ = ["run_bounded"]
+
+T = TypeVar("T")
+# How often the waiting thread looks for Ctrl-C [s], and how long a stopped call may take to end.
+POLL = 0.05
+STOP_TIMEOUT = 3.0
+
+
+def run_bounded(
+    call: Callable[[], T], *, timeout_s: float, stop: Callable[[], None] | None = None
+) -> T:
+    """Return `call()`, made in another thread and waited for at most `timeout_s`.
+
+    On a timeout, and on Ctrl-C, `stop()` is called and the call gets a moment to end; where it does
+    not, or there is no `stop`, its thread is left behind.
+
+    Raises:
+        TimeoutError: the call did not end in time
+        KeyboardInterrupt: on Ctrl-C, after stopping
+        Exception: whatever the call raises
+    """
+    results: list[T] = []
+    errors: list[BaseException] = []
+    # Not Thread.join: interrupted by Ctrl-C, Python 3.11's takes the thread for ended.
+    ended = threading.Event()
+
+    def run() -> None:
+        try:
+            results.append(call())
+        except BaseException as error:  # handed on to the waiting thread below
+            errors.append(error)
+        finally:
+            ended.set()
+
+    def give_up() -> None:
+        if stop is not None:
+            stop()
+            ended.wait(STOP_TIMEOUT)
+
+    deadline = time.monotonic() + timeout_s
+    try:
+        threading.Thread(target=run, daemon=True).start()
+        while not ended.wait(POLL) and time.monotonic() < deadline:
+            pass
+    except KeyboardInterrupt:
+        give_up()
+        raise
+    if not ended.is_set():
+        give_up()
+        raise TimeoutError(f"no answer in {timeout_s:g} s")
+    if errors:
+        raise errors[0]
+    return results[0]

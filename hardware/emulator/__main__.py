@@ -1,0 +1,40 @@
+"""Serve an emulated Franka Panda on loopback until Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from warp_deform.errors import InputError, WarpDeformError
+
+from .process import serve_emulator
+from .server import EmulatorConfig
+from .world import TableWorld
+
+
+def main() -> int:
+    """Serve as the command line says; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m hardware.emulator", description=__doc__)
+    parser.add_argument("--host", default=EmulatorConfig.host, help="address to listen on")
+    parser.add_argument("--paced", action="store_true", help="1 kHz by the wall clock, as a robot")
+    parser.add_argument("--table-z", type=float, help="height of a table under the hand [m]")
+    parser.add_argument(
+        "--object-width", type=float, default=0.0, help="of what every grasp finds [m]"
+    )
+    options = parser.parse_args()
+    try:
+        config = EmulatorConfig(host=options.host, paced=options.paced)
+        world = TableWorld(table_z=options.table_z, object_width=options.object_width)
+        pace = "1 kHz" if config.paced else "in lock-step"
+        print(f"emulated Panda on {config.host}, {pace}; Ctrl-C ends it", file=sys.stderr)
+        serve_emulator(config, world=world)
+    except KeyboardInterrupt:
+        return 130
+    except WarpDeformError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""The Franka Panda's numbers and its kinematics in NumPy: what every part of `hardware` shares.
+
+The tool centre point (TCP) lies between the fingertips of the Franka hand, 0.1034 m below the
+flange; its z axis points out of the hand, and the fingers travel along its y axis.
+
+Source: Franka Control Interface documentation, "Robot and interface specifications" (modified
+Denavit-Hartenberg parameters; limits of the Panda).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = [
+    "DDQ_MAX",
+    "DH_A",
+    "DH_ALPHA",
+    "DH_D",
+    "DQ_MAX",
+    "FLANGE",
+    "GRIPPER_MAX_WIDTH",
+    "HOME_Q",
+    "Q_MAX",
+    "Q_MIN",
+    "TAU_MAX",
+    "PandaKinematics",
+    "flange_T_tcp",
+]
+
+DH_A = (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088)  # [m]
+DH_D = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0)  # [m]
+DH_ALPHA = tuple(np.pi / 2 * quarters for quarters in (0, -1, 1, 1, -1, 1, 1))  # [rad]
+FLANGE = 0.107  # [m] from joint 7's frame
+Q_MIN = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])  # [rad]
+Q_MAX = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])  # [rad]
+DQ_MAX = np.array([2.175] * 4 + [2.61] * 3)  # [rad/s]
+DDQ_MAX = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])  # [rad/s^2]
+TAU_MAX = np.array([87.0] * 4 + [12.0] * 3)  # [N m]
+# The vendor's ready pose: the hand points straight down, 0.31 m ahead and 0.49 m up.
+HOME_Q = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)
+GRIPPER_MAX_WIDTH = 0.08  # [m]
+HAND_LENGTH, HAND_YAW = 0.1034, -np.pi / 4
+
+
+def flange_T_tcp() -> np.ndarray:
+    """Return the pose of the TCP on the flange, shape (4, 4) [m]."""
+    c, s = np.cos(HAND_YAW), np.sin(HAND_YAW)
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, HAND_LENGTH], [0, 0, 0, 1.0]])
+
+
+class PandaKinematics:
+    """Forward kinematics and Jacobian of the nominal arm; a real one differs by some 0.1 mm."""
+
+    def pose(self, q: np.ndarray) -> np.ndarray:
+        """Return base_T_tcp (4, 4) [m] of joint positions [rad] (7,)."""
+        return self._chain(q)[0]
+
+    def poses(self, q: np.ndarray) -> np.ndarray:
+        """Return base_T_tcp (N, 4, 4) [m] of many joint positions [rad] (N, 7) at once."""
+        q = np.asarray(q, dtype=np.float64)
+        cosines, sines = np.cos(q), np.sin(q)
+        T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+        for i, (a, d, alpha) in enumerate(zip(DH_A, DH_D, DH_ALPHA, strict=True)):
+            ca, sa, ct, st = np.cos(alpha), np.sin(alpha), cosines[:, i], sines[:, i]
+            link = np.zeros((len(q), 4, 4))
+            for row, (cosine, sine, shift) in enumerate(
+                [(1.0, 0.0, a), (ca, -sa, -d * sa), (sa, ca, d * ca)]
+            ):
+                link[:, row, 0] = (ct if row == 0 else st) * cosine
+                link[:, row, 1] = (-st if row == 0 else ct) * cosine
+                link[:, row, 2] = sine
+                link[:, row, 3] = shift
+            link[:, 3, 3] = 1.0
+            T = T @ link
+        flange = np.eye(4)
+        flange[2, 3] = FLANGE
+        return T @ (flange @ flange_T_tcp())
+
+    def jacobian(self, q: np.ndarray) -> np.ndarray:
+        """Return the TCP's Jacobian in the base frame, shape (6, 7) [m, rad]."""
+        base_T_tcp, axes, origins = self._chain(q)
+        return np.vstack([np.cross(axes, base_T_tcp[:3, 3] - origins).T, axes.T])
+
+    @staticmethod
+    def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return base_T_tcp, and the joints' axes and origins, each (7, 3)."""
+        T, axes, origins = np.eye(4), np.empty((7, 3)), np.empty((7, 3))
+        for i, (a, d, alpha) in enumerate(zip(DH_A, DH_D, DH_ALPHA, strict=True)):
+            ca, sa, ct, st = np.cos(alpha), np.sin(alpha), np.cos(q[i]), np.sin(q[i])
+            T = T @ np.array(
+                [
+                    [ct, -st, 0.0, a],
+                    [st * ca, ct * ca, -sa, -d * sa],
+                    [st * sa, ct * sa, ca, d * ca],
+                    [0.0, 0.0, 0.0, 1.0],
+                ]
+            )
+            axes[i], origins[i] = T[:3, 2], T[:3, 3]
+        flange = np.eye(4)
+        flange[2, 3] = FLANGE
+        return T @ flange @ flange_T_tcp(), axes, origins

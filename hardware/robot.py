@@ -1,0 +1,307 @@
+"""What every robot backend offers, and the errors it raises.
+
+Units are SI and radians; a pose is a 4x4 matrix base_T_tcp. Connecting to a robot and closing the
+connection never move the arm. The command methods block until the motion has ended.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from types import TracebackType
+from typing import Protocol, Self
+
+import numpy as np
+
+from warp_deform.errors import InputError, WarpDeformError
+
+from .panda_arm import GRIPPER_MAX_WIDTH, Q_MAX, Q_MIN
+
+
+class RobotMode(StrEnum):
+    """What the robot is doing, or why it does nothing."""
+
+    IDLE = "idle"
+    MOVING = "moving"
+    GUIDING = "guiding"
+    REFLEX = "reflex"
+    USER_STOPPED = "user-stopped"
+    RECOVERING = "recovering"
+    OTHER = "other"
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """A reading of the robot.
+
+    Attributes:
+        q: joint positions [rad], shape (7,)
+        base_T_tcp: pose of the TCP [m], shape (4, 4)
+        force_N: external force [N] and torque [N m] on the TCP in the base frame, shape (6,)
+        gripper_width_m: opening between the fingers [m]
+        mode: what the robot is doing
+    """
+
+    q: np.ndarray
+    base_T_tcp: np.ndarray
+    force_N: np.ndarray
+    gripper_width_m: float
+    mode: RobotMode
+
+
+@dataclass(frozen=True)
+class MoveResult:
+    """Where a straight motion ended.
+
+    Attributes:
+        base_T_tcp: the measured pose [m], shape (4, 4)
+        contact: whether the force limit ended it before its target
+    """
+
+    base_T_tcp: np.ndarray
+    contact: bool
+
+
+class RobotError(WarpDeformError):
+    """Something went wrong with the robot; the message is one line and ends with what to do.
+
+    Args:
+        what: what went wrong
+        advice: what to do about it; default: the class's own
+    """
+
+    default_advice = "read the state, clear the cause and call recover()"
+
+    def __init__(self, what: str, *, advice: str | None = None) -> None:
+        self.advice = advice or self.default_advice
+        super().__init__(f"{' '.join(what.split())}; {self.advice}")
+
+
+class ConnectionFailed(RobotError):
+    """No connection came about."""
+
+    default_advice = (
+        "check cable and address, unlock the joints in Desk, activate FCI, and close other clients"
+    )
+
+
+class BackendMissing(ConnectionFailed):
+    """The vendor's package is not installed."""
+
+    default_advice = "install it: pip install 'warp-deform[panda]'"
+
+
+class IncompatibleVersion(ConnectionFailed):
+    """Robot and client speak different versions of the protocol."""
+
+    default_advice = "install the panda-python build for the robot's system version"
+
+
+class ConnectionLost(RobotError):
+    """The robot stopped answering; this connection is of no more use."""
+
+    default_advice = "see whether the arm stands still, check power and network, then connect anew"
+
+
+class MotionError(RobotError):
+    """A motion did not end where it should."""
+
+    default_advice = "see what is in the arm's way; a slower motion or nearer way-points may help"
+
+
+class UnreachablePose(MotionError):
+    """No joint positions lead there; nothing has moved."""
+
+    default_advice = "choose a pose nearer the middle of the workspace"
+
+
+class ReflexError(MotionError):
+    """The robot stopped itself.
+
+    Attributes:
+        reflexes: the robot's names for the reasons
+    """
+
+    default_advice = "look at the arm, clear the cause, then call recover()"
+
+    def __init__(
+        self, what: str, *, reflexes: tuple[str, ...] = (), advice: str | None = None
+    ) -> None:
+        self.reflexes = reflexes
+        super().__init__(what, advice=advice or _reflex_advice(reflexes))
+
+
+def _reflex_advice(reflexes: tuple[str, ...]) -> str | None:
+    for part, advice in REFLEX_ADVICE.items():
+        if any(part in reflex for reflex in reflexes):
+            return advice
+    return None
+
+
+# By a part of the reflex's name; the first that fits counts.
+REFLEX_ADVICE = {
+    "communication_constraints": (
+        "connect the arm directly, use a real-time kernel, close other programs, then recover()"
+    ),
+    "position_limits": "guide the arm away from its joint limits by hand, then recover()",
+    "velocity": "move more slowly, then recover()",
+    "discontinuity": "move more slowly, then recover()",
+    "_reflex": "the arm touched something: clear it, then recover()",
+}
+
+
+class UserStopped(MotionError):
+    """Somebody pressed the user stop (or it was pressed before)."""
+
+    default_advice = "make sure the workspace is clear, release the user stop, then call recover()"
+
+
+class GraspError(RobotError):
+    """The gripper did not do as told; a missed grasp is not an error but grasp()'s answer."""
+
+    default_advice = "see that nothing blocks the fingers, then home the gripper"
+
+
+class SafetyViolation(RobotError):
+    """A command was refused before the robot saw it; nothing has moved."""
+
+    default_advice = "change the command; the limits stand in the configuration"
+
+
+class Robot(Protocol):
+    """An arm with a parallel gripper."""
+
+    def state(self) -> RobotState:
+        """Read the robot now; from any thread, also while it moves.
+
+        Raises:
+            ConnectionLost: it does not answer
+        """
+        ...
+
+    def move_joints(self, q: np.ndarray, *, speed: float) -> None:
+        """Move through joint way-points to the last one.
+
+        The arm comes to rest where the path turns by more than 30 degrees; gentler corners may be
+        rounded a little.
+
+        Args:
+            q: joint positions [rad], one way-point (7,) or several (N, 7)
+            speed: share of the joints' greatest speeds and accelerations, above 0 and up to 1
+
+        Raises:
+            InputError: wrong shape, beyond the joint limits, or a speed that is none
+            MotionError: ended elsewhere; ReflexError, UserStopped: the robot stopped
+            ConnectionLost: it does not answer
+        """
+        ...
+
+    def move_linear(
+        self, base_T_tcp: np.ndarray, *, speed: float, stop_force_N: float | None = None
+    ) -> MoveResult:
+        """Move the TCP to a pose in a straight line, turning evenly on the way.
+
+        Args:
+            base_T_tcp: where to [m], shape (4, 4)
+            speed: greatest speed of the TCP [m/s]
+            stop_force_N: end the motion, without error, when any component of the force on the
+                TCP exceeds this [N]
+
+        Raises:
+            UnreachablePose: no joint positions lead there, or not without a jump
+            InputError, MotionError, ReflexError, UserStopped, ConnectionLost: as move_joints
+        """
+        ...
+
+    def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:
+        """Move the fingers to an opening [m].
+
+        Raises:
+            GraspError: they did not get there
+            ConnectionLost: the gripper does not answer
+        """
+        ...
+
+    def grasp(self, *, width_m: float, force_N: float) -> bool:
+        """Close the fingers; returns whether they hold something about `width_m` [m] wide.
+
+        Raises:
+            GraspError: the gripper failed (a miss is no failure: it returns False)
+            ConnectionLost: the gripper does not answer
+        """
+        ...
+
+    def stop(self) -> None:
+        """End the motion in progress, if any; the gripper keeps what it has. From any thread."""
+        ...
+
+    def recover(self) -> None:
+        """Clear a reflex, so that motions are accepted again; moves nothing.
+
+        Raises:
+            UserStopped: the user stop is pressed
+            ReflexError: the robot needs to be recovered by hand
+            ConnectionLost: it does not answer
+        """
+        ...
+
+    def close(self) -> None:
+        """End the connection; moves nothing, and may be called twice."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None: ...
+
+
+def check_joints(q: np.ndarray) -> np.ndarray:
+    """Return joint way-points [rad] as (N, 7) float64.
+
+    Raises:
+        InputError: wrong shape, not finite, or beyond the joint limits
+    """
+    points = np.atleast_2d(np.asarray(q, dtype=np.float64))
+    if points.ndim != 2 or points.shape[1] != 7 or not len(points):
+        raise InputError(f"q: shape (7,) or (N, 7), not {np.shape(q)}")
+    if not np.isfinite(points).all():
+        raise InputError("q: joint positions must be finite [rad]")
+    beyond = (points < Q_MIN) | (points > Q_MAX)
+    if beyond.any():
+        row, joint = map(int, np.argwhere(beyond)[0])
+        raise InputError(
+            f"q: joint {joint + 1} at {points[row, joint]:.4f} rad is beyond its limits "
+            f"{Q_MIN[joint]} to {Q_MAX[joint]}; choose another way-point"
+        )
+    return points
+
+
+def check_pose(base_T_tcp: np.ndarray) -> np.ndarray:
+    """Return a pose as (4, 4) float64.
+
+    Raises:
+        InputError: no rigid transform
+    """
+    T = np.asarray(base_T_tcp, dtype=np.float64)
+    if T.shape != (4, 4):
+        raise InputError(f"base_T_tcp: shape (4, 4), not {T.shape}")
+    R = T[:3, :3]
+    rigid = np.allclose(R.T @ R, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0.0
+    if not (np.isfinite(T).all() and rigid and np.array_equal(T[3], [0, 0, 0, 1])):
+        raise InputError("base_T_tcp: not a rigid transform; its rotation must be orthonormal")
+    return T
+
+
+def check_range(name: str, value: float, *, low: float, high: float, unit: str) -> float:
+    """Return `value`.
+
+    Raises:
+        InputError: it is not above `low` and at most `high`
+    """
+    if not low < value <= high:
+        raise InputError(f"{name}: above {low} and at most {high} {unit}, not {value}")
+    return float(value)

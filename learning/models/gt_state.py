@@ -1,0 +1,259 @@
+"""Ground-truth baselines: from a state vector to an action, through mixtures of Gaussians.
+
+Source: Seita et al., ICRA 2021, baselines GT-State MLP and GT-State MLP 2-Step, and what their code
+does: sines and cosines of the inputs beside them, the input seen again by every layer, weights and
+biases drawn from N(0, 0.05^2), mixing logits divided by 2.5, the variance raised to the fourth
+power when acting. The inputs are not normalised (the original stores means and deviations, then
+ignores them), and no unit is dropped: the original builds dropout of 0.1 but calls its networks
+without training mode, and then Keras leaves it out.
+
+`exact=True` keeps the original's likelihood, whose densities and probabilities are clipped to
+[1e-8, 1e8] and so lose their gradient far from the data. Otherwise the same likelihood is computed
+in logarithms without clipping, and (1 cm)^2 is added to every variance to bound it: without a bound
+training on actions that follow from the state never settles. Acting hardly feels it, as the fourth
+power leaves 0.1 um.
+
+An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from warp_deform.errors import InputError
+from warp_deform.tasks.ground_truth import YAW_SCALE
+
+__all__ = ["GtState", "GtState2Step", "GtStateConfig", "GtStateLosses", "Mixture", "MixtureMLP",
+           "encode_action", "mixture_loss", "sample_mixture"]  # fmt: skip
+
+_POSE = 3
+_CLIP = (1e-8, 1e8)
+_LEAST_VARIANCE = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class GtStateConfig:
+    """Sizes and choices of a ground-truth baseline; the defaults are the paper's."""
+
+    hidden: int = 128
+    """Units of both hidden layers."""
+    n_gaussians: int = 26
+    """Gaussians of a mixture."""
+    temperature: float = 2.5
+    """What mixing logits are divided by."""
+    one_rotation: bool = True
+    """Act with yaws of 0, as in tasks where rotation does not matter."""
+    lifts: tuple[float, ...] = (0.04,)
+    """Lifts of the task's stages [m]; with several there is one more output that chooses."""
+    exact: bool = False
+    """The original's clipped likelihood."""
+
+    def __post_init__(self) -> None:
+        if not self.lifts:
+            raise InputError("lifts: at least one is needed")
+
+
+class Mixture(NamedTuple):
+    """Isotropic Gaussians: log weights (B, K), means (B, K, D), variances (B, K)."""
+
+    log_pi: Tensor
+    mean: Tensor
+    variance: Tensor
+
+
+class MixtureMLP(nn.Module):
+    """State (B, d) -> a mixture over (B, D), and lift logits (B, n_lifts) or None.
+
+    Args:
+        d_state: d
+        d_action: D
+        config: sizes and choices
+        n_lifts: lifts to choose from; 0 or 1 for none
+        generator: draws the initial weights
+    """
+
+    def __init__(
+        self,
+        d_state: int,
+        d_action: int,
+        *,
+        config: GtStateConfig,
+        n_lifts: int = 0,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        seen, hidden, k = 3 * d_state, config.hidden, config.n_gaussians
+        self.first = _linear(seen, hidden)
+        self.second = _linear(hidden + seen, hidden)
+        self.mean = _linear(hidden + seen, d_action * k)
+        self.log_variance = _linear(hidden + seen, k)
+        self.mixing = _linear(hidden + seen, k)
+        self.lift = _linear(hidden + seen, n_lifts) if n_lifts > 1 else None
+        for parameter in self.parameters():
+            nn.init.normal_(parameter, std=0.05, generator=generator)
+
+    def forward(self, state: Tensor) -> tuple[Mixture, Tensor | None]:
+        """The mixture, and lift logits where there is a choice."""
+        z = torch.cat([state, state.cos(), state.sin()], dim=1)
+        h = torch.cat([functional.relu(self.first(z)), z], dim=1)
+        h = torch.cat([functional.relu(self.second(h)), z], dim=1)
+        log_pi = functional.log_softmax(self.mixing(h) / self.config.temperature, dim=1)
+        variance = self.log_variance(h).exp()
+        if not self.config.exact:
+            variance = variance + _LEAST_VARIANCE
+        mean = self.mean(h).unflatten(1, (self.config.n_gaussians, -1))
+        return Mixture(log_pi, mean, variance), None if self.lift is None else self.lift(h)
+
+
+def mixture_loss(mixture: Mixture, target: Tensor, *, exact: bool = False) -> Tensor:
+    """Mean negative log likelihood [nat] of targets (B, D).
+
+    `exact` clips densities, mixing weights and their sum to [1e-8, 1e8], as the original does.
+    """
+    log_pi, mean, variance = mixture
+    d = target.shape[1]
+    squared = (target[:, None] - mean).square().sum(dim=2)
+    log_density = -squared / (2 * variance) - d / 2 * torch.log(2 * math.pi * variance)
+    if not exact:
+        return -torch.logsumexp(log_pi + log_density, dim=1).mean()
+    product = log_density.exp().clamp(*_CLIP) * log_pi.exp().clamp(*_CLIP)
+    return -product.sum(dim=1).clamp(*_CLIP).log().mean()
+
+
+def sample_mixture(mixture: Mixture, *, rng: np.random.Generator) -> np.ndarray:
+    """One draw (B, D) float64 from each mixture, its variances first raised to the fourth power."""
+    pi = mixture.log_pi.double().exp().cpu().numpy()
+    mean, variance = (each.double().cpu().numpy() for each in (mixture.mean, mixture.variance))
+    draws = np.empty((len(pi), mean.shape[2]))
+    for b, weights in enumerate(pi):
+        k = rng.choice(len(weights), p=weights / weights.sum())
+        draws[b] = rng.normal(mean[b, k], variance[b, k] ** 2)
+    return draws
+
+
+def encode_action(action: np.ndarray) -> np.ndarray:
+    """Targets (B, 6) float32, x, y [m] and -yaw / 15 of pick and place, of actions (B, 7)."""
+    action = np.asarray(action, dtype=float)
+    if action.ndim != 2 or action.shape[1] != 7:
+        raise InputError(f"action: shape (B, 7) is needed, got {action.shape}")
+    return (action[:, :6] * _units()).astype(np.float32)
+
+
+class GtStateLosses(NamedTuple):
+    """Losses [nat] of a batch: of the action's density, and of the lift (0 where there is one)."""
+
+    action: Tensor
+    lift: Tensor
+
+    def total(self) -> Tensor:
+        """Their sum."""
+        return self.action + self.lift
+
+
+class GtState(nn.Module):
+    """GT-State MLP: state (B, d) -> a mixture over pick and place poses at once.
+
+    Args:
+        d_state: length of the ground truth, twice that where the goal's is appended
+        config: sizes and choices
+        seed: of the initial weights
+    """
+
+    name: ClassVar[str] = "gt-mlp"
+
+    def __init__(self, d_state: int, config: GtStateConfig, *, seed: int) -> None:
+        super().__init__()
+        self.config = config
+        generator = torch.Generator().manual_seed(seed)
+        self.network = MixtureMLP(
+            d_state, 2 * _POSE, config=config, n_lifts=len(config.lifts), generator=generator
+        )
+
+    def forward(self, state: Tensor, target: Tensor, lift: Tensor) -> GtStateLosses:
+        """Losses of states (B, d), encoded actions (B, 6) and lift indices (B,) int64."""
+        mixture, logits = self.network(state)
+        loss = mixture_loss(mixture, target, exact=self.config.exact)
+        return GtStateLosses(loss, _lift_loss(logits, lift, loss))
+
+    @torch.no_grad()
+    def act(self, state: Tensor, *, rng: np.random.Generator) -> np.ndarray:
+        """Actions (B, 7) float64 drawn for states (B, d).
+
+        They may lie outside of the action space: nothing is clipped here.
+        """
+        mixture, logits = self.network(state)
+        return _actions(sample_mixture(mixture, rng=rng), logits, self.config)
+
+
+class GtState2Step(nn.Module):
+    """GT-State MLP 2-Step: the pick from the state, then the place from the state and the pick.
+
+    Training feeds the demonstrated pick to the second network, acting the drawn one with a yaw of
+    0. Arguments as of `GtState`.
+    """
+
+    name: ClassVar[str] = "gt-mlp-2step"
+
+    def __init__(self, d_state: int, config: GtStateConfig, *, seed: int) -> None:
+        super().__init__()
+        self.config = config
+        generator = torch.Generator().manual_seed(seed)
+        self.pick = MixtureMLP(d_state, _POSE, config=config, generator=generator)
+        self.place = MixtureMLP(
+            d_state + _POSE,
+            _POSE,
+            config=config,
+            n_lifts=len(config.lifts),
+            generator=generator,
+        )
+
+    def forward(self, state: Tensor, target: Tensor, lift: Tensor) -> GtStateLosses:
+        """Losses of states (B, d), encoded actions (B, 6) and lift indices (B,) int64."""
+        pick, place = target[:, :_POSE], target[:, _POSE:]
+        first, _ = self.pick(state)
+        second, logits = self.place(torch.cat([state, pick], dim=1))
+        loss = mixture_loss(first, pick, exact=self.config.exact)
+        loss = loss + mixture_loss(second, place, exact=self.config.exact)
+        return GtStateLosses(loss, _lift_loss(logits, lift, loss))
+
+    @torch.no_grad()
+    def act(self, state: Tensor, *, rng: np.random.Generator) -> np.ndarray:
+        """Actions (B, 7) float64 drawn for states (B, d); see `GtState.act`."""
+        pick = sample_mixture(self.pick(state)[0], rng=rng)
+        seen = pick.copy()
+        seen[:, 2] = 0.0
+        given = torch.from_numpy(seen).to(state)
+        second, logits = self.place(torch.cat([state, given], dim=1))
+        place = sample_mixture(second, rng=rng)
+        return _actions(np.hstack([pick, place]), logits, self.config)
+
+
+def _actions(draws: np.ndarray, logits: Tensor | None, config: GtStateConfig) -> np.ndarray:
+    """Actions (B, 7) of encoded draws (B, 6)."""
+    poses = draws / _units()
+    if config.one_rotation:
+        poses[:, [2, 5]] = 0.0
+    choice = np.zeros(len(draws), int) if logits is None else logits.argmax(dim=1).cpu().numpy()
+    return np.column_stack([poses, np.array(config.lifts)[choice]])
+
+
+def _units() -> np.ndarray:
+    return np.array([1.0, 1.0, -1.0 / YAW_SCALE] * 2)
+
+
+def _lift_loss(logits: Tensor | None, lift: Tensor, like: Tensor) -> Tensor:
+    return like.new_zeros(()) if logits is None else functional.cross_entropy(logits, lift)
+
+
+def _linear(before: int, after: int) -> nn.Linear:
+    """A layer whose weights are still unset, so that no global generator draws them."""
+    layer: nn.Linear = nn.utils.skip_init(nn.Linear, before, after)
+    return layer

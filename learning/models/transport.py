@@ -1,0 +1,167 @@
+"""Where to place: features of the scene correlated with rotated crops of features around the pick.
+
+Source: Zeng et al., CoRL 2020; Seita et al., ICRA 2021, section on Goal-Conditioned Transporters.
+Kept of the original: zero padding of the raw image by half a crop on every side; three feature
+channels; kernels padded to odd size and the mean taken over the crop's area; nearest sampling,
+whose zeros are zeros of features (crop after the query) or of normalised images (crop before).
+Replaced: the correlation goes through FFTs unless `exact=True`; only the crop is sampled, not the
+turned map; the query network runs only on the window of the image that its crop depends on. All
+three change rounding only.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from .correlation import correlate_direct, correlate_fft
+from .crops import crop_reach, rotated_crops
+from .images import CHANNELS, normalise
+from .resnet import STRIDE, ResNet43, receptive_span
+
+__all__ = ["Transport", "TransportGoalSplit"]
+
+_FEATURES = 3
+
+
+class Transport(nn.Module):
+    """Raw images (B, 4 k, H, W) and picked pixels (B, 2) -> place logits (B, R, H, W).
+
+    The i-th of R rotations turns the crop by 2 pi i / R. 19,666,866 parameters for one image at
+    width 1.
+
+    Args:
+        images: k, 2 where the goal's image is stacked below the current one
+        crop: side of the crop around the pick [pixels], 64 at 320 x 160
+        crop_before_query: run the query network on rotated crops of the image, as the first
+            Transporters did; else rotate and crop its features, as the paper's
+        width: channels relative to the original's
+        exact: correlate directly, as the original does
+        bfloat16: convolve in bfloat16; the correlation stays float32
+        generator: draws the initial weights
+    """
+
+    def __init__(
+        self,
+        *,
+        images: int = 1,
+        crop: int = 64,
+        crop_before_query: bool = False,
+        width: float = 1.0,
+        exact: bool = False,
+        bfloat16: bool = False,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.crop = crop
+        self.crop_before_query = crop_before_query
+        self.exact = exact
+        self.key, self.query = (
+            ResNet43(6 * images, _FEATURES, width=width, bfloat16=bfloat16, generator=generator)
+            for _ in range(2)
+        )
+
+    def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
+        """Place logits (B, R, H, W); `pick` (B, 2) int64 row and column within the image."""
+        x, centres = _pad(image, pick, self.crop)
+        key = self.key(x)
+        if self.crop_before_query:
+            crops = rotated_crops(x, centres, size=self.crop, n_rotations=n_rotations)
+            kernels = self.query(crops.flatten(0, 1)).unflatten(0, crops.shape[:2])
+        else:
+            window = _Window(x, centres, crop=self.crop, n_rotations=n_rotations)
+            kernels = window.crops(self.query(window.of(x)))
+        return _correlate(key, kernels, exact=self.exact)
+
+
+class TransportGoalSplit(nn.Module):
+    """Raw images (B, 8, H, W), current and goal, and picks (B, 2) -> place logits (B, R, H, W).
+
+    A third network sees the goal; its features multiply those of key and query before the crop,
+    so the kernel holds the goal's features at the pick. The crop is always after the query.
+    29,500,299 parameters at width 1. Arguments as of `Transport`.
+    """
+
+    def __init__(
+        self,
+        *,
+        crop: int = 64,
+        width: float = 1.0,
+        exact: bool = False,
+        bfloat16: bool = False,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.crop = crop
+        self.exact = exact
+        self.key, self.query, self.goal = (
+            ResNet43(6, _FEATURES, width=width, bfloat16=bfloat16, generator=generator)
+            for _ in range(3)
+        )
+
+    def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
+        """Place logits (B, R, H, W); `pick` (B, 2) int64 row and column within the image."""
+        current, centres = _pad(image[:, :CHANNELS], pick, self.crop)
+        goal = self.goal(_pad(image[:, CHANNELS:], pick, self.crop)[0])
+        window = _Window(current, centres, crop=self.crop, n_rotations=n_rotations)
+        kernels = window.crops(self.query(window.of(current)) * window.of(goal))
+        return _correlate(self.key(current) * goal, kernels, exact=self.exact)
+
+
+def _pad(image: Tensor, pick: Tensor, crop: int) -> tuple[Tensor, Tensor]:
+    """The network's input, padded by half a crop a side, and the picks in it (on the CPU)."""
+    half = crop // 2
+    return normalise(functional.pad(image, (half, half, half, half))), pick.cpu() + half
+
+
+def _correlate(key: Tensor, kernels: Tensor, *, exact: bool) -> Tensor:
+    return (correlate_direct if exact else correlate_fft)(key, kernels)
+
+
+class _Window:
+    """The part of a padded image that decides the query's features in the crops of a batch.
+
+    Every picture has a window of the same size, moved to lie within it: kernels of convolutions are
+    prepared once per size.
+    """
+
+    def __init__(self, x: Tensor, centres: Tensor, *, crop: int, n_rotations: int) -> None:
+        self.size, self.n_rotations = crop, n_rotations
+        self.shape = (x.shape[-2], x.shape[-1])
+        reach = crop_reach(crop, n_rotations)
+        widest = max(_needed(phase, phase, reach)[1] for phase in range(STRIDE))
+        lowest, highest = centres.min(dim=0).values.tolist(), centres.max(dim=0).values.tolist()
+        spans = []
+        for length, low, high in zip(self.shape, lowest, highest, strict=True):
+            extent = min(length, _round_up(high - low + widest + STRIDE))
+            start = _needed(low, high, reach)[0] // STRIDE * STRIDE
+            start = max(0, min(start, length - extent))
+            spans.append(slice(start, start + extent))
+        self.rows, self.columns = spans
+        self.centres = centres
+
+    def of(self, x: Tensor) -> Tensor:
+        """The window of maps (B, C, H, W)."""
+        return x[:, :, self.rows, self.columns]
+
+    def crops(self, features: Tensor) -> Tensor:
+        """Rotated crops (B, R, C, S, S) of features of the window."""
+        return rotated_crops(
+            features,
+            self.centres,
+            size=self.size,
+            n_rotations=self.n_rotations,
+            origin=(self.rows.start, self.columns.start),
+            shape=self.shape,
+        )
+
+
+def _needed(low: int, high: int, reach: int) -> tuple[int, int]:
+    """First input row, and number of rows, behind features within `reach` of rows low to high."""
+    start, stop = receptive_span(low - reach, high + reach + 1)
+    return start, stop - start
+
+
+def _round_up(length: int) -> int:
+    return -(-length // STRIDE) * STRIDE

@@ -1,0 +1,299 @@
+"""Transporter, Transporter-Goal-Split and Transporter-Goal-Stack: where to pick, place and lift.
+
+Source: Zeng et al., CoRL 2020; Seita et al., ICRA 2021, sections on Transporters and their
+goal-conditioned variants, appendix on training; and what their code does, which the modules beside
+this one take up point by point.
+
+`exact=True` computes what the original computes, by the same operations. The default differs by a
+pick network that sees the image unpadded (attention.py); all else is the same but for rounding.
+Kept in both: the crop comes after the query for Transporter and Goal-Split, before it for
+Goal-Stack (the original's default, which only the plain Transporter's configuration overrides);
+rotations are counted separately for training (24) and evaluation (1 in most of the original's
+results). The lift is ours: the original reads the height of the motion from the simulator.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from warp_deform.errors import InputError
+from warp_deform.rendering.pixels import SHAPE
+
+from .attention import Attention
+from .images import CHANNELS, image_tensor
+from .lift import LiftHead
+from .resnet import STRIDE
+from .transport import Transport, TransportGoalSplit
+
+__all__ = ["PRESETS", "Batch", "GoalSplit", "GoalStack", "Losses", "Picture", "PixelActions",
+           "Transporter", "TransporterConfig"]  # fmt: skip
+
+Picture = tuple[np.ndarray, np.ndarray]
+"""Colour (320, 160, 3) uint8 and height (320, 160) float32 [m], as in an observation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransporterConfig:
+    """Sizes and choices of a Transporter; the defaults are the paper's."""
+
+    scale: int = 1
+    """Camera pixels along the side of a network pixel: 1 for 320 x 160, 2 for 160 x 80."""
+    width: float = 1.0
+    """Channels relative to the original's."""
+    crop: int = 64
+    """Side of the crop around the pick [network pixels]; 64 are 0.2 m at scale 1."""
+    crop_before_query: bool | None = None
+    """Run the query on crops of the image; None: as the original does for the agent."""
+    n_rotations_train: int = 24
+    """Place rotations told apart in training; 24 are steps of 15 degrees."""
+    n_rotations_eval: int = 1
+    """Place rotations considered when acting; with 1 the place yaw is always 0."""
+    lifts: tuple[float, ...] = (0.04,)
+    """Lifts of the task's stages [m]; with one there is nothing to predict and no lift head."""
+    bfloat16: bool = False
+    """Convolve in bfloat16: `paper` is 3 times faster where processors multiply it natively."""
+    exact: bool = False
+    """Compute by the original's operations, several times slower: for parity."""
+
+    def __post_init__(self) -> None:
+        sides = [side / self.scale if self.scale >= 1 else math.nan for side in SHAPE]
+        if any(side % STRIDE != 0 for side in sides):
+            raise InputError(f"scale: must divide the picture into eights, got {self.scale}")
+        if self.crop < STRIDE or self.crop % STRIDE:
+            raise InputError(f"crop: a multiple of {STRIDE} pixels is needed, got {self.crop}")
+        for name in ("n_rotations_train", "n_rotations_eval"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: at least 1 is needed, got {getattr(self, name)}")
+        if not self.lifts:
+            raise InputError("lifts: at least one is needed")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the network's image [pixels]."""
+        return SHAPE[0] // self.scale, SHAPE[1] // self.scale
+
+    def to_network(self, pixel: np.ndarray) -> np.ndarray:
+        """Network pixels (..., 2) int64 that hold camera pixels (..., 2) int."""
+        return np.asarray(pixel, dtype=np.int64) // self.scale
+
+    def to_camera(self, pixel: np.ndarray) -> np.ndarray:
+        """Centres (..., 2) float64 of network pixels (..., 2), in camera pixels."""
+        return (np.asarray(pixel, dtype=float) + 0.5) * self.scale - 0.5
+
+
+PRESETS = {
+    "paper": TransporterConfig(),
+    # A step costs nearly 30 times less CPU time than the paper's (benchmarks/models.py).
+    "fast": TransporterConfig(scale=2, width=0.25, crop=32, n_rotations_train=1),
+}
+
+
+class Batch(NamedTuple):
+    """Labelled images, in network pixels.
+
+    image: (B, 4 k, H, W) float32, raw (see `image_tensor`): the current picture, then the goal's
+    pick, place: (B, 2) int64, row and column
+    theta: (B,) float, pick yaw minus place yaw [rad]
+    lift: (B,) int64, index into the configuration's lifts
+    """
+
+    image: Tensor
+    pick: Tensor
+    place: Tensor
+    theta: Tensor
+    lift: Tensor
+
+
+class Losses(NamedTuple):
+    """Cross entropies [nat], means over a batch; no two share a parameter.
+
+    Their sum may therefore be minimised at once. `lift` is 0 where there is one lift.
+    """
+
+    attention: Tensor
+    transport: Tensor
+    lift: Tensor
+
+    def total(self) -> Tensor:
+        """Their sum."""
+        return self.attention + self.transport + self.lift
+
+
+class PixelActions(NamedTuple):
+    """What to do in each of B pictures.
+
+    pick, place: (B, 2) float64 row and column [camera pixels]
+    place_yaw: (B,) float64 [rad], within -pi to pi; the pick yaw is 0
+    lift: (B,) float64 [m]
+    """
+
+    pick: np.ndarray
+    place: np.ndarray
+    place_yaw: np.ndarray
+    lift: np.ndarray
+
+
+class Transporter(nn.Module):
+    """Pick by attention, place by transport, lift by a head on the pick's crop.
+
+    >>> agent = Transporter(PRESETS["fast"], seed=0)
+    >>> color, height = np.zeros((320, 160, 3), np.uint8), np.zeros((320, 160), np.float32)
+    >>> agent.act(agent.image((color, height))[None]).place.shape
+    (1, 2)
+
+    Args:
+        config: sizes and choices
+        seed: of the initial weights
+    """
+
+    name: ClassVar[str] = "transporter"
+    pictures: ClassVar[int] = 1
+    """1, or 2 where the goal is seen too."""
+    crop_before_query: ClassVar[bool] = False
+
+    def __init__(self, config: TransporterConfig, *, seed: int) -> None:
+        super().__init__()
+        self.config = config
+        generator = torch.Generator().manual_seed(seed)
+        self.attention = Attention(
+            images=self.pictures,
+            width=config.width,
+            exact=config.exact,
+            bfloat16=config.bfloat16,
+            generator=generator,
+        )
+        self.transport = self._transport(generator)
+        n_lifts = len(config.lifts)
+        self.lift = (
+            LiftHead(n_lifts, crop=config.crop, generator=generator) if n_lifts > 1 else None
+        )
+
+    def _transport(self, generator: torch.Generator) -> nn.Module:
+        config = self.config
+        before = config.crop_before_query
+        return Transport(
+            images=self.pictures,
+            crop=config.crop,
+            crop_before_query=self.crop_before_query if before is None else before,
+            width=config.width,
+            exact=config.exact,
+            bfloat16=config.bfloat16,
+            generator=generator,
+        )
+
+    def image(self, current: Picture, goal: Picture | None = None) -> Tensor:
+        """The network's image (4 or 8, H, W) of a picture, and of the goal's if the agent has one.
+
+        Raises:
+            InputError: a goal is missing, or given to an agent that has none.
+        """
+        if (goal is not None) != (self.pictures == 2):
+            raise InputError(f"{self.name}: {self.pictures - 1} goal pictures are needed")
+        pictures = [current] if goal is None else [current, goal]
+        return torch.cat([image_tensor(*each, scale=self.config.scale) for each in pictures])
+
+    def forward(self, batch: Batch) -> Losses:
+        """Losses of a batch.
+
+        Raises:
+            InputError: an image of another shape, or a labelled pixel outside of it.
+        """
+        image = batch.image
+        self._check(image)
+        picks, places = (
+            _flat(name, pixel, self.config.shape)
+            for name, pixel in (("pick", batch.pick), ("place", batch.place))
+        )
+        n = self.config.n_rotations_train
+        attention = functional.cross_entropy(
+            self.attention(image).flatten(1), picks.to(image.device)
+        )
+        # Halves go to even, as in the original.
+        rotation = torch.round(batch.theta.double() / (2 * math.pi / n)).long() % n
+        label = rotation.to(image.device) * math.prod(self.config.shape) + places.to(image.device)
+        logits = self.transport(image, batch.pick, n_rotations=n)
+        transport = functional.cross_entropy(logits.flatten(1), label)
+        lift = attention.new_zeros(())
+        if self.lift is not None:
+            lift = functional.cross_entropy(
+                self.lift(image, batch.pick), batch.lift.to(image.device)
+            )
+        return Losses(attention, transport, lift)
+
+    @torch.no_grad()
+    def act(self, image: Tensor) -> PixelActions:
+        """Most likely pick, then place and lift given the pick, for images (B, 4 k, H, W).
+
+        Raises:
+            InputError: an image of another shape.
+        """
+        self._check(image)
+        n, (rows, columns) = self.config.n_rotations_eval, self.config.shape
+        best = self.attention(image).flatten(1).argmax(dim=1).cpu()
+        pick = torch.stack([best // columns, best % columns], dim=1)
+        best = self.transport(image, pick, n_rotations=n).flatten(1).argmax(dim=1).cpu()
+        rotation, best = best // (rows * columns), best % (rows * columns)
+        place = torch.stack([best // columns, best % columns], dim=1)
+        yaw = -rotation.double().numpy() * (2 * math.pi / n)
+        choice = np.zeros(len(image), int)
+        if self.lift is not None:
+            choice = self.lift(image, pick).argmax(dim=1).cpu().numpy()
+        return PixelActions(
+            self.config.to_camera(pick.numpy()),
+            self.config.to_camera(place.numpy()),
+            np.where(yaw < -math.pi, yaw + 2 * math.pi, yaw),
+            np.array(self.config.lifts)[choice],
+        )
+
+    def _check(self, image: Tensor) -> None:
+        shape = (CHANNELS * self.pictures, *self.config.shape)
+        if image.ndim != 4 or image.shape[1:] != shape:
+            raise InputError(f"image: shape (B, {shape}) is needed, got {tuple(image.shape)}")
+
+
+class GoalSplit(Transporter):
+    """Transporter-Goal-Split: a third network sees the goal and multiplies key and query features.
+
+    Attention sees current and goal pictures stacked; `crop_before_query` has no meaning here.
+    """
+
+    name = "goal-split"
+    pictures = 2
+
+    def _transport(self, generator: torch.Generator) -> nn.Module:
+        config = self.config
+        if config.crop_before_query:
+            raise InputError("crop_before_query: Goal-Split multiplies features before it crops")
+        return TransportGoalSplit(
+            crop=config.crop,
+            width=config.width,
+            exact=config.exact,
+            bfloat16=config.bfloat16,
+            generator=generator,
+        )
+
+
+class GoalStack(Transporter):
+    """Transporter-Goal-Stack: every network sees current and goal pictures stacked."""
+
+    name = "goal-stack"
+    pictures = 2
+    crop_before_query = True
+
+
+def _flat(name: str, pixel: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Index (B,) of pixels (B, 2) in a flattened image."""
+    limit = torch.tensor(shape, device=pixel.device)
+    outside = ((pixel < 0) | (pixel >= limit)).any(dim=1)
+    if outside.any():
+        raise InputError(
+            f"{name}: pixel {pixel[outside][0].tolist()} lies outside of {shape[0]} x {shape[1]}"
+        )
+    return pixel[:, 0] * shape[1] + pixel[:, 1]

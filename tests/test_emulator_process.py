@@ -1,0 +1,226 @@
+"""The emulated Panda as a process: its clock, its clients, its user stop, its end."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from emulator_client import HOME, OFF_HOME, libfranka, reset, timed, vendor_client
+from emulator_worlds import RecordingWorld
+
+from hardware.emulator import EmulatorFailed, EmulatorProcess, TableWorld
+from hardware.emulator.server import AddressTaken, EmulatorConfig
+from warp_deform.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+pytestmark = [
+    pytest.mark.emulator,
+    pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
+]
+
+
+@pytest.fixture(scope="module")
+def emulator() -> Iterator[EmulatorProcess]:
+    with EmulatorProcess(world=RecordingWorld, free_host=True) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def client(emulator: EmulatorProcess) -> Iterator[SimpleNamespace]:
+    with vendor_client(emulator.host) as client:
+        yield client
+
+
+@pytest.fixture
+def panda(emulator: EmulatorProcess, client: SimpleNamespace) -> SimpleNamespace:
+    """The vendor's client of an arm at home."""
+    reset(client, emulator)
+    return client
+
+
+# User stop, time, and the process.
+
+
+def test_user_stop_until_it_is_released(panda: SimpleNamespace, emulator: EmulatorProcess) -> None:
+    emulator.user_stop()
+    with pytest.raises(RuntimeError, match="rejected"):
+        panda.robot.automatic_error_recovery()
+    assert not panda.panda.move_to_joint_position(OFF_HOME, speed_factor=0.2)
+    np.testing.assert_array_equal(emulator.snapshot()["q"], HOME)
+    emulator.user_stop(False)
+    assert panda.panda.move_to_joint_position(OFF_HOME, speed_factor=0.2)
+
+
+def scripted_run() -> dict[str, object]:
+    """Motions, a grasp, a reflex and its recovery in a fresh emulator; returns where it ended."""
+    with EmulatorProcess(world=RecordingWorld, free_host=True) as emulator:
+        with vendor_client(emulator.host) as client:
+            client.panda.move_to_joint_position(OFF_HOME, speed_factor=0.3)
+            emulator.call_world("place_object", width=0.01)
+            client.gripper.grasp(0.01, 0.05, 10.0)
+            emulator.inject_reflex("joint_reflex", after_ticks=150)
+            client.panda.move_to_start(speed_factor=0.3)
+            client.panda.recover()
+            client.panda.move_to_start(speed_factor=0.5)
+        return {**emulator.snapshot(), "trace": emulator.call_world("take")}
+
+
+def test_lock_step_gives_the_same_bits_twice() -> None:
+    once, again = scripted_run(), scripted_run()
+    for key in ("q", "base_T_tcp"):
+        assert once[key].tobytes() == again[key].tobytes()
+    for key in ("ticks", "missed", "sim_seconds", "gripper_width"):
+        assert once[key] == again[key]
+    for key, values in once["trace"].items():
+        assert values.tobytes() == again["trace"][key].tobytes(), key
+    assert once["ticks"] > 1000
+
+
+def test_lock_step_is_faster_than_the_robot(
+    panda: SimpleNamespace, emulator: EmulatorProcess
+) -> None:
+    before, clock = emulator.snapshot()["sim_seconds"], time.perf_counter()
+    assert panda.panda.move_to_joint_position(OFF_HOME, speed_factor=0.05)
+    simulated = emulator.snapshot()["sim_seconds"] - before
+    assert simulated > time.perf_counter() - clock
+
+
+@pytest.fixture(scope="module")
+def paced() -> Iterator[EmulatorProcess]:
+    with EmulatorProcess(EmulatorConfig(paced=True), free_host=True) as process:
+        yield process
+
+
+def test_paced_time_is_the_wall_clocks(paced: EmulatorProcess) -> None:
+    robot = libfranka.Robot(paced.host)
+    first, clock = robot.read_once().time.to_sec(), time.perf_counter()
+    while time.perf_counter() - clock < 0.5:
+        last = robot.read_once().time.to_sec()
+    assert last - first == pytest.approx(time.perf_counter() - clock, abs=0.1)
+
+
+def test_a_silent_client_loses_the_robot(paced: EmulatorProcess) -> None:
+    robot = libfranka.Robot(paced.host)
+
+    def make(t: float, state: object) -> object:
+        if t > 0.05:
+            time.sleep(0.2)
+        return libfranka.JointPositions(list(state.q_d))
+
+    with pytest.raises(RuntimeError, match="communication_constraints_violation"):
+        robot.control_joint_position(timed(make, seconds=1.0))
+    robot.automatic_error_recovery()
+
+
+def test_a_client_that_goes_away_in_mid_motion_leaves_a_robot_for_the_next(
+    paced: EmulatorProcess,
+) -> None:
+    def leave(t: float, state: object) -> object:
+        if t > 0.05:
+            raise ValueError("gone")
+        return libfranka.JointPositions(list(state.q_d))
+
+    with pytest.raises(ValueError, match="gone"):
+        libfranka.Robot(paced.host).control_joint_position(timed(leave, seconds=1.0))
+    until = time.monotonic() + 5.0
+    while paced.snapshot()["mode"] == "move" and time.monotonic() < until:
+        time.sleep(0.01)
+    robot = libfranka.Robot(paced.host)
+    if robot.read_once().robot_mode == libfranka.RobotMode.kReflex:
+        robot.automatic_error_recovery()
+    robot.control_joint_position(
+        timed(lambda t, state: libfranka.JointPositions(list(state.q_d)), seconds=0.05)
+    )
+
+
+def test_a_second_client_is_turned_away(panda: SimpleNamespace, emulator: EmulatorProcess) -> None:
+    with pytest.raises(RuntimeError, match="libfranka"):
+        libfranka.Robot(emulator.host)
+    assert panda.robot.read_once().q[0] == HOME[0]
+
+
+def test_bytes_that_are_no_request_drop_the_client(paced: EmulatorProcess) -> None:
+    with socket.create_connection((paced.host, 1337), timeout=5.0) as stranger:
+        stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        assert stranger.recv(100) == b""
+    libfranka.Robot(paced.host)
+
+
+def test_a_world_is_made_in_the_emulators_process() -> None:
+    world = partial(TableWorld, object_width=0.02)
+    with (
+        EmulatorProcess(world=world, free_host=True) as emulator,
+        vendor_client(emulator.host) as client,
+    ):
+        assert not client.gripper.move(0.0, 0.1)
+        assert emulator.snapshot()["gripper_width"] == 0.02
+
+
+def test_an_address_serves_one_emulator(emulator: EmulatorProcess) -> None:
+    with pytest.raises(AddressTaken, match="cannot listen on 127"):
+        EmulatorProcess(EmulatorConfig(host=emulator.host))
+
+
+def test_questions_that_have_no_answer(emulator: EmulatorProcess) -> None:
+    with pytest.raises(InputError, match="reflex: one of"):
+        emulator.inject_reflex("no_such_reflex")
+    with pytest.raises(InputError, match="no method 'dance'"):
+        emulator.call_world("dance")
+    with pytest.raises(InputError, match="seven finite"):
+        emulator.place(np.full(7, np.nan))
+    with pytest.raises(InputError, match="seven"):
+        EmulatorConfig(q=(0.0,))
+    with pytest.raises(InputError, match="gripper_width"):
+        EmulatorConfig(gripper_width=0.5)
+    with pytest.raises(InputError, match="object_width"):
+        TableWorld(object_width=0.1)
+
+
+def test_a_killed_emulator_says_so() -> None:
+    process = EmulatorProcess(free_host=True)
+    process.kill()
+    with pytest.raises(EmulatorFailed, match="has ended"):
+        process.snapshot()
+    process.close()
+
+
+def test_command_line() -> None:
+    """Serves until it is interrupted; a mistake is one line and exit code 2."""
+    command = [sys.executable, "-m", "hardware.emulator"]
+    running = subprocess.Popen(
+        [*command, "--host", "127.0.78.1"], stderr=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    watchdog = threading.Timer(30.0, running.kill)
+    watchdog.start()
+    try:
+        assert "emulated Panda on 127.0.78.1" in running.stderr.readline()
+        until = time.monotonic() + 20.0
+        while True:
+            try:
+                libfranka.Robot("127.0.78.1")
+                break
+            except RuntimeError:
+                assert time.monotonic() < until
+                time.sleep(0.05)
+        running.send_signal(2)
+        assert running.wait(10.0) == 130
+    finally:
+        watchdog.cancel()
+        running.kill()
+        running.stderr.close()
+        running.wait()
+    wrong = subprocess.run(
+        [*command, "--object-width", "1"], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    assert wrong.returncode == 2
+    assert wrong.stderr.startswith("error: object_width") and wrong.stderr.count("\n") == 1

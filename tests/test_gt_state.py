@@ -1,0 +1,140 @@
+"""The ground-truth baselines: mixtures against closed forms, and what the networks learn."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from learning.models.adam import KerasAdam
+from learning.models.gt_state import (
+    GtState,
+    GtState2Step,
+    GtStateConfig,
+    Mixture,
+    encode_action,
+    mixture_loss,
+    sample_mixture,
+)
+from warp_deform.errors import InputError
+
+AGENTS = (GtState, GtState2Step)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def mixture(seed: int = 0, batch: int = 4, k: int = 3, d: int = 2) -> Mixture:
+    g = torch.Generator().manual_seed(seed)
+    weights = torch.rand(batch, k, generator=g)
+    return Mixture(
+        (weights / weights.sum(dim=1, keepdim=True)).log(),
+        torch.randn(batch, k, d, generator=g),
+        0.3 + torch.rand(batch, k, generator=g),
+    )
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_loss_is_the_mixture_s_negative_log_likelihood(exact: bool) -> None:
+    mix, target = mixture(), torch.linspace(-1, 1, 8).reshape(4, 2)
+    pi, mean, variance = mix.log_pi.exp().numpy(), mix.mean.numpy(), mix.variance.numpy()
+    expected = [
+        -math.log(
+            sum(
+                pi[b, k] * multivariate_normal.pdf(target[b], mean[b, k], variance[b, k])
+                for k in range(3)
+            )
+        )
+        for b in range(4)
+    ]
+    assert float(mixture_loss(mix, target, exact=exact)) == pytest.approx(
+        np.mean(expected), rel=1e-5
+    )
+
+
+def test_only_the_exact_loss_is_clipped_far_away() -> None:
+    mix = mixture()
+    mean = mix.mean.clone().requires_grad_()
+    far = torch.full((4, 2), 40.0)
+    clipped = mixture_loss(mix._replace(mean=mean), far, exact=True)
+    assert float(clipped.detach()) == pytest.approx(-math.log(1e-8), rel=1e-5)
+    clipped.backward()
+    assert mean.grad is not None
+    assert not mean.grad.any()
+    mixture_loss(mix._replace(mean=mean), far).backward()
+    assert mean.grad.abs().max() > 1
+
+
+def test_samples_have_the_sharpened_variance() -> None:
+    mix = Mixture(
+        torch.tensor([[0.0, -50.0]]).expand(4000, -1),
+        torch.tensor([[[1.0, -2.0], [9.0, 9.0]]]).expand(4000, -1, -1),
+        torch.tensor([[0.5, 1.0]]).expand(4000, -1),
+    )
+    draws = sample_mixture(mix, rng=np.random.default_rng(0))
+    assert draws.mean(axis=0) == pytest.approx([1.0, -2.0], abs=0.02)
+    assert draws.var(axis=0) == pytest.approx([0.5**4] * 2, rel=0.1)
+
+
+def test_parameter_counts() -> None:
+    d, hidden, k = 147, 128, 26
+    features = hidden + 3 * d
+    body = (3 * d + 1) * hidden + (features + 1) * hidden
+    one = GtState(d, GtStateConfig(), seed=0)
+    assert sum(p.numel() for p in one.parameters()) == body + (features + 1) * (6 * k + 2 * k)
+    assert float(one.network.first.weight.detach().std()) == pytest.approx(0.05, rel=0.02)
+    assert float(one.network.first.bias.detach().std()) == pytest.approx(0.05, rel=0.3)
+
+
+@pytest.mark.parametrize("agent_class", AGENTS)
+def test_agent_learns_an_action_that_depends_on_the_state(
+    agent_class: type[GtState] | type[GtState2Step],
+) -> None:
+    """Pick the block, place it opposite, turned as it is; carry high where it lies far."""
+    config = GtStateConfig(lifts=(0.05, 0.3), one_rotation=False)
+    agent = agent_class(3, config, seed=0)
+    rng = np.random.default_rng(0)
+
+    def scenes(n: int) -> tuple[np.ndarray, np.ndarray]:
+        x, y, yaw = rng.uniform([0.3, -0.4, -2], [0.7, 0.4, 2], (n, 3)).T
+        lift = np.where(y > 0, 0.3, 0.05)
+        action = np.column_stack([x, y, 0 * yaw, x, -y, yaw, lift])
+        return np.column_stack([x, y, -yaw / 15]).astype(np.float32), action
+
+    optimiser = KerasAdam(agent.parameters(), lr=1e-3)
+    for _ in range(400):
+        state, action = scenes(64)
+        losses = agent(
+            torch.from_numpy(state),
+            torch.from_numpy(encode_action(action)),
+            torch.from_numpy(action[:, 6] > 0.1).long(),
+        )
+        optimiser.zero_grad()
+        losses.total().backward()
+        optimiser.step()
+    state, action = scenes(64)
+    drawn = agent.act(torch.from_numpy(state), rng=np.random.default_rng(1))
+    again = agent.act(torch.from_numpy(state), rng=np.random.default_rng(1))
+    assert np.array_equal(drawn, again)
+    assert np.median(np.abs(drawn - action)[:, [0, 1, 3, 4]]) < 0.02
+    assert np.median(np.abs(drawn - action)[:, 5]) < 0.3
+    assert (drawn[:, 6] == action[:, 6])[np.abs(state[:, 1]) > 0.1].mean() > 0.95
+    agent.config = dataclasses.replace(config, one_rotation=True)
+    assert not agent.act(torch.from_numpy(state), rng=np.random.default_rng(1))[:, [2, 5]].any()
+
+
+def test_wrong_input_is_refused() -> None:
+    with pytest.raises(InputError, match=r"\(B, 7\)"):
+        encode_action(np.zeros(7))
+    with pytest.raises(InputError, match="lifts"):
+        GtStateConfig(lifts=())

@@ -1,0 +1,129 @@
+"""Connecting to a Panda and losing it: each failure is typed, in time, and says what to do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from emulator_client import HOME, OFF_HOME, says_what_to_do
+
+from hardware import (
+    BackendMissing,
+    ConnectionFailed,
+    ConnectionLost,
+    IncompatibleVersion,
+    ReflexError,
+    RobotMode,
+)
+from hardware.backends.panda import PandaConfig, PandaRobot
+from hardware.emulator import EmulatorProcess
+from hardware.emulator.server import EmulatorConfig
+
+ROOT = Path(__file__).resolve().parent.parent
+pytestmark = [
+    pytest.mark.emulator,
+    pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
+    pytest.mark.timeout(60),
+]
+
+
+def test_a_robot_in_reflex_can_be_connected_to() -> None:
+    with EmulatorProcess(free_host=True) as emulator:
+        with PandaRobot(PandaConfig(host=emulator.host)) as robot:
+            emulator.inject_reflex("joint_reflex", after_ticks=50)
+            with pytest.raises(ReflexError):
+                robot.move_joints(OFF_HOME, speed=0.2)
+        with PandaRobot(PandaConfig(host=emulator.host)) as robot:
+            assert robot.state().mode == RobotMode.REFLEX
+            robot.recover()
+            robot.move_joints(HOME, speed=0.3)
+        with pytest.raises(ConnectionLost, match="closed"):
+            robot.state()
+        robot.close()
+
+
+def test_nothing_listens() -> None:
+    with pytest.raises(ConnectionFailed, match="refused") as caught:
+        PandaRobot(PandaConfig(host="127.0.79.1"))
+    assert says_what_to_do(caught.value) and "activate FCI" in caught.value.advice
+
+
+def test_something_listens_that_never_answers() -> None:
+    clock = time.monotonic()
+    with socket.create_server(("127.0.79.2", 1337)):
+        with pytest.raises(ConnectionFailed, match=r"no answer in 0\.5 s") as caught:
+            PandaRobot(PandaConfig(host="127.0.79.2", connect_timeout_s=0.5))
+    assert says_what_to_do(caught.value)
+    assert time.monotonic() - clock < 5.0
+
+
+def test_another_version() -> None:
+    with EmulatorProcess(EmulatorConfig(version=4), free_host=True) as emulator:
+        with pytest.raises(IncompatibleVersion, match="version 4") as caught:
+            PandaRobot(PandaConfig(host=emulator.host))
+        assert says_what_to_do(caught.value)
+
+
+def test_the_vendors_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "panda_py", None)
+    with pytest.raises(BackendMissing, match=r"pip install 'warp-deform\[panda\]'") as caught:
+        PandaRobot(PandaConfig(host="127.0.79.1"))
+    assert says_what_to_do(caught.value)
+
+
+KILLED = """
+import json, threading, time
+import numpy as np
+from hardware import ConnectionLost
+from hardware.backends.panda import PandaConfig, PandaRobot
+from hardware.emulator import EmulatorProcess
+
+if __name__ == "__main__":
+    emulator = EmulatorProcess(free_host=True)
+    robot = PandaRobot(PandaConfig(host=emulator.host))
+    goal = np.array([0.6, -0.5, 0.1, -2.2, 0.05, 1.7, 0.9])
+    threading.Timer(0.3, emulator.kill).start()
+    report = []
+    for call in (
+        lambda: robot.move_joints(goal, speed=0.005),
+        robot.state,
+        lambda: robot.grasp(width_m=0.01, force_N=10.0),
+        robot.recover,
+        robot.stop,
+        robot.close,
+    ):
+        clock = time.monotonic()
+        try:
+            call()
+            report.append(["nothing", "", 0.0])
+        except ConnectionLost as error:
+            report.append([type(error).__name__, str(error), time.monotonic() - clock])
+    print(json.dumps(report))
+"""
+
+
+def test_a_robot_that_goes_away_in_mid_motion_costs_neither_time_nor_the_process(
+    tmp_path: Path,
+) -> None:
+    """In a process of its own: the vendor's destructor would abort it."""
+    script = tmp_path / "killed.py"
+    script.write_text(KILLED)
+    done = subprocess.run(
+        [sys.executable, script],
+        capture_output=True,
+        text=True,
+        timeout=50,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    *lost, closed = json.loads(done.stdout)
+    assert [kind for kind, _, _ in lost] == ["ConnectionLost"] * 5
+    assert all("connect anew" in text and seconds < 8.0 for _, text, seconds in lost)
+    assert closed[0] == "nothing"

@@ -1,0 +1,139 @@
+"""Search for an action by simulation, with a budget of rollouts: enumerate, draw, or refine (CEM).
+
+All begin with the candidates of the task. `enumerate` takes the best of them; `random` tries others
+drawn around them; `cem`, the cross-entropy method over a mixture of picks, draws around the best so
+far, ever closer. Two actions ahead, each of the best states is searched again.
+Source: Rubinstein, Kroese, "The Cross-Entropy Method", 2004.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import InputError
+from ..rendering.pixels import BOUNDS
+from ..tasks.task import Action, Task
+from ..world_state import WorldState
+from .lookahead import Lookahead, Outlook
+
+METHODS = ("enumerate", "random", "cem")
+_LOW, _HIGH = np.array(BOUNDS[:2]).T
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """How to search; `budget` is all that a search may spend, in rollouts of one action."""
+
+    method: str = "cem"
+    budget: int = 64
+    candidates: int = 32
+    """First tries, from the task."""
+    elites: int = 6
+    """Best tries around which `cem` draws."""
+    rounds: int = 2
+    """Draws of `cem`."""
+    spread: float = 0.04
+    """Standard deviation of drawn place points [m]; `cem` halves it every round."""
+    turn_spread: float = 0.3
+    """The same of the place yaw [rad], where the task has use for it."""
+    depth: int = 2
+    """Actions ahead."""
+    beam: int = 3
+    """States after the first action that are searched on."""
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError(f"no method {self.method!r}; choose from {', '.join(METHODS)}")
+        if min(self.budget, self.candidates, self.elites, self.depth, self.beam) < 1:
+            raise InputError("budget, candidates, elites, depth and beam must be 1 or more")
+
+
+def search(
+    lookahead: Lookahead,
+    task: Task,
+    state: WorldState,
+    rng: np.random.Generator,
+    config: SearchConfig,
+) -> list[Outlook]:
+    """Outlooks tried from `state`, the best first; empty when the task has no candidate.
+
+    With `depth` 2 and no first action that solves the task, the actions whose second action leads
+    farthest come first, in the order of what that one leads to.
+    """
+    deep = config.depth > 1
+    first = config.budget if not deep else max(1, config.budget // 2)
+    tried = _around(lookahead, task, state, rng, config, first, keep=deep)
+    tried.sort(key=lambda o: o.rank, reverse=True)
+    if not deep or not tried or tried[0].solved:
+        return tried
+    beam = [o for o in tried if o.after is not None and o.grade >= 2][: config.beam]
+    if not beam:
+        return tried
+    each = (config.budget - first) // len(beam)
+    led = []
+    for outlook in beam:
+        assert outlook.after is not None
+        seconds = _around(lookahead, task, outlook.after, rng, config, each, keep=False)
+        best = max((o.rank for o in seconds), default=(0, 0.0))
+        led.append((best if best > outlook.rank else outlook.rank, outlook))
+    led.sort(key=lambda pair: pair[0], reverse=True)
+    chosen = [outlook for _, outlook in led]
+    return chosen + [o for o in tried if o not in chosen]
+
+
+def _around(
+    lookahead: Lookahead,
+    task: Task,
+    state: WorldState,
+    rng: np.random.Generator,
+    config: SearchConfig,
+    budget: int,
+    *,
+    keep: bool,
+) -> list[Outlook]:
+    """Try up to `budget` actions from one state."""
+    layout, snapshot = state.episode.layout, state.episode.snapshot
+    known: set[bytes] = set()
+
+    def fresh(actions: Sequence[Action], most: int) -> list[Action]:
+        new: list[Action] = []
+        for action in actions:
+            if len(new) < most and action.tobytes() not in known:
+                known.add(action.tobytes())
+                new.append(action)
+        return new
+
+    def tries(actions: Sequence[Action]) -> list[Outlook]:
+        return lookahead.try_each([(state, action) for action in actions], keep=keep)
+
+    proposed = task.candidates(layout, snapshot, rng, config.candidates)
+    tried = tries(fresh(proposed, budget))
+    if config.method == "enumerate" or not tried:
+        return tried
+    left = budget - len(tried)
+    if config.method == "random":
+        around = [tried[i].action for i in rng.integers(len(tried), size=left)]
+        return tried + tries([_drawn(a, rng, config.spread, config.turn_spread) for a in around])
+    for k in range(config.rounds):
+        if any(o.solved for o in tried):
+            break
+        count = left // (config.rounds - k)
+        left -= count
+        elites = sorted(tried, key=lambda o: o.rank, reverse=True)[: config.elites]
+        around = [elites[i % len(elites)].action for i in range(count)]
+        scale = 0.5**k
+        drawn = [_drawn(a, rng, config.spread * scale, config.turn_spread * scale) for a in around]
+        tried += tries(fresh(drawn, count))
+    return tried
+
+
+def _drawn(action: Action, rng: np.random.Generator, spread: float, turn: float) -> Action:
+    """The same pick, placed near by; on the table."""
+    near = action.copy()
+    near[3:5] = np.clip(near[3:5] + rng.normal(0.0, spread, 2), _LOW, _HIGH)
+    if near[5] != 0.0:
+        near[5] += rng.normal(0.0, turn)
+    return near
