@@ -92,7 +92,9 @@ def cell_sort(scalar: Any, lanes: int) -> SimpleNamespace:
         x: wp.array(dtype=V4), key: wp.array(dtype=int), at: int, end: int, b: V4, below: int
     ) -> int: ...  # fmt: skip
 
-    @wp.func_native("return __builtin_ctz((unsigned)hits);")
+    on_device, on_host = "return __ffs(hits) - 1;", "return __builtin_ctz((unsigned)hits);"
+
+    @wp.func_native(f"#if defined(__CUDA_ARCH__)\n{on_device}\n#else\n{on_host}\n#endif\n")
     def first_hit(hits: int) -> int: ...
 
     @wp.func_native(f"""
