@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .solver.guards import WatchValues
     from .solver.solver import SolverFusedXPBD
 
-__all__ = ["Frames", "GripPath", "Rollout", "rollout"]
+__all__ = ["Frames", "GripPath", "Rollout", "prepare", "rollout"]
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -104,6 +104,36 @@ def rollout(
 
     A world's result does not depend on which other worlds run with it.
     """
+    dt = solver.config.dt
+    longest = prepare(
+        solver, worlds, paths=paths, pushes=pushes, least=least, most=most, calm=calm,
+        calm_after=calm_after,
+    )  # fmt: skip
+    every = max(1, round(record / dt)) if record else 0
+    watch = solver.run(longest, record_every=every)
+    return {
+        w: Rollout(
+            seconds=watch[w].steps * dt,
+            watch=watch[w],
+            at_rest=watch[w].steps < round(_of(most, w) / dt),
+            frames=_frames(solver, w, watch[w].steps, every),
+        )
+        for w in worlds
+    }
+
+
+def prepare(
+    solver: SolverFusedXPBD,
+    worlds: Sequence[int],
+    *,
+    paths: Mapping[int, GripPath] | None = None,
+    pushes: Mapping[int, Sequence[Push]] | None = None,
+    least: float | Mapping[int, float] = 0.0,
+    most: float | Mapping[int, float] = 10.0,
+    calm: float | Mapping[int, float] = 0.0,
+    calm_after: float = 0.0,
+) -> int:
+    """Set a rollout up without running it, see `rollout`; returns its substeps at most."""
     data, dt = solver.data, solver.config.dt
     for w in worlds:
         if not 0 <= w < data.world_count:
@@ -129,17 +159,7 @@ def rollout(
         data.per_world("group.most_steps", w)[:] = limit
         data.per_world("group.calm_steps", w)[:] = round(_of(calm, w) / dt)
         data.per_world("group.calm_after", w)[:] = round(calm_after / dt)
-    every = max(1, round(record / dt)) if record else 0
-    watch = solver.run(longest, record_every=every)
-    return {
-        w: Rollout(
-            seconds=watch[w].steps * dt,
-            watch=watch[w],
-            at_rest=watch[w].steps < round(_of(most, w) / dt),
-            frames=_frames(solver, w, watch[w].steps, every),
-        )
-        for w in worlds
-    }
+    return longest
 
 
 def _of(value: float | Mapping[int, float], world: int) -> float:

@@ -11,10 +11,10 @@ from typing import Any
 
 import warp as wp
 
-from .lanes import add, div, dot, mul, root, sub  # noqa: F401  (operators are found by name)
+from .lanes import add, div, dot, less, mul, root, select, sub  # noqa: F401  (operators)
 from .structures import structures
 
-__all__ = ["bending"]
+__all__ = ["bending", "bending_adjoint"]
 
 
 @functools.cache
@@ -47,3 +47,61 @@ def bending(scalar: Any, lanes: int) -> SimpleNamespace:
         q.x[j] = q.x[j] - d * (s * wj)
 
     return SimpleNamespace(project_bend=project_bend)
+
+
+@functools.cache
+def bending_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`record_bend` solves a bending spring and leaves its offset d on the tape, `sweep_bend` takes
+    it back: the derivatives by the three particles, inverse masses and `inverse_dt2` (returned).
+    """
+    t = structures(scalar, lanes)
+    S, V, V3 = t.S, t.V, t.V3
+    Particles, Springs, Tape, Adjoint = t.Particles, t.Springs, t.Tape, t.Adjoint
+    project_bend = bending(scalar, lanes).project_bend
+
+    @wp.func
+    def record_bend(
+        k: int, p0: int, at: int, inverse_dt2: V, q: Particles, springs: Springs, tape: Tape
+    ):
+        ends = springs.ij[k]
+        middle = q.x[p0 + springs.middle[k]]
+        tape.x[at] = middle - (q.x[p0 + ends[0]] + q.x[p0 + ends[1]]) * S(0.5)
+        project_bend(k, p0, inverse_dt2, q, springs)
+
+    @wp.func
+    def sweep_bend(k: int, p0: int, d: V3, inverse_dt2: V, springs: Springs, adj: Adjoint):
+        ends = springs.ij[k]
+        i = p0 + ends[0]
+        j = p0 + springs.middle[k]
+        e = p0 + ends[1]
+        wi = adj.w[i]
+        wj = adj.w[j]
+        we = adj.w[e]
+        zero = V(S(0.0))
+        half = S(0.5)
+        tiny = V(S(1.0e-9))
+        exact = root(dot(d, d))
+        l = wp.max(exact, tiny)
+        w = wj + (wi + we) * S(0.25) + inverse_dt2 * springs.compliance[k] + tiny
+        rest = V(springs.length[k])
+        s = (l - rest) / (l * w)
+        gi = adj.x[i]
+        gj = adj.x[j]
+        ge = adj.x[e]
+        b = gi * (wi * half) + ge * (we * half) - gj * wj
+        di = dot(d, gi) * half
+        dj = dot(d, gj)
+        de = dot(d, ge) * half
+        gs = di * wi + de * we - dj * wj
+        gd = b * s + d * (gs * rest * less(tiny, exact) / (l * l * l * w))
+        adj.x[i] = gi - gd * half
+        adj.x[e] = ge - gd * half
+        adj.x[j] = gj + gd
+        gw = zero - gs * s / w
+        quarter = gw * S(0.25)
+        adj.mass[i] = adj.mass[i] + select(wi, quarter + s * di, zero)
+        adj.mass[e] = adj.mass[e] + select(we, quarter + s * de, zero)
+        adj.mass[j] = adj.mass[j] + select(wj, gw - s * dj, zero)
+        return gw * springs.compliance[k]
+
+    return SimpleNamespace(record_bend=record_bend, sweep_bend=sweep_bend)

@@ -19,7 +19,7 @@ from .topology import WorldTopology, read_worlds, tethers
 __all__ = ["KERNEL_ARGUMENTS", "SolverData"]
 
 KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near",
-                    "bodies", "contacts", "grips", "watch", "sheets", "cells")  # fmt: skip
+                    "bodies", "contacts", "grips", "watch", "sheets", "cells", "tape")  # fmt: skip
 """The kernel's structs, after the settings, in the order of its arguments."""
 
 _NUMPY = {wp.float32: np.float32, wp.float64: np.float64}

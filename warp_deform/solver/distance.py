@@ -11,15 +11,26 @@ from typing import Any
 
 import warp as wp
 
-from .lanes import add, any_less, div, dot, mul, root, sub  # noqa: F401  (operators by name)
+from .lanes import (  # noqa: F401  (operators are found by name)
+    add,
+    any_less,
+    div,
+    dot,
+    less,
+    mul,
+    root,
+    select,
+    sub,
+)
 from .structures import structures
+from .tape import Kind
 
-__all__ = ["distance"]
+__all__ = ["distance", "distance_adjoint"]
 
 
 @functools.cache
 def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamespace:
-    """`project_distance(k, p0, inverse_dt2, q, springs)`: solve spring `k`.
+    """`project_distance(k, p0, inverse_dt2, q, springs)`: solve spring `k`; whether it acted.
 
     For a two-sided spring (mode 0) of length l, rest length L and compliance a,
     ``lambda = (l - L) / (wi + wj + a / dt^2)`` moves both ends along the spring. AT_LEAST (mode 1)
@@ -69,5 +80,107 @@ def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamesp
                     s = wp.min(s, (l - V(floor)) / (w * safe))
             q.x[i] = xi - d * (s * wi)
             q.x[j] = xj + d * (s * wj)
+        return acts
 
     return SimpleNamespace(project_distance=project_distance)
+
+
+@functools.cache
+def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamespace:
+    """`record_distance` solves a spring and leaves its offset d on the tape, `sweep_distance`
+    takes it back: the derivatives by both ends, inverse masses and `inverse_dt2` (returned).
+
+    The correction is s d with s = (l - target) / (D l); whichever of the rest length, the strain
+    limit and the floor decided s is the target, and D is the sum of inverse masses plus, for the
+    rest length, the compliance. So ds/dl = target / (D l^2) and ds/dD = -s / D.
+    """
+    t = structures(scalar, lanes)
+    S, V, V3 = t.S, t.V, t.V3
+    Particles, Springs, Tape, Adjoint = t.Particles, t.Springs, t.Tape, t.Adjoint
+    project_distance = distance(scalar, lanes, with_floors).project_distance
+
+    @wp.func
+    def record_distance(
+        k: int, p0: int, at: int, inverse_dt2: V, q: Particles, springs: Springs, tape: Tape
+    ):
+        ij = springs.ij[k]
+        tape.x[at] = q.x[p0 + ij[0]] - q.x[p0 + ij[1]]
+        return project_distance(k, p0, inverse_dt2, q, springs)
+
+    @wp.func
+    def sweep_distance(
+        k: int, p0: int, d: V3, inverse_dt2: V, springs: Springs, counts: int, on: V, adj: Adjoint
+    ):
+        ij = springs.ij[k]
+        i = p0 + ij[0]
+        j = p0 + ij[1]
+        rest = springs.length[k]
+        mode = springs.mode[k]
+        l2 = dot(d, d)
+        zero = V(S(0.0))
+        one = V(S(1.0))
+        tiny = V(S(1.0e-9))
+        l = root(l2)
+        c = l - V(rest)
+        acts = one
+        if mode == 1:
+            c = wp.min(c, zero)
+            acts = less(c, zero)
+            kind = counts + wp.static(int(Kind.FOLD_LIMIT))
+            adj.fired[kind] = adj.fired[kind] + acts * on
+        elif mode == 2:
+            c = wp.max(c, zero)
+            acts = less(zero, c)
+        wi = adj.w[i]
+        wj = adj.w[j]
+        w = wi + wj + tiny
+        safe = wp.max(l, tiny)
+        soft = one * springs.compliance[k]
+        below = w + inverse_dt2 * soft
+        inverse = one / (below * safe)
+        s = c * inverse
+        target = V(rest)
+        limit = springs.limit[k]
+        if limit > S(0.0) and any_less(V(limit * limit) - l2, S(0.0)):
+            # compared as in the forward pass; what is not tight keeps the bits it has alone
+            other = (l - V(limit)) / (w * safe)
+            tight = less(c / (below * safe), other)
+            kind = counts + wp.static(int(Kind.STRAIN_LIMIT))
+            adj.fired[kind] = adj.fired[kind] + tight * on
+            s = select(tight, other, s)
+            acts = wp.max(acts, tight)
+            target = select(tight, V(limit), target)
+            below = select(tight, w, below)
+            soft = select(tight, zero, soft)
+            inverse = one / (below * safe)
+        if wp.static(with_floors):
+            floor = springs.floor[k]
+            if any_less(l2, floor * floor):
+                other = (l - V(floor)) / (w * safe)
+                tight = less(other, (l - target) * acts / (below * safe))
+                kind = counts + wp.static(int(Kind.STRAIN_LIMIT))
+                adj.fired[kind] = adj.fired[kind] + tight * on
+                s = select(tight, other, s)
+                acts = wp.max(acts, tight)
+                target = select(tight, V(floor), target)
+                below = select(tight, w, below)
+                soft = select(tight, zero, soft)
+                inverse = one / (below * safe)
+        gi = adj.x[i]
+        gj = adj.x[j]
+        b = gj * wj - gi * wi
+        di = dot(d, gi)
+        dj = dot(d, gj)
+        gs = (dj * wj - di * wi) * acts
+        # at length 0 the spring has no direction, and none to turn to
+        along = inverse * below
+        gl = gs * target * less(tiny, l) * inverse * along * along
+        gd = b * s + d * gl
+        adj.x[i] = gi + gd
+        adj.x[j] = gj - gd
+        gw = zero - gs * s * inverse * safe
+        adj.mass[i] = adj.mass[i] + select(wi, gw - s * di, zero)
+        adj.mass[j] = adj.mass[j] + select(wj, gw + s * dj, zero)
+        return gw * soft
+
+    return SimpleNamespace(record_distance=record_distance, sweep_distance=sweep_distance)

@@ -211,47 +211,58 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         return left_out
 
     @wp.func
+    def project_edge(k: int, lane: int, p0: int, push: S, sheets: Sheets, cells: Cells):
+        """One pair; returns whether it moved."""
+        acts = bool(False)
+        e = sheets.edge[cells.edge_a[k]]
+        f = sheets.edge[cells.edge_b[k]]
+        signed = cells.edge_gap[k]
+        a = get(cells.x, p0 + e[0], lane)
+        b = get(cells.x, p0 + e[1], lane)
+        c = get(cells.x, p0 + f[0], lane)
+        d = get(cells.x, p0 + f[1], lane)
+        n = wp.cross(b - a, d - c) * wp.sign(signed)
+        n2 = wp.dot(n, n)
+        h = wp.abs(signed)
+        # distance of the two lines along the normal between them
+        apart = wp.dot(a - c, n)
+        if (apart <= S(0.0) or apart * apart < h * h * n2) and n2 > (
+            S(PARALLEL) * wp.length_sq(b - a) * wp.length_sq(d - c)
+        ):
+            at = nearest(a, b, c, d)
+            u = at[0]
+            v = at[1]
+            low = S(INSIDE)
+            high = S(1.0) - low
+            if u > low and u < high and v > low and v < high:
+                n = n / wp.sqrt(n2)
+                wa = get_mass(cells.w, p0 + e[0], lane) * (S(1.0) - u)
+                wb = get_mass(cells.w, p0 + e[1], lane) * u
+                wc = get_mass(cells.w, p0 + f[0], lane) * (S(1.0) - v)
+                wd = get_mass(cells.w, p0 + f[1], lane) * v
+                w = wa * (S(1.0) - u) + wb * u + wc * (S(1.0) - v) + wd * v
+                moved = (a - get(cells.xp, p0 + e[0], lane)) * (S(1.0) - u)
+                moved += (b - get(cells.xp, p0 + e[1], lane)) * u
+                moved -= (c - get(cells.xp, p0 + f[0], lane)) * (S(1.0) - v)
+                moved -= (d - get(cells.xp, p0 + f[1], lane)) * v
+                gap = wp.dot(a + (b - a) * u - c - (d - c) * v, n)
+                depth = wp.min(h - gap, wp.max(push - wp.dot(moved, n), S(0.0)))
+                if depth > S(0.0) and w > S(0.0):
+                    step = n * (depth / w)
+                    put(cells.x, p0 + e[0], lane, a + step * wa)
+                    put(cells.x, p0 + e[1], lane, b + step * wb)
+                    put(cells.x, p0 + f[0], lane, c - step * wc)
+                    put(cells.x, p0 + f[1], lane, d - step * wd)
+                    acts = True
+        return acts
+
+    @wp.func
     def project_edges(g: int, lane: int, p0: int, push: S, sheets: Sheets, cells: Cells):
         start = cells.list_start[g] + lane * cells.capacity[g]
         for k in range(start, start + cells.edge_count[g * wp.static(L) + lane]):
-            e = sheets.edge[cells.edge_a[k]]
-            f = sheets.edge[cells.edge_b[k]]
-            signed = cells.edge_gap[k]
-            a = get(cells.x, p0 + e[0], lane)
-            b = get(cells.x, p0 + e[1], lane)
-            c = get(cells.x, p0 + f[0], lane)
-            d = get(cells.x, p0 + f[1], lane)
-            n = wp.cross(b - a, d - c) * wp.sign(signed)
-            n2 = wp.dot(n, n)
-            h = wp.abs(signed)
-            # distance of the two lines along the normal between them
-            apart = wp.dot(a - c, n)
-            if (apart <= S(0.0) or apart * apart < h * h * n2) and n2 > (
-                S(PARALLEL) * wp.length_sq(b - a) * wp.length_sq(d - c)
-            ):
-                at = nearest(a, b, c, d)
-                u = at[0]
-                v = at[1]
-                low = S(INSIDE)
-                high = S(1.0) - low
-                if u > low and u < high and v > low and v < high:
-                    n = n / wp.sqrt(n2)
-                    wa = get_mass(cells.w, p0 + e[0], lane) * (S(1.0) - u)
-                    wb = get_mass(cells.w, p0 + e[1], lane) * u
-                    wc = get_mass(cells.w, p0 + f[0], lane) * (S(1.0) - v)
-                    wd = get_mass(cells.w, p0 + f[1], lane) * v
-                    w = wa * (S(1.0) - u) + wb * u + wc * (S(1.0) - v) + wd * v
-                    moved = (a - get(cells.xp, p0 + e[0], lane)) * (S(1.0) - u)
-                    moved += (b - get(cells.xp, p0 + e[1], lane)) * u
-                    moved -= (c - get(cells.xp, p0 + f[0], lane)) * (S(1.0) - v)
-                    moved -= (d - get(cells.xp, p0 + f[1], lane)) * v
-                    gap = wp.dot(a + (b - a) * u - c - (d - c) * v, n)
-                    depth = wp.min(h - gap, wp.max(push - wp.dot(moved, n), S(0.0)))
-                    if depth > S(0.0) and w > S(0.0):
-                        step = n * (depth / w)
-                        put(cells.x, p0 + e[0], lane, a + step * wa)
-                        put(cells.x, p0 + e[1], lane, b + step * wb)
-                        put(cells.x, p0 + f[0], lane, c - step * wc)
-                        put(cells.x, p0 + f[1], lane, d - step * wd)
+            project_edge(k, lane, p0, push, sheets, cells)
 
-    return SimpleNamespace(list_edges=list_edges, project_edges=project_edges)
+    return SimpleNamespace(
+        list_edges=list_edges, project_edges=project_edges, project_edge=project_edge,
+        nearest=nearest,
+    )  # fmt: skip

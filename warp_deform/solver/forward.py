@@ -11,19 +11,12 @@ from typing import Any
 
 import warp as wp
 
-from ..objects.attributes import SpringMode
 from ..objects.push import MOST_PUSHES
-from .bending import bending
-from .body_contact import body_contact
-from .box_box import box_box
-from .box_particle import box_particle
-from .box_table import box_table
-from .box_triangle import box_triangle
+from .body_solve import body_solve
 from .cell_list import cell_list
-from .distance import distance
 from .edge_contact import edge_contact
-from .grip import grip
-from .internal_friction import internal_friction
+from .grip import grip, grip_adjoint
+from .internal_friction import internal_friction, internal_friction_adjoint
 from .lanes import (  # noqa: F401  (operators are found by name)
     KERNEL_OPTIONS,
     add,
@@ -37,12 +30,13 @@ from .lanes import (  # noqa: F401  (operators are found by name)
     select,
     sub,
 )
+from .particle_solve import particle_solve
 from .rigid import rigid
 from .sphere_contact import sphere_contact
 from .structures import structures
-from .table_contact import table_contact
-from .tether import tether
-from .triangle_contact import triangle_contact
+from .table_contact import table_contact, table_contact_adjoint
+from .tape import COUNTERS, GRIP_WORDS, tape
+from .watch import watch
 
 __all__ = ["forward_kernel"]
 
@@ -54,133 +48,48 @@ def forward_kernel(
     with_bodies: bool,
     with_sheets: bool = False,
     with_edges: bool = False,
+    taped: bool = False,
 ) -> Any:
     """The kernel for a precision and a width; launch it with one thread per group.
 
     `with_bodies` False leaves the code of rigid bodies out, which halves the compile time;
-    `with_sheets` False that of triangles, `with_edges` False that of their edges.
+    `with_sheets` False that of triangles, `with_edges` False that of their edges. `taped` leaves a
+    tape for the backward sweep (see `tape`) and can continue a launch, to the same bits.
     """
     t = structures(scalar, lanes)
     S, V, V3, R3, L = t.S, t.V, t.V3, t.R3, t.L
     predict, finish = (getattr(table_contact(scalar, lanes), n) for n in ("predict", "finish"))
-    project_distance = distance(scalar, lanes, with_sheets).project_distance
-    project_bend = bending(scalar, lanes).project_bend
-    contact = sphere_contact(scalar, lanes)
-    list_near, project_contact = contact.list_near, contact.project_contact
+    list_near = sphere_contact(scalar, lanes).list_near
     cells_ = cell_list(scalar, lanes)
     common_step, moved_since = cells_.common_step, cells_.moved_since
     list_triangles = cells_.list_triangles
-    project_triangles = triangle_contact(scalar, lanes).project_triangles
-    edges_ = edge_contact(scalar, lanes)
-    list_edges, project_edges = edges_.list_edges, edges_.project_edges
+    list_edges = edge_contact(scalar, lanes).list_edges
+    solve_particles = particle_solve(scalar, lanes, with_sheets, with_edges, taped).solve_particles
     calms = internal_friction(scalar, lanes)
     sleep_speed, calm_particle, damp_spring = (
         getattr(calms, n) for n in ("sleep_speed", "calm_particle", "damp_spring")
     )
-    project_tether = tether(scalar, lanes).project_tether
     grips_ = grip(scalar, lanes)
     follow_path, take, let_go = grips_.follow_path, grips_.take, grips_.let_go
     body = rigid(scalar, lanes)
     predict_body, finish_body = body.predict_body, body.finish_body
-    list_table = box_table(scalar, lanes).list_table
-    project_box_particle = box_particle(scalar, lanes).project_box_particle
-    project_box_triangles = box_triangle(scalar, lanes).project_box_triangles
-    list_boxes = box_box(scalar, lanes).list_boxes
-    bodies_ = body_contact(scalar, lanes)
-    begin_body, solve_contacts, end_body = (
-        getattr(bodies_, n) for n in ("begin_body", "solve_contacts", "end_body")
-    )
+    solve_bodies = body_solve(scalar, lanes, with_sheets).solve_bodies
+    watch_group = watch(scalar, lanes, with_bodies).watch_group
+    record_finish = table_contact_adjoint(scalar, lanes, with_sheets).record_finish
+    record_grip = grip_adjoint(scalar, lanes).record_grip
+    record_spring = internal_friction_adjoint(scalar, lanes).record_spring
+    tapes = tape(scalar, lanes)
+    has_room, load_state, save_state = tapes.has_room, tapes.load_state, tapes.save_state
     Settings, Topology, Group, Particles = t.Settings, t.Topology, t.Group, t.Particles
     Springs, Pairs, Shapes, Near = t.Springs, t.Pairs, t.Shapes, t.Near
     Bodies, Contacts, Grips, Watch = t.Bodies, t.Contacts, t.Grips, t.Watch
-    Sheets, Cells = t.Sheets, t.Cells
-
-    @wp.func
-    def solve_bodies(
-        g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
-        q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets, cells: Cells,
-    ):  # fmt: skip
-        """Contacts of one lane's bodies with particles, each other and the table."""
-        p0 = group.particle_start[g]
-        count = top.body_count[k]
-        b0 = group.body_start[g] + lane * count
-        first = group.shape_start[g] + lane * top.shape_count[k]
-        last = first + top.shape_count[k]
-        mv = group.contact_friction[g]
-        mu = mv[lane]
-        tv = group.table_friction[g]
-        radii = top.particle_start[k]
-        for shape in range(first, last):
-            b = b0 + shapes.body[shape]
-            far = wp.length(shapes.half[shape])
-            center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
-            thickest = S(0.0)
-            for i in range(top.particle_count[k]):
-                radius = top.radius[radii + i]
-                thickest = wp.max(thickest, radius)
-                x = q.x[p0 + i]
-                d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
-                if wp.dot(d, d) < (far + radius) * (far + radius):
-                    project_box_particle(
-                        p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
-                    )
-            if wp.static(with_sheets):
-                project_box_triangles(
-                    lane, k, p0, radii, shape, b, far + thickest, mu, push, top, shapes, bodies,
-                    sheets, cells,
-                )  # fmt: skip
-        for b in range(b0, b0 + count):
-            begin_body(b, bodies)
-        start = group.contact_start[g]
-        c = int(start)
-        for sa in range(first, last):
-            for sb in range(sa + 1, last):
-                a = b0 + shapes.body[sa]
-                b = b0 + shapes.body[sb]
-                if a != b and bodies.w[a] + bodies.w[b] > S(0.0):
-                    pair_mu = mu * wp.min(shapes.friction[sa], shapes.friction[sb])
-                    c = list_boxes(c, sa, a, sb, b, pair_mu, push, shapes, bodies, contacts)
-        for b in range(count):
-            if bodies.w[b0 + b] > S(0.0):
-                c = list_table(c, b0 + b, b, first, last, tv[lane], push, shapes, bodies, contacts)
-        solve_contacts(start, c, bodies, contacts)
-        for b in range(b0, b0 + count):
-            end_body(b, bodies)
-
-    @wp.func
-    def watch_group(
-        g: int, p0: int, n: int, s0: int, s1: int, b0: int, body_count: int, springs: Springs,
-        q: Particles, bodies: Bodies, watch: Watch,
-    ):  # fmt: skip
-        """Worst values of the guards, once every `check_every` substeps."""
-        zero = V(S(0.0))
-        bad = watch.nonfinite[g]
-        lowest = V(S(1.0e9))
-        for i in range(p0, p0 + n):
-            x = q.x[i]
-            bad = wp.max(bad, nonfinite(x.x + x.y + x.z))
-            lowest = wp.min(lowest, x.z)
-        if wp.static(with_bodies):
-            for lane in range(wp.static(L)):
-                for b in range(b0 + lane * body_count, b0 + (lane + 1) * body_count):
-                    sum = bodies.x[b] + bodies.omega[b]
-                    if not wp.isfinite(sum[0] + sum[1] + sum[2]):
-                        bad[lane] = S(1.0)
-        watch.nonfinite[g] = bad
-        watch.depth[g] = wp.max(watch.depth[g], wp.max(zero - lowest, zero))
-        stretch = watch.stretch[g]
-        for s in range(s0, s1):
-            if springs.watched[s] > 0:
-                ij = springs.ij[s]
-                l = length(q.x[p0 + ij[0]] - q.x[p0 + ij[1]])
-                stretch = wp.max(stretch, l * (S(1.0) / springs.length[s]))
-        watch.stretch[g] = stretch
+    Sheets, Cells, Tape = t.Sheets, t.Cells, t.Tape
 
     @wp.kernel(module="unique", enable_backward=False, module_options=dict(KERNEL_OPTIONS))
     def forward(
         st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
         q: Particles, near: Near, bodies: Bodies, contacts: Contacts, grips: Grips, watch: Watch,
-        sheets: Sheets, cells: Cells,
+        sheets: Sheets, cells: Cells, tape: Tape,
     ):  # fmt: skip
         g = wp.tid()
         k = group.topology[g]
@@ -220,10 +129,14 @@ def forward_kernel(
         free_time = zero  # since the launch began or something was let go
         frame = int(0)
         longest_push = int(0)
+        begins = bool(True)
+        if wp.static(taped):
+            begins = tape.resume == 0
         for lane in range(wp.static(L)):
             if wp.static(with_sheets):
-                cells.met[w0 + lane] = 0
-            if on[lane] > S(0.0):
+                if begins:
+                    cells.met[w0 + lane] = 0
+            if begins and on[lane] > S(0.0):
                 if grips.particle[w0 + lane] >= 0 or grips.body[w0 + lane] >= 0:
                     holding[lane] = S(1.0)
                     take(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
@@ -234,6 +147,24 @@ def forward_kernel(
         # the table hides at once that a particle started under it
         watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
         substep = int(0)
+        tops = wp.vec4i()
+        if wp.static(taped):
+            tops = tape.first[g]
+            if not begins:
+                (
+                    on, steps, quiet, holding, calm, stale, fresh, travel, clamped, free_time,
+                    least, drift,
+                ) = load_state(g, tape)  # fmt: skip
+                at = g * wp.static(COUNTERS)
+                substep = tape.counters[at]
+                near_count = tape.counters[at + 1]
+                longest_push = tape.counters[at + 2]
+            if wp.static(not with_sheets):
+                for i in range(n):
+                    tape.x[tops[0]] = q.v[p0 + i]
+                    tops[0] += 1
+            tape.steps[g] = -substep
+            tape.full[g] = 0
         while substep < st.max_steps and any_less(zero - on, S(0.0)):
             all_on = not any_less(on, S(0.5))
             if st.record_every > 0 and substep % wp.max(st.record_every, 1) == 0:
@@ -268,6 +199,8 @@ def forward_kernel(
                         x.z[lane] = x.z[lane] + kick[2]
                         q.x[p0 + i] = x
             # grips
+            if wp.static(taped):
+                mark = int(tops[2])
             if any_less(zero - holding, S(0.0)):
                 for lane in range(wp.static(L)):
                     if holding[lane] > S(0.0) and on[lane] > S(0.0):
@@ -280,10 +213,18 @@ def forward_kernel(
                         met = bool(False)
                         if wp.static(with_sheets):
                             met = cells.met[w] > 0
-                        if not follow_path(
+                        if wp.static(taped):
+                            tick = grips.tick[w]
+                            knot = grips.knot[w]
+                        goes_on = follow_path(
                             met, w, lane, p0, bl, shape, shape + top.shape_count[k], near_start,
                             near_count, radius, dt, q, pairs, shapes, near, bodies, grips,
-                        ):  # fmt: skip
+                        )  # fmt: skip
+                        if wp.static(taped):
+                            released = wp.where(goes_on, 0, 1)
+                            record_grip(tops[2], w, lane, tick, knot, released, grips, tape)
+                            tops[2] += wp.static(GRIP_WORDS)
+                        if not goes_on:
                             let_go(w, lane, p0, bl, q, bodies, grips)
                             holding[lane] = S(0.0)
                             after = group.calm_after[g]
@@ -315,39 +256,24 @@ def forward_kernel(
                             over = watch.overflow[g]
                             over[lane] = wp.max(over[lane], S(left))
                             watch.overflow[g] = over
+            if wp.static(taped):
+                tape.k[tops[2]] = (tops[2] - mark) // wp.static(GRIP_WORDS)
+                tops[2] += 1
+                listed = int(0)
+                if wp.static(with_sheets):
+                    for lane in range(wp.static(L)):
+                        listed += cells.count[w0 + lane]
+                        if wp.static(with_edges):
+                            listed += cells.edge_count[w0 + lane]
+                if not has_room(g, tops, s1 - s0, n, near_count, listed, tape):
+                    tape.full[g] = 1
+                    break
             # constraints
-            # always in the same order: sweeping backwards in every other substep makes tight heaps
-            # crawl for ever, and shells jitter
-            for s in range(s0, s1):
-                if springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                    project_bend(s, p0, inverse_dt2, q, springs)
-                else:
-                    project_distance(s, p0, inverse_dt2, q, springs)
-            if wp.static(with_sheets):
-                if any_less(zero - holding, S(0.0)):
-                    held = q.x[p0]
-                    for lane in range(wp.static(L)):
-                        i = grips.particle[w0 + lane]
-                        if i >= 0:
-                            x = q.x[p0 + i]
-                            held.x[lane] = x.x[lane]
-                            held.y[lane] = x.y[lane]
-                            held.z[lane] = x.z[lane]
-                    for i in range(n):
-                        project_tether(p0 + i, holding, held, q)
-            for c in range(near_start, near_start + near_count):
-                project_contact(c, p0, contact_mu, push, q, pairs, near)
-            if wp.static(with_sheets):
-                if sheets.first[k + 1] > sheets.first[k]:
-                    for lane in range(wp.static(L)):
-                        if on[lane] > S(0.0):
-                            hit = project_triangles(
-                                g, lane, p0, grips.particle[w0 + lane], contact_mu[lane], push,
-                                sheets, cells,
-                            )  # fmt: skip
-                            cells.met[w0 + lane] = wp.where(hit, 1, 0)
-                            if wp.static(with_edges):
-                                project_edges(g, lane, p0, push, sheets, cells)
+            tops = solve_particles(
+                g, n, p0, s0, s1, near_start, near_count, sheets.first[k + 1] - sheets.first[k],
+                inverse_dt2, contact_mu, push, holding, on, tops, q, springs, pairs, near, grips,
+                sheets, cells, tape,
+            )  # fmt: skip
             if wp.static(with_bodies):
                 for lane in range(wp.static(L)):
                     if on[lane] > S(0.0):
@@ -363,11 +289,35 @@ def forward_kernel(
             moved2 = zero
             for i in range(n):
                 radius = top.radius[radii + i]
-                moved2 = wp.max(
-                    moved2, finish(p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q)
-                )
+                ended2 = zero
+                if wp.static(taped):
+                    ended2 = record_finish(
+                        p0 + i,
+                        tops[0],
+                        tops[1],
+                        radius,
+                        inverse_dt,
+                        table_mu,
+                        fastest,
+                        all_on,
+                        on,
+                        q,
+                        tape,
+                    )
+                    if wp.static(with_sheets):
+                        tops[0] += 3
+                    else:
+                        tops[0] += 1
+                        tops[1] += 1
+                else:
+                    ended2 = finish(
+                        p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q
+                    )  # fmt: skip
+                moved2 = wp.max(moved2, ended2)
             unrest2 = moved2
             drowsy = one
+            if wp.static(taped):
+                sleep = zero
             if wp.static(with_sheets):
                 if st.dry > S(0.0) or st.sleep > S(0.0):
                     sleep = sleep_speed(free_time, st.sleep, st.sleep_ramp)
@@ -379,7 +329,11 @@ def forward_kernel(
                 if st.viscous > S(0.0):
                     for s in range(s0, s1):
                         if springs.limit[s] > S(0.0):
-                            damp_spring(s, p0, st.viscous, on, q, springs)
+                            if wp.static(taped):
+                                record_spring(s, p0, tops[0], st.viscous, on, q, springs, tape)
+                                tops[0] += 1
+                            else:
+                                damp_spring(s, p0, st.viscous, on, q, springs)
                 free_time = (free_time + V(dt)) * (one - holding)
             if wp.static(with_bodies):
                 for lane in range(wp.static(L)):
@@ -389,6 +343,12 @@ def forward_kernel(
                             m = finish_body(at, dt, fastest[lane], drowsy[lane], bodies)
                             moved2[lane] = wp.max(moved2[lane], m)
                             unrest2[lane] = wp.max(unrest2[lane], m)
+            if wp.static(taped):
+                tape.v[tops[1]] = on
+                tape.v[tops[1] + 1] = fastest
+                tape.v[tops[1] + 2] = holding
+                tape.v[tops[1] + 3] = sleep
+                tops[1] += 4
             moved = root(moved2)
             travel = travel + moved
             # the next substep may move by half as much again before its contacts are solved
@@ -406,14 +366,37 @@ def forward_kernel(
                 watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
             on = on * (one - done)
         watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
-        if wp.static(with_sheets):
-            for i in range(p0, p0 + n):
-                cells.xr[i] = cells.xr[i] + drift
         watch.steps[g] = steps
         watch.clamped[g] = clamped
+        ends = bool(True)
+        if wp.static(taped):
+            save_state(
+                g, on, steps, quiet, holding, calm, stale, fresh, travel, clamped, free_time, least,
+                drift, tape,
+            )  # fmt: skip
+            at = g * wp.static(COUNTERS)
+            tape.counters[at] = substep
+            tape.counters[at + 1] = near_count
+            tape.counters[at + 2] = longest_push
+            tape.steps[g] = tape.steps[g] + substep
+            tape.until[g] = substep
+            ends = tape.last > 0
+            mark = int(tops[2])
+        if wp.static(with_sheets):
+            if ends:
+                for i in range(p0, p0 + n):
+                    cells.xr[i] = cells.xr[i] + drift
         # a world cut off while it held something lets go: nothing is held between launches
         for lane in range(wp.static(L)):
-            if holding[lane] > S(0.0):
+            if ends and holding[lane] > S(0.0):
+                if wp.static(taped):
+                    tape.k[tops[2]] = lane
+                    tape.k[tops[2] + 1] = grips.particle[w0 + lane]
+                    tops[2] += 2
                 let_go(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
+        if wp.static(taped):
+            tape.k[tops[2]] = (tops[2] - mark) // 2
+            tops[2] += 1
+            tape.top[g] = tops
 
     return forward

@@ -13,8 +13,9 @@ import warp as wp
 
 from .lanes import add, any_less, div, dot, less, mul, root, select, sub  # noqa: F401
 from .structures import structures
+from .tape import Kind
 
-__all__ = ["internal_friction"]
+__all__ = ["internal_friction", "internal_friction_adjoint"]
 
 
 @functools.cache
@@ -70,4 +71,71 @@ def internal_friction(scalar: Any, lanes: int) -> SimpleNamespace:
 
     return SimpleNamespace(
         sleep_speed=sleep_speed, calm_particle=calm_particle, damp_spring=damp_spring
+    )
+
+
+@functools.cache
+def internal_friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`record_spring` leaves the relative velocity of a damped spring on the tape, `sweep_spring`
+    takes it back. `sweep_calm` needs no tape: its velocity v follows from the positions.
+
+    Branches: asleep (the step is undone and the velocity lost), and stopped by dry friction.
+    """
+    t = structures(scalar, lanes)
+    S, V, V3 = t.S, t.V, t.V3
+    Particles, Springs, Tape, Adjoint = t.Particles, t.Springs, t.Tape, t.Adjoint
+    damp_spring = internal_friction(scalar, lanes).damp_spring
+
+    @wp.func
+    def record_spring(
+        s: int, p0: int, at: int, share: S, on: V, q: Particles, springs: Springs, tape: Tape
+    ):
+        ij = springs.ij[s]
+        tape.x[at] = q.v[p0 + ij[0]] - q.v[p0 + ij[1]]
+        damp_spring(s, p0, share, on, q, springs)
+
+    @wp.func
+    def sweep_spring(s: int, p0: int, d: V3, share: S, on: V, springs: Springs, adj: Adjoint):
+        ij = springs.ij[s]
+        i = p0 + ij[0]
+        j = p0 + ij[1]
+        zero = V(S(0.0))
+        wi = adj.w[i]
+        wj = adj.w[j]
+        inverse = V(S(1.0)) / (wi + wj + V(S(1.0e-9)))
+        factor = on * share * inverse
+        gi = adj.v[i]
+        gj = adj.v[j]
+        g = (gj * wj - gi * wi) * factor
+        adj.v[i] = gi + g
+        adj.v[j] = gj - g
+        gw = zero - dot(g, d) * inverse
+        adj.mass[i] = adj.mass[i] + select(wi, gw - factor * dot(d, gi), zero)
+        adj.mass[j] = adj.mass[j] + select(wj, gw + factor * dot(d, gj), zero)
+
+    @wp.func
+    def sweep_calm(i: int, v: V3, g: V3, dry: S, sleep: V, on: V, counts: int, adj: Adjoint):
+        """Derivative by the velocity v before; `g` by that after it, 0 where the lane is off."""
+        zero = V(S(0.0))
+        one = V(S(1.0))
+        speed = root(dot(v, v))
+        safe = wp.max(speed, V(S(1.0e-12)))
+        kept = wp.max(speed - V(dry), zero) / safe
+        free = on * less(zero, adj.w[i])
+        kept = select(free, kept, one)
+        asleep = less(speed * kept, sleep) * free
+        rubs = less(V(dry), speed) * free
+        kind = counts + wp.static(int(Kind.SLEEP))
+        adj.fired[kind] = adj.fired[kind] + asleep
+        kind = counts + wp.static(int(Kind.DRY_FRICTION))
+        adj.fired[kind] = adj.fired[kind] + rubs * wp.sign(dry)
+        if any_less(zero - asleep, S(0.0)):
+            back = adj.x[i] * asleep
+            adj.x[i] = adj.x[i] - back
+            adj.xp[i] = adj.xp[i] + back
+        g = g * (one - asleep)
+        return g * kept + v * (dot(v, g) * rubs * dry / (safe * safe * safe))
+
+    return SimpleNamespace(
+        record_spring=record_spring, sweep_spring=sweep_spring, sweep_calm=sweep_calm
     )

@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from .friction import friction
+from .friction import friction, friction_adjoint
 from .lanes import (  # noqa: F401  (operators are found by name)
     add,
     any_less,
@@ -25,8 +25,9 @@ from .lanes import (  # noqa: F401  (operators are found by name)
     sub,
 )
 from .structures import structures
+from .tape import Kind
 
-__all__ = ["sphere_contact"]
+__all__ = ["sphere_contact", "sphere_contact_adjoint"]
 
 
 @functools.cache
@@ -125,3 +126,105 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         return hit
 
     return SimpleNamespace(list_near=list_near, project_contact=project_contact, touches=touches)
+
+
+@functools.cache
+def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`record_contact` solves a pair and leaves its offset d, its step since the substep began and
+    its mask on the tape, or returns False where it does not touch. `sweep_contact` takes it back
+    and returns the derivative by friction.
+
+    Branches: apart or touching; depth limited by the overlap or by `recovery` (then its slope is
+    that of the approach, or 0 while the pair separates as fast as it may).
+    """
+    t = structures(scalar, lanes)
+    S, V, V3 = t.S, t.V, t.V3
+    Pairs, Particles, Near, Tape, Adjoint = t.Pairs, t.Particles, t.Near, t.Tape, t.Adjoint
+    project_contact = sphere_contact(scalar, lanes).project_contact
+    coulomb_soft_slopes = friction_adjoint(scalar, lanes).coulomb_soft_slopes
+
+    @wp.func
+    def record_contact(
+        k: int, p0: int, at: int, at_mask: int, mu: V, push: S, q: Particles, pairs: Pairs,
+        near: Near, tape: Tape,
+    ):  # fmt: skip
+        pair = near.pair[k]
+        ij = pairs.ij[pair]
+        h = pairs.distance[pair]
+        i = p0 + ij[0]
+        j = p0 + ij[1]
+        xi = q.x[i]
+        xj = q.x[j]
+        d = xi - xj
+        touching = any_less(dot(d, d), h * h)
+        if touching:
+            tape.x[at] = d
+            tape.x[at + 1] = (xi - q.xp[i]) - (xj - q.xp[j])
+            tape.v[at_mask] = near.mask[k]
+            project_contact(k, p0, mu, push, q, pairs, near)
+        return touching
+
+    @wp.func
+    def sweep_contact(
+        pair: int, p0: int, d: V3, moved: V3, mask: V, mu: V, push: S, pairs: Pairs, counts: int,
+        on: V, adj: Adjoint,
+    ):  # fmt: skip
+        ij = pairs.ij[pair]
+        h = pairs.distance[pair]
+        i = p0 + ij[0]
+        j = p0 + ij[1]
+        zero = V(S(0.0))
+        one = V(S(1.0))
+        tiny = V(S(1.0e-9))
+        exact = root(dot(d, d))
+        l = wp.max(exact, tiny)
+        inverse = one / l
+        n = d * inverse
+        approach = dot(moved, n)
+        overlap = wp.max(V(h) - l, zero) * mask
+        allowed = wp.max(V(push) - approach, zero)
+        depth = wp.min(overlap, allowed)
+        wi = adj.w[i]
+        wj = adj.w[j]
+        share = one / wp.max(wi + wj, tiny)
+        slip = moved - n * approach
+        slip2 = dot(slip, slip)
+        budget = depth * mu
+        f, by_budget, by_slip2 = coulomb_soft_slopes(slip2, budget)
+        acts = less(zero, depth)
+        slowed = less(allowed, overlap) * acts
+        kind = counts + wp.static(int(Kind.CONTACT))
+        adj.fired[kind] = adj.fired[kind] + acts * on
+        kind = counts + wp.static(int(Kind.CONTACT_SLOWED))
+        adj.fired[kind] = adj.fired[kind] + slowed * on
+        gi = adj.x[i]
+        gj = adj.x[j]
+        # step = n * (depth * share) - slip * (f * share)
+        b = (gi * wi - gj * wj) * acts
+        ni = dot(n, gi)
+        nj = dot(n, gj)
+        si = dot(slip, gi)
+        sj = dot(slip, gj)
+        along = (ni * wi - nj * wj) * acts
+        across = (sj * wj - si * wi) * acts
+        gf = across * share
+        g_budget = gf * by_budget
+        g_depth = along * share + g_budget * mu
+        g_slip = slip * (gf * by_slip2 * S(2.0)) - b * (f * share)
+        g_approach = zero - dot(g_slip, n) - g_depth * slowed
+        gn = b * (depth * share) - g_slip * approach + moved * g_approach
+        g_moved = g_slip + n * g_approach
+        gl = zero - g_depth * (one - slowed) * mask
+        gd = (gn - n * dot(n, gn)) * inverse + n * gl
+        g = gd * less(tiny, exact) + g_moved
+        adj.x[i] = gi + g
+        adj.x[j] = gj - g
+        adj.xp[i] = adj.xp[i] - g_moved
+        adj.xp[j] = adj.xp[j] + g_moved
+        gw = zero - (along * depth + across * f) * share * share
+        given = share * acts
+        adj.mass[i] = adj.mass[i] + select(wi, gw + (ni * depth - si * f) * given, zero)
+        adj.mass[j] = adj.mass[j] + select(wj, gw - (nj * depth - sj * f) * given, zero)
+        return g_budget * depth
+
+    return SimpleNamespace(record_contact=record_contact, sweep_contact=sweep_contact)

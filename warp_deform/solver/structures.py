@@ -263,8 +263,56 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         frame_body_x: wp.array(dtype=R3)
         frame_body_q: wp.array(dtype=Q)
 
+    @wp.struct
+    class Tape:
+        """What a taped launch leaves for the backward sweep: four stacks per group (see `tape`)."""
+
+        resume: int  # 1: the launch continues a rollout where `state` and `counters` left it
+        last: int  # 1: the rollout ends with the launch
+        x: wp.array(dtype=V3)
+        v: wp.array(dtype=V)
+        k: wp.array(dtype=int)
+        s: wp.array(dtype=S)
+        # tops of the four stacks, in this order, by group
+        first: wp.array(dtype=wp.vec4i)
+        end: wp.array(dtype=wp.vec4i)  # of the room for them
+        top: wp.array(dtype=wp.vec4i)
+        steps: wp.array(dtype=int)  # substeps on the tape
+        until: wp.array(dtype=int)  # number of the substep after them
+        full: wp.array(dtype=int)  # 1: there was no room for another substep
+        state: wp.array(dtype=V)  # by group * STATE: what the kernel knows between launches
+        counters: wp.array(dtype=int)  # by group * COUNTERS: the same in whole numbers
+        x_flat: wp.array(dtype=S)  # `x` scalar by scalar (see `lane_access`)
+
+    @wp.struct
+    class Adjoint:
+        """Derivatives of the loss by what is named, while the sweep goes back through the tape."""
+
+        x: wp.array(dtype=V3)
+        v: wp.array(dtype=V3)
+        xp: wp.array(dtype=V3)  # by position at the start of the substep
+        w: wp.array(dtype=V)  # not a derivative: inverse masses as they were in the substep
+        mass: wp.array(dtype=V)  # by free inverse mass
+        damping: wp.array(dtype=V)  # by the share of velocity kept; per group, as those below
+        table_friction: wp.array(dtype=V)
+        contact_friction: wp.array(dtype=V)
+        stiffness: wp.array(dtype=V)  # by 1 / (stiffness dt^2)
+        time: wp.array(dtype=S)  # of each knot, as those below
+        position: wp.array(dtype=R3)
+        rotation: wp.array(dtype=Q)
+        shift: wp.array(dtype=R3)  # by group * L + lane
+        leave: int  # 1: the tape before takes back the prediction of this tape's first substep
+        pending: wp.array(dtype=int)  # 1: the tape after has left that to this one, by group
+        fired: wp.array(dtype=V)  # by group * KINDS: constraints that acted, by kind
+        # the same memory as arrays of V3 and V, scalar by scalar (see `lane_access`)
+        x_flat: wp.array(dtype=S)
+        xp_flat: wp.array(dtype=S)
+        w_flat: wp.array(dtype=S)
+        mass_flat: wp.array(dtype=S)
+
     return SimpleNamespace(
         **vars(t), V4=V4, Settings=Settings, Topology=Topology, Springs=Springs, Pairs=Pairs,
         Shapes=Shapes, Group=Group, Particles=Particles, Near=Near, Bodies=Bodies, Grips=Grips,
-        Watch=Watch, Contacts=Contacts, Sheets=Sheets, Cells=Cells,
+        Watch=Watch, Contacts=Contacts, Sheets=Sheets, Cells=Cells, Tape=Tape,
+        Adjoint=Adjoint,
     )  # fmt: skip

@@ -6,11 +6,13 @@ from typing import Any
 
 import warp as wp
 
-from .friction import friction
-from .lanes import add, any_less, div, dot, mul, root, select, sub  # noqa: F401  (operators)
+from .friction import friction, friction_adjoint
+from .internal_friction import internal_friction_adjoint
+from .lanes import add, any_less, div, dot, less, mul, root, select, sub  # noqa: F401
 from .structures import structures
+from .tape import Kind
 
-__all__ = ["table_contact"]
+__all__ = ["table_contact", "table_contact_adjoint"]
 
 
 @functools.cache
@@ -60,3 +62,132 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         return moved2
 
     return SimpleNamespace(predict=predict, finish=finish)
+
+
+@functools.cache
+def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) -> SimpleNamespace:
+    """`record_finish` ends a substep and leaves a particle's step and height on the tape (with
+    fabrics: its position, that at the start of the substep, and its old velocity).
+
+    `sweep_finish` takes that back, and with it the prediction of the next substep (`again`), whose
+    velocity it finds; with fabrics, dry friction and sleep. Returns the derivatives by friction and
+    by the share of velocity that air damping keeps. `sweep_predict` takes back a prediction alone.
+
+    Branches: above or on the table (its push acts on z only, friction across), the speed clamp, and
+    lanes that are frozen. Sticking is the smooth end of friction, no branch.
+    """
+    t = structures(scalar, lanes)
+    S, V, V3 = t.S, t.V, t.V3
+    Particles, Tape, Adjoint = t.Particles, t.Tape, t.Adjoint
+    finish = table_contact(scalar, lanes).finish
+    coulomb_slopes = friction_adjoint(scalar, lanes).coulomb_slopes
+    sweep_calm = internal_friction_adjoint(scalar, lanes).sweep_calm
+
+    @wp.func
+    def record_finish(
+        i: int, at: int, at_height: int, radius: S, inverse_dt: S, mu: V, fastest: V, all_on: bool,
+        on: V, q: Particles, tape: Tape,
+    ):  # fmt: skip
+        if wp.static(with_sheets):
+            tape.x[at] = q.x[i]
+            tape.x[at + 1] = q.xp[i]
+            tape.x[at + 2] = q.v[i]
+        else:
+            x = q.x[i]
+            tape.x[at] = x - q.xp[i]
+            tape.v[at_height] = x.z
+        return finish(i, radius, inverse_dt, mu, fastest, all_on, on, q)
+
+    @wp.func
+    def sweep_finish(
+        i: int, d: V3, z: V, radius: S, inverse_dt: S, mu: V, fastest: V, on: V, all_on: bool,
+        again: bool, dt: S, kept: V, fall: V3, dry: S, sleep: V, counts: int, adj: Adjoint,
+    ):  # fmt: skip
+        zero = V(S(0.0))
+        one = V(S(1.0))
+        w = adj.w[i]
+        g = adj.x[i]
+        gv = adj.v[i]
+        go = adj.xp[i]
+        # the step as it ended
+        touches = any_less(z, radius)
+        depth = zero
+        share = zero
+        by_budget = zero
+        by_d2 = zero
+        e = d
+        if touches:
+            depth = select(w, wp.max(V(radius) - z, zero), zero)
+            share, by_budget, by_d2 = coulomb_slopes(d.x * d.x + d.y * d.y, depth * mu)
+            e = V3(d.x - d.x * share, d.y - d.y * share, d.z + depth)
+        moved2 = dot(e, e)
+        slower = one
+        bent = zero
+        if any_less(fastest * fastest - moved2, S(0.0)):
+            l = wp.max(root(moved2), V(S(1.0e-12)))
+            slower = wp.min(one, fastest / l)
+            over = less(fastest, l)
+            bent = over * slower / (l * l)
+            kind = counts + wp.static(int(Kind.SPEED_CLAMP))
+            adj.fired[kind] = adj.fired[kind] + over * on
+        by_kept = zero
+        if wp.static(not with_sheets):
+            if again:
+                free = select(w, V(dt), zero)
+                by_kept = dot(g, e * (slower * inverse_dt) + fall) * free
+                gv = gv + g * (kept * free)
+                g = g + go
+                go = V3(zero, zero, zero)
+        # what is frozen ends where it began
+        frozen = V3(zero, zero, zero)
+        if not all_on:
+            frozen = gv * (one - on)
+            gv = gv * on
+            back = g * (one - on)
+            g = g * on
+            go = go + back
+        adj.v[i] = frozen
+        if wp.static(with_sheets):
+            if dry > S(0.0) or any_less(zero - sleep, S(0.0)):
+                adj.x[i] = g
+                adj.xp[i] = go
+                gv = sweep_calm(i, e * (slower * inverse_dt), gv, dry, sleep, on, counts, adj)
+                g = adj.x[i]
+                go = adj.xp[i]
+        gd = gv * inverse_dt
+        gd = gd * slower - e * (bent * dot(gd, e))
+        g = g + gd
+        go = go - gd
+        by_mu = zero
+        if touches:
+            down = less(zero, depth)
+            kind = counts + wp.static(int(Kind.TABLE))
+            adj.fired[kind] = adj.fired[kind] + down * on
+            kind = counts + wp.static(int(Kind.TABLE_SLIP))
+            adj.fired[kind] = adj.fired[kind] + less(share, V(S(0.5))) * down * on
+            g_share = zero - d.x * g.x - d.y * g.y
+            g_budget = g_share * by_budget
+            turn = g_share * by_d2 * S(2.0)
+            gx = d.x * turn - g.x * share
+            gy = d.y * turn - g.y * share
+            gz = down * (g.z + g_budget * mu)
+            by_mu = g_budget * depth
+            g = V3(g.x + gx, g.y + gy, g.z - gz)
+            go = V3(go.x - gx, go.y - gy, go.z)
+        adj.x[i] = g
+        adj.xp[i] = go
+        return by_mu, by_kept
+
+    @wp.func
+    def sweep_predict(i: int, v: V3, dt: S, kept: V, fall: V3, adj: Adjoint):
+        g = adj.x[i]
+        zero = V(S(0.0))
+        free = select(adj.w[i], V(dt), zero)
+        adj.v[i] = adj.v[i] + g * (kept * free)
+        adj.x[i] = g + adj.xp[i]
+        adj.xp[i] = V3(zero, zero, zero)
+        return dot(g, v + fall) * free
+
+    return SimpleNamespace(
+        record_finish=record_finish, sweep_finish=sweep_finish, sweep_predict=sweep_predict
+    )

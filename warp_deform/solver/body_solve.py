@@ -1,0 +1,87 @@
+"""Contacts of a world's rigid bodies: with particles, triangles, each other and the table."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .body_contact import body_contact
+from .box_box import box_box
+from .box_particle import box_particle
+from .box_table import box_table
+from .box_triangle import box_triangle
+from .structures import structures
+
+__all__ = ["body_solve"]
+
+
+@functools.cache
+def body_solve(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
+    """`solve_bodies(g, lane, k, ...)`: the contacts of the bodies of one lane, in a fixed order."""
+    t = structures(scalar, lanes)
+    S, R3 = t.S, t.R3
+    Topology, Shapes, Group, Particles = t.Topology, t.Shapes, t.Group, t.Particles
+    Bodies, Contacts, Sheets, Cells = t.Bodies, t.Contacts, t.Sheets, t.Cells
+    list_table = box_table(scalar, lanes).list_table
+    project_box_particle = box_particle(scalar, lanes).project_box_particle
+    project_box_triangles = box_triangle(scalar, lanes).project_box_triangles
+    list_boxes = box_box(scalar, lanes).list_boxes
+    bodies_ = body_contact(scalar, lanes)
+    begin_body, solve_contacts, end_body = (
+        getattr(bodies_, n) for n in ("begin_body", "solve_contacts", "end_body")
+    )
+
+    @wp.func
+    def solve_bodies(
+        g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
+        q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets, cells: Cells,
+    ):  # fmt: skip
+        """Contacts of one lane's bodies with particles, each other and the table."""
+        p0 = group.particle_start[g]
+        count = top.body_count[k]
+        b0 = group.body_start[g] + lane * count
+        first = group.shape_start[g] + lane * top.shape_count[k]
+        last = first + top.shape_count[k]
+        mv = group.contact_friction[g]
+        mu = mv[lane]
+        tv = group.table_friction[g]
+        radii = top.particle_start[k]
+        for shape in range(first, last):
+            b = b0 + shapes.body[shape]
+            far = wp.length(shapes.half[shape])
+            center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
+            thickest = S(0.0)
+            for i in range(top.particle_count[k]):
+                radius = top.radius[radii + i]
+                thickest = wp.max(thickest, radius)
+                x = q.x[p0 + i]
+                d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
+                if wp.dot(d, d) < (far + radius) * (far + radius):
+                    project_box_particle(
+                        p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
+                    )
+            if wp.static(with_sheets):
+                project_box_triangles(
+                    lane, k, p0, radii, shape, b, far + thickest, mu, push, top, shapes, bodies,
+                    sheets, cells,
+                )  # fmt: skip
+        for b in range(b0, b0 + count):
+            begin_body(b, bodies)
+        start = group.contact_start[g]
+        c = int(start)
+        for sa in range(first, last):
+            for sb in range(sa + 1, last):
+                a = b0 + shapes.body[sa]
+                b = b0 + shapes.body[sb]
+                if a != b and bodies.w[a] + bodies.w[b] > S(0.0):
+                    pair_mu = mu * wp.min(shapes.friction[sa], shapes.friction[sb])
+                    c = list_boxes(c, sa, a, sb, b, pair_mu, push, shapes, bodies, contacts)
+        for b in range(count):
+            if bodies.w[b0 + b] > S(0.0):
+                c = list_table(c, b0 + b, b, first, last, tv[lane], push, shapes, bodies, contacts)
+        solve_contacts(start, c, bodies, contacts)
+        for b in range(b0, b0 + count):
+            end_body(b, bodies)
+
+    return SimpleNamespace(solve_bodies=solve_bodies)

@@ -1,0 +1,79 @@
+"""Copies of what a launch changes, so that a rollout can be run again from within."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .data import SolverData
+    from .mirrored import Mirrored
+
+__all__ = ["Checkpoints"]
+
+_STATE = (
+    "particles.x", "particles.v", "particles.xp", "particles.xr", "particles.w", "near.pair",
+    "near.mask", "grips.particle", "grips.body", "grips.tick", "grips.knot", "grips.shift",
+    "bodies.x", "bodies.q", "bodies.v", "bodies.omega", "bodies.xp", "bodies.qp", "bodies.w",
+    "bodies.touching", "bodies.support", "watch.steps", "watch.nonfinite", "watch.stretch",
+    "watch.depth", "watch.clamped", "watch.overflow",
+)  # fmt: skip
+"""What a launch changes and a later one needs; the lists of fabrics are trimmed to their length."""
+_SHEET_STATE = ("cells.count", "cells.met", "cells.xr", "cells.slack", "cells.place")
+_LISTS = {"cells.count": ("cells.particle", "cells.face", "cells.gap"),
+          "cells.edge_count": ("cells.edge_a", "cells.edge_b", "cells.edge_gap")}  # fmt: skip
+
+
+class Checkpoints:
+    """Saves and restores what launches change: a solver's arrays and the kernel's own `control`."""
+
+    def __init__(self, data: SolverData, control: Mapping[str, Mirrored]) -> None:
+        self.data, self._control = data, control
+        self._held = [name for name in _STATE if name in data.arrays]
+        if data.has_sheets:
+            self._held += _SHEET_STATE
+        if data.has_edges:
+            self._held += ["cells.edge_count", "cells.edge_ball"]
+
+    def save(self) -> dict[str, np.ndarray]:
+        """A copy of everything that the next substep depends on."""
+        data = self.data
+        saved: dict[str, np.ndarray] = {}
+        for name in self._held:
+            data.arrays[name].to_host()
+            saved[name] = data.arrays[name].view.copy()
+        for name, mirrored in self._control.items():
+            mirrored.to_host()
+            saved[name] = mirrored.view.copy()
+        for count, lists in _LISTS.items():
+            if count in saved:
+                rows = self._rows(saved[count])
+                for name in lists:
+                    data.arrays[name].to_host()
+                    saved[name] = data.arrays[name].view[rows]
+        return saved
+
+    def _rows(self, counts: np.ndarray) -> np.ndarray:
+        """Rows of the lists of fabrics that hold something, of all worlds."""
+        data = self.data
+        start = data.views["cells.list_start"][:, None]
+        first = (start + np.arange(data.lanes) * data.views["cells.capacity"][:, None]).ravel()
+        counts = counts[: len(first)]
+        return np.concatenate([np.arange(a, a + c) for a, c in zip(first, counts, strict=True)])
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        data = self.data
+        for name in self._held:
+            data.arrays[name].view[...] = saved[name]
+            data.arrays[name].to_device()
+        for name, mirrored in self._control.items():
+            mirrored.view[...] = saved[name]
+            mirrored.to_device()
+        for count, lists in _LISTS.items():
+            if count in saved:
+                rows = self._rows(saved[count])
+                for name in lists:
+                    data.arrays[name].view[rows] = saved[name]
+                    data.arrays[name].to_device()

@@ -1,0 +1,123 @@
+"""The tape of a differentiated rollout, and how often constraints of each kind acted on it.
+
+A taped launch pushes what the derivative of each constraint needs (its inputs, as differences where
+those suffice) onto one of four stacks of its group: V3, V, whole numbers, and scalars of one lane.
+Constraints that always act push no more; those that act now and then push who they were as well,
+and every phase of a substep ends with their number. The backward sweep pops in reverse, so it finds
+the very inputs, and takes the very branches, of the forward pass. Nothing else of the state is
+needed: the sweep restores none.
+"""
+
+import functools
+from enum import IntEnum
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .structures import structures
+
+__all__ = ["COUNTERS", "GRIP_WORDS", "STATE", "TRIANGLE_SCALARS", "TRIANGLE_WORDS", "Kind", "tape"]
+
+STATE = 14
+"""Lane vectors of the kernel's own state per group."""
+COUNTERS = 3
+"""Whole numbers of the kernel's own state per group."""
+GRIP_WORDS = 7
+"""Whole numbers on the tape for a lane that holds something."""
+TRIANGLE_WORDS = 2
+"""The same for a particle that touches a triangle, or an edge that touches another one."""
+TRIANGLE_SCALARS = 13
+"""Scalars of that pair: distance at which they touch, and the four positions [m]."""
+
+
+class Kind(IntEnum):
+    """What is counted in the sweep, world by world."""
+
+    STRETCH = 0
+    FOLD_LIMIT = 1
+    STRAIN_LIMIT = 2
+    BEND = 3
+    CONTACT = 4
+    CONTACT_SLOWED = 5
+    TABLE = 6
+    TABLE_SLIP = 7
+    SPEED_CLAMP = 8
+    GRIP = 9
+    REACHED = 10
+    RELEASE = 11
+    TETHER = 12
+    TRIANGLE_FACE = 13
+    TRIANGLE_RIM = 14
+    EDGE = 15
+    DRY_FRICTION = 16
+    SLEEP = 17
+    VISCOSITY = 18
+
+
+@functools.cache
+def tape(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`fetch_ahead(x, begin, bytes)`: have a part of the stack of V3 brought near the processor, as
+    the sweep reads backwards, which hardware foresees badly.
+
+    `has_room(...)`: whether a substep with so many springs, particles, near pairs and listed
+    pairs of triangles and edges fits on the tape, and the grips of the next substep with it.
+
+    `load_state(g, tape)`, `save_state(g, ..., tape)`: the kernel's own state between launches.
+    """
+    t = structures(scalar, lanes)
+    L, V, V3, Tape = t.L, t.V, t.V3, t.Tape
+    far = "const char* p = (const char*)(x.data + (begin > 0 ? begin : 0));"
+    lines = "for (int i = 0; i < bytes; i += 64) __builtin_prefetch(p + i, 0, 2);"
+
+    @wp.func_native(f"#if !defined(__CUDA_ARCH__)\n{far} {lines}\n#endif\n")
+    def fetch_ahead(x: wp.array(dtype=V3), begin: int, bytes: int): ...
+
+    @wp.func
+    def has_room(
+        g: int, tops: wp.vec4i, springs: int, particles: int, near: int, listed: int, tape: Tape
+    ):
+        end = tape.end[g]
+        words = springs + particles + near + wp.static(TRIANGLE_WORDS) * listed
+        words += wp.static(2 * L * (GRIP_WORDS + 4) + 8)
+        return (
+            tops[0] + 2 * springs + 4 * particles + 2 * near <= end[0]
+            and tops[1] + near + particles + 8 <= end[1]
+            and tops[2] + words <= end[2]
+            and tops[3] + wp.static(TRIANGLE_SCALARS) * listed <= end[3]
+        )
+
+    @wp.func
+    def load_state(g: int, tape: Tape):
+        at = g * wp.static(STATE)
+        return (
+            tape.state[at], tape.state[at + 1], tape.state[at + 2], tape.state[at + 3],
+            tape.state[at + 4], tape.state[at + 5], tape.state[at + 6], tape.state[at + 7],
+            tape.state[at + 8], tape.state[at + 9], tape.state[at + 10],
+            V3(tape.state[at + 11], tape.state[at + 12], tape.state[at + 13]),
+        )  # fmt: skip
+
+    @wp.func
+    def save_state(
+        g: int, on: V, steps: V, quiet: V, holding: V, calm: V, stale: V, fresh: V, travel: V,
+        clamped: V, free_time: V, least: V, drift: V3, tape: Tape,
+    ):  # fmt: skip
+        at = g * wp.static(STATE)
+        tape.state[at] = on
+        tape.state[at + 1] = steps
+        tape.state[at + 2] = quiet
+        tape.state[at + 3] = holding
+        tape.state[at + 4] = calm
+        tape.state[at + 5] = stale
+        tape.state[at + 6] = fresh
+        tape.state[at + 7] = travel
+        tape.state[at + 8] = clamped
+        tape.state[at + 9] = free_time
+        tape.state[at + 10] = least
+        tape.state[at + 11] = drift.x
+        tape.state[at + 12] = drift.y
+        tape.state[at + 13] = drift.z
+
+    return SimpleNamespace(
+        has_room=has_room, fetch_ahead=fetch_ahead, load_state=load_state, save_state=save_state
+    )
