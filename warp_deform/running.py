@@ -17,7 +17,7 @@ from .rollout import Frames, GripPath, Rollout
 from .solver.guards import Problem
 from .tasks.task import Layout, Snapshot, Task
 
-__all__ = ["DEMONSTRATOR_STREAM", "LAYOUT_STREAM", "Plan", "RunningEpisode", "StepReport",
+__all__ = ["DEMONSTRATOR_STREAM", "LAYOUT_STREAM", "Carry", "Plan", "RunningEpisode", "StepReport",
            "episode_rng", "join_frames"]  # fmt: skip
 
 LAYOUT_STREAM, DEMONSTRATOR_STREAM = 0, 1
@@ -87,21 +87,32 @@ class Plan:
         s = snapshot
         return find_grasp(self.action[:3], s.objects, s.particle_q, s.body_q, task.primitive)
 
-    def carry(
-        self, grasp: Grasp, task: Task, robot: Robot, snapshot: Snapshot, radii: np.ndarray
-    ) -> tuple[Motion, GripPath]:
-        """Motion of the loaded tip, down to where what it holds would rest on the table.
 
-        radii (P,): of the world's particles [m]
-        """
+@dataclass(frozen=True, eq=False)
+class Carry:
+    """How a tip carries what it has taken: called with an action, it tells the motion and the path.
+
+    radii (P,): of the world's particles [m]
+    """
+
+    grasp: Grasp
+    task: Task
+    robot: Robot
+    snapshot: Snapshot
+    radii: np.ndarray
+
+    def __call__(self, action: np.ndarray) -> tuple[Motion, GripPath]:
+        """Motion of the loaded tip, down to where what it holds would rest on the table."""
+        grasp, snapshot = self.grasp, self.snapshot
         if grasp.particle is not None:
-            lowest = snapshot.particle_q[grasp.particle, 2] - radii[grasp.particle]
+            lowest = snapshot.particle_q[grasp.particle, 2] - self.radii[grasp.particle]
         else:
             box = next(o for o in snapshot.objects if isinstance(o, Box) and o.body == grasp.body)
             lowest = snapshot.body_q[box.body, 2] + box.config.lowest
-        hover = robot.hover_height(self.action[3], self.action[4], task.primitive.hover)
-        stage, floor = task.stage_of(float(self.action[6])), grasp.height - float(lowest)
-        return carry(self.action, grasp, stage, floor, hover, task.primitive)
+        config = self.task.primitive
+        hover = self.robot.hover_height(action[3], action[4], config.hover)
+        stage, floor = self.task.stage_of(float(action[6])), grasp.height - float(lowest)
+        return carry(action, grasp, stage, floor, hover, config)
 
 
 def join_frames(frames: Sequence[Frames | None], seconds: Sequence[float]) -> Frames | None:

@@ -24,7 +24,15 @@ from .rendering.topdown import TopDown
 from .robots import robot as find_robot
 from .robots.primitive import Motion, Outcome, approach, solve_joints
 from .rollout import rollout
-from .running import LAYOUT_STREAM, Plan, RunningEpisode, StepReport, episode_rng, join_frames
+from .running import (
+    LAYOUT_STREAM,
+    Carry,
+    Plan,
+    RunningEpisode,
+    StepReport,
+    episode_rng,
+    join_frames,
+)
 from .solver.solver import SolverFusedXPBD
 from .tasks.free_space import FreeSpace
 from .tasks.registry import task as find_task
@@ -299,17 +307,10 @@ class Worlds:
 
     def _carry(self, plans: Mapping[int, Plan], record: float) -> None:
         """Lift, carry and let go what the tips hold, and let the worlds come to rest."""
+        carries = self._carries(plans)
         motions, paths = {}, {}
-        radii = self.solver.data.topologies[0].particle_radius
-        for slot, plan in plans.items():
-            if plan.outcome is not Outcome.MISSED:
-                continue
-            snapshot = self.episodes[slot].snapshot
-            grasp = plan.grasp(self.task, snapshot)
-            if grasp is not None:
-                motions[slot], paths[slot] = plan.carry(
-                    grasp, self.task, self.robot, snapshot, radii
-                )
+        for slot, carried in carries.items():
+            motions[slot], paths[slot] = carried(plans[slot].action)
         moving = self._reachable(plans, motions)
         if not moving:
             return
@@ -327,6 +328,25 @@ class Worlds:
             plans[slot].outcome = Outcome.PLACED
             self.episodes[slot].at_rest = runs[slot].at_rest
             self.episodes[slot].tip = motions[slot].way_points[-1]
+
+    def _carries(self, plans: Mapping[int, Plan]) -> dict[int, Carry]:
+        """How the tips that have reached something would carry it, by slot."""
+        radii, carries = self.solver.data.topologies[0].particle_radius, {}
+        for slot, plan in plans.items():
+            snapshot = self.episodes[slot].snapshot
+            grasp = plan.grasp(self.task, snapshot) if plan.outcome is Outcome.MISSED else None
+            if grasp is not None:
+                carries[slot] = Carry(grasp, self.task, self.robot, snapshot, radii)
+        return carries
+
+    def lead(self, actions: Mapping[int, np.ndarray]) -> dict[int, Carry]:
+        """Move the tips down to what they take, and stop there: how they would carry it, by slot.
+
+        Slots whose tip takes nothing, or cannot go there, are left out.
+        """
+        plans = {slot: self._checked(slot, action) for slot, action in actions.items()}
+        self._approach(plans, 0.0)
+        return self._carries(plans)
 
     def _reachable(self, plans: Mapping[int, Plan], motions: Mapping[int, Motion]) -> list[int]:
         """Slots whose motion the arm can make; notes motions, joints and what is out of reach."""

@@ -1,0 +1,62 @@
+"""The verb `convert` of the `warp-deform` command."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from warp_deform.cli import CommandOptions, Outcome
+from warp_deform.errors import InputError
+
+__all__ = ["ConvertOptions", "convert"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConvertOptions(CommandOptions):
+    """Convert a dataset to or from another format; the destination appears when it is whole."""
+
+    source: Annotated[Positional[Path], arg(metavar="SRC")]
+    """Folder of episodes; with --from, a task's folder of the original, which holds `color`,
+    `depth`, `action` and so on."""
+    target: Annotated[Positional[Path], arg(metavar="DST")]
+    """What is made: a folder, or with `--to robomimic` a file that ends with .hdf5."""
+    to: Literal["lerobot", "robomimic"] | None = None
+    """Format to export to: a LeRobotDataset v3.0, or robomimic's HDF5 (needs the extra `export`).
+    """
+    origin: Annotated[Literal["deformable-ravens"] | None, arg(name="from")] = None
+    """Format to import from: the pickles of the original code, read by a process that can run
+    nothing of theirs."""
+    task: Annotated[str | None, arg(metavar="TASK")] = None
+    """With --from: our name of the task; left out, the folder's name tells it."""
+    workers: Annotated[int | None, arg(metavar="W")] = None
+    """With --from: processes; left out, one per core, fewer for few episodes."""
+
+
+def convert(options: ConvertOptions) -> Outcome:
+    """Convert a dataset."""
+    if (options.to is None) == (options.origin is None):
+        raise InputError("give either --to lerobot or robomimic, or --from deformable-ravens")
+    if options.to is not None and (options.task, options.workers) != (None, None):
+        raise InputError("--task and --workers go with --from")
+    if options.to == "lerobot":
+        from .interchange.lerobot import export_lerobot
+
+        report = export_lerobot(options.source, options.target)
+    elif options.to == "robomimic":
+        from .interchange.robomimic import export_robomimic
+
+        report = export_robomimic(options.source, options.target)
+    else:
+        from .interchange.deformable_ravens import import_deformable_ravens
+
+        report = import_deformable_ravens(
+            options.source, options.target, task=options.task, workers=options.workers
+        )
+    text = (
+        f"{report.out}: {report.episodes} episodes, {report.steps} steps of {report.task}, "
+        f"{report.bytes / 1e6:.1f} MB in {report.seconds:.1f} s"
+    )
+    return Outcome(data=asdict(report), text=text)
