@@ -2,10 +2,10 @@
 
     python benchmarks/planning.py [--tasks cable-ring] [--seeds 50] [--budget 64] [--out rows.jsonl]
 
-`scripted` and `mpc` (8 simulated actions a choice) are the demonstrators; `enumerate`, `random` and
-`cem` look one action ahead, `planner` two. Plays whole episodes in this process on the same seeds.
-With --out, rows already in that file are not measured again. Intervals are Wilson's, 95 %; those of
-mean actions and scores are 1.96 standard errors.
+`scripted` and `mpc` (8 simulated actions a choice) are the demonstrators; `enumerate`, `random`,
+`cem` and `gradient` look one action ahead, `planner` (cem) two. Plays whole episodes in this
+process on the same seeds. With --out, rows already in that file are not measured again. Intervals
+are Wilson's, 95 %; those of mean actions and scores are 1.96 standard errors.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ METHODS: dict[str, Callable[[int], Act[Any]]] = {
     "mpc": lambda _: demonstrator("mpc"),
     **{
         name: partial(lambda name, n: planner(SearchConfig(method=name, depth=1, budget=n)), name)
-        for name in ("enumerate", "random", "cem")
+        for name in ("enumerate", "random", "cem", "gradient")
     },
     "planner": lambda n: planner(SearchConfig(budget=n)),
 }

@@ -126,7 +126,7 @@ def test_every_verb_explains_itself(name: str, capsys: pytest.CaptureFixture[str
         (["demo", "cable-shape", "--out", "x", "-n", "0"], "-n is 0; it must be 1 or more"),
         (["demo", "cable-shape", "--out", "x", "--workers", "-1"], "--workers is -1"),
         (["demo", "cable-shape", "--out", "x", "--robot", "r2d2"], "'ur5', 'panda'"),
-        (["demo", "cable-shape", "--out", "x", "--demonstrator", "planner"], "'visible', 'mpc'"),
+        (["demo", "cable-shape", "--out", "x", "--demonstrator", "oracle"], "'visible', 'mpc'"),
         (["replay", "no-such-folder", "--json"], "no folder 'no-such-folder'"),
         (["inspect", "no-such-folder"], "no folder 'no-such-folder'"),
         (["inspect", ".", "--sheets", "-1"], "--sheets is -1"),

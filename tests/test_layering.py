@@ -26,7 +26,7 @@ OURS = {*MAY_IMPORT, "tests", "examples", "benchmarks"}
 LAZY_EXCEPTION = ("hardware", "learning.policy")
 OPTIONAL = {
     "pybullet", "pybullet_data", "ray", "viser", "rerun", "tensorboard", "h5py", "panda_py",
-    "franky", "frankapy", "pyrealsense2",
+    "franky", "frankapy", "pyk4a", "pyrealsense2",
 }  # fmt: skip
 COMPUTED_IMPORTS = {
     "warp_deform/__init__.py",

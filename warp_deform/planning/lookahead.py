@@ -15,8 +15,8 @@ from ..spaces import action_space
 from ..tasks.task import Action, Task
 from ..world_state import WorldState
 from ..worlds import Worlds
+from .slopes import LANES, Slopes, slopes_for
 
-LANES = 8
 LOOKAHEAD_REST = 1.0
 """Longest wait for rest after a tried action [s]; what still moves is judged as it is."""
 
@@ -35,6 +35,8 @@ class Outlook:
     score: float
     after: WorldState | None
     """The state that the action leaves, where it was asked for."""
+    origin: str = "candidate"
+    """Where the action comes from: a task's candidate, "drawn" near by, or by "gradient"."""
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -54,7 +56,16 @@ class Lookahead:
         self._worlds = Worlds(
             task, count, robot=robot, lanes=LANES, precision=precision, rest_limit=LOOKAHEAD_REST
         )
+        self._slopes = functools.partial(slopes_for, task, robot, precision)
         self.rollouts = 0
+
+    def slopes(self) -> Slopes:
+        """The worlds in which the same actions are differentiated.
+
+        Raises:
+            InputError: the task has none.
+        """
+        return self._slopes()
 
     def try_each(
         self, jobs: Sequence[tuple[WorldState, Action]], *, keep: bool = False

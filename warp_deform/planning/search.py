@@ -1,15 +1,17 @@
-"""Search for an action by simulation, with a budget of rollouts: enumerate, draw, or refine (CEM).
+"""Search for an action by simulation, with a budget of rollouts.
 
-All begin with the candidates of the task. `enumerate` takes the best of them; `random` tries others
-drawn around them; `cem`, the cross-entropy method over a mixture of picks, draws around the best so
-far, ever closer. Two actions ahead, each of the best states is searched again.
-Source: Rubinstein, Kroese, "The Cross-Entropy Method", 2004.
+All methods begin with the candidates of the task. `enumerate` takes the best of them; `random`
+tries others drawn around them; `cem`, the cross-entropy method over a mixture of picks, draws
+around the best so far, ever closer; `gradient` moves the best down the slope of the task's loss by
+Adam, and draws around those whose slope cannot be used. Every action that a search returns has been
+tried as it would run. Two actions ahead, each of the best states is searched again.
+Sources: Rubinstein, Kroese, "The Cross-Entropy Method", 2004; Kingma, Ba, "Adam", 2015.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +21,11 @@ from ..tasks.task import Action, Task
 from ..world_state import WorldState
 from .lookahead import Lookahead, Outlook
 
-METHODS = ("enumerate", "random", "cem")
+METHODS = ("enumerate", "random", "cem", "gradient")
+SLOPE_COST = 4
+"""Rollouts that a slope counts as: a taped one, its repetition and the backward sweep."""
+MOST_GROWTH = 1e5
+"""A slope whose rollout is more chaotic than that is not used."""
 _LOW, _HIGH = np.array(BOUNDS[:2]).T
 
 
@@ -39,6 +45,10 @@ class SearchConfig:
     """Standard deviation of drawn place points [m]; `cem` halves it every round."""
     turn_spread: float = 0.3
     """The same of the place yaw [rad], where the task has use for it."""
+    steps: int = 3
+    """Steps of `gradient` down the slope."""
+    rate: float = 0.015
+    """Length of its first steps [m]; turns go ten times as far [rad]."""
     depth: int = 2
     """Actions ahead."""
     beam: int = 3
@@ -111,9 +121,11 @@ def _around(
 
     proposed = task.candidates(layout, snapshot, rng, config.candidates)
     tried = tries(fresh(proposed, budget))
-    if config.method == "enumerate" or not tried:
+    if config.method == "enumerate" or not tried or any(o.solved for o in tried):
         return tried
     left = budget - len(tried)
+    if config.method == "gradient":
+        return tried + _downhill(lookahead, task, state, rng, config, tried, left, keep=keep)
     if config.method == "random":
         around = [tried[i].action for i in rng.integers(len(tried), size=left)]
         return tried + tries([_drawn(a, rng, config.spread, config.turn_spread) for a in around])
@@ -128,6 +140,51 @@ def _around(
         drawn = [_drawn(a, rng, config.spread * scale, config.turn_spread * scale) for a in around]
         tried += tries(fresh(drawn, count))
     return tried
+
+
+def _downhill(
+    lookahead: Lookahead,
+    task: Task,
+    state: WorldState,
+    rng: np.random.Generator,
+    config: SearchConfig,
+    tried: Sequence[Outlook],
+    budget: int,
+    *,
+    keep: bool,
+) -> list[Outlook]:
+    """Move the best of `tried` downhill, and try where they get; spends up to `budget`."""
+    slopes = lookahead.slopes()
+    each = SLOPE_COST * config.steps + config.steps
+    elites = sorted(tried, key=lambda o: o.rank, reverse=True)[: max(1, budget // each)]
+    if budget < each:
+        return []
+    places = np.array([o.action for o in elites])
+    first, second = np.zeros((len(elites), 3)), np.zeros((len(elites), 3))
+    scale = config.rate * np.array([1.0, 1.0, 10.0])
+    turns = places[:, 5] != 0.0
+    stuck = np.zeros(len(elites), dtype=bool)
+    jobs: list[tuple[WorldState, Action]] = []
+    origins: list[str] = []
+    for k in range(1, config.steps + 1):
+        told = slopes.of([(state, place) for place in places])
+        lookahead.rollouts += SLOPE_COST * len(told)
+        by_place = np.array([slope.by_place for slope in told])
+        stuck |= [not slope.usable or slope.growth > MOST_GROWTH for slope in told]
+        by_place[~turns, 2] = 0.0
+        norms = np.linalg.norm(by_place, axis=1, keepdims=True)
+        by_place = np.where(stuck[:, None], 0.0, by_place / np.maximum(norms, 1e-12))
+        first = 0.8 * first + 0.2 * by_place
+        second = 0.9 * second + 0.1 * by_place**2
+        mean, spread = first / (1 - 0.8**k), np.sqrt(second / (1 - 0.9**k))
+        places[:, 3:6] -= scale / np.sqrt(k) * mean / (spread + 1e-8)
+        places[:, 3:5] = np.clip(places[:, 3:5], _LOW, _HIGH)
+        for i in range(len(elites)):
+            near = _drawn(elites[i].action, rng, config.spread / k, config.turn_spread / k)
+            jobs.append((state, near if stuck[i] else places[i].copy()))
+            origins.append("drawn" if stuck[i] else "gradient")
+    outlooks = lookahead.try_each(jobs, keep=keep)
+    return [replace(o, origin=origin) for o, origin in zip(outlooks, origins, strict=True)]
 
 
 def _drawn(action: Action, rng: np.random.Generator, spread: float, turn: float) -> Action:

@@ -1,4 +1,9 @@
-"""How what is left to do changes with where an action places, by the solver's adjoint."""
+"""How what is left to do changes with where an action places, by the solver's adjoint.
+
+A heap of beads is chaotic: the exact derivative of where it ends is large and points nowhere. Where
+a task says so (`Task.slope_damping`), the rollout that is differentiated is damped more than the
+one that counts, and its derivative agrees with what 5 mm do to the latter.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +15,14 @@ import numpy as np
 
 from ..differentiable import DifferentiableRollout
 from ..errors import InputError
-from ..running import Carry
+from ..running import Carry, RunningEpisode
 from ..tasks.task import Action, Task
 from ..world_state import WorldState
 from ..worlds import Worlds
-from .lookahead import LANES
 
+__all__ = ["Slope", "Slopes", "slopes_for"]
+
+LANES = 8
 PLACE = slice(3, 6)
 """The part of an action that slopes are taken by: place x, y [m], yaw [rad]."""
 SETTLE = 0.3
@@ -49,6 +56,9 @@ class Slopes:
         self._worlds = Worlds(task, LANES, robot=robot, lanes=LANES, precision=precision)
         # what sleeps does not answer to a small change
         self._run = DifferentiableRollout(self._worlds.solver, memory=_MEMORY, sleep=False)
+        if task.slope_damping is not None:
+            for slot in range(LANES):
+                self._worlds.solver.set_world(slot, damping=task.slope_damping)
         self.rollouts = 0
 
     def of(self, jobs: Sequence[tuple[WorldState, Action]]) -> list[Slope]:
@@ -88,16 +98,15 @@ class Slopes:
         return slopes
 
 
-def _loss(task: Task, episode: object, particle_q: np.ndarray) -> tuple[float, np.ndarray]:
+def _loss(task: Task, episode: RunningEpisode, particle_q: np.ndarray) -> tuple[float, np.ndarray]:
     """The task's loss of an end state, and its derivative (P, 3)."""
     import torch
 
-    x = torch.tensor(np.asarray(particle_q, dtype=float), requires_grad=True)
-    bodies = torch.tensor(np.asarray(episode.snapshot.body_q, dtype=float))  # type: ignore[attr-defined]
-    value = task.loss(episode.layout, episode.snapshot, x, bodies)  # type: ignore[attr-defined]
-    value.backward()  # type: ignore[no-untyped-call]
-    assert x.grad is not None
-    return float(value), x.grad.numpy()
+    x = torch.tensor(particle_q, dtype=torch.float64, requires_grad=True)
+    bodies = torch.tensor(episode.snapshot.body_q, dtype=torch.float64)
+    value = task.loss(episode.layout, episode.snapshot, x, bodies)
+    (slope,) = torch.autograd.grad(value, x)
+    return value.item(), slope.numpy()
 
 
 def _by_place(
