@@ -47,7 +47,7 @@ STARTS = {"bag-alone-open": 24, "bag-items-1": 24, "bag-items-2": 24, "bag-color
 # Scores of a constructed goal where they are counted in pixels, whose edges round either way.
 GOAL_SCORE = {"fabric-flat-notarget": 0.97, "bag-color-goal": 0.97}
 # Of eight seeds, where the demonstrator solves fewer than seven; the visible one acts for bags.
-LEAST_SOLVED = {"bag-items-1": 5, "bag-items-2": 2, "bag-color-goal": 3}
+LEAST_SOLVED = {"bag-items-1": 6, "bag-items-2": 5}
 every_task = pytest.mark.parametrize("name", TASKS)
 goal_task = pytest.mark.parametrize("name", [n for n, t in TASKS.items() if t.goal_conditioned])
 
