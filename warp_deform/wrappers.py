@@ -27,7 +27,7 @@ from .tasks.task import Stage, Task
 from .vector_env import PickPlaceVectorEnv
 from .worlds import Worlds
 
-__all__ = ["PrivilegedStage", "VectorPrivilegedStage"]
+__all__ = ["PrivilegedStage", "VectorPrivilegedStage", "stage_at"]
 
 _RULE = "privileged"
 
@@ -59,7 +59,7 @@ class PrivilegedStage(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
         worlds = cast(PickPlaceEnv, self.unwrapped).worlds
         pose = _check(action, (6,))
         if worlds.episodes:
-            self._stage = _stage_at(worlds, 0, pose, self._stage)
+            self._stage = stage_at(worlds, 0, pose, self._stage)
         lift = self._stage.lift if self._stage else 0.0
         seen, reward, terminated, truncated, info = self.env.step(np.append(pose, lift))
         return seen, reward, terminated, truncated, {**info, "stage_rule": _RULE}
@@ -92,7 +92,7 @@ class VectorPrivilegedStage(VectorWrapper[Any, Any, Any, Any, Any]):
         lifts = np.full(self.num_envs, float(env.single_action_space.low[6]))  # type: ignore[attr-defined]
         for i in range(self.num_envs):
             if i in env.worlds.episodes and not env.ended[i]:
-                stage = self._stages[i] = _stage_at(env.worlds, i, poses[i], self._stages[i])
+                stage = self._stages[i] = stage_at(env.worlds, i, poses[i], self._stages[i])
                 lifts[i] = stage.lift
         seen, rewards, terminations, truncations, infos = self.env.step(
             np.column_stack([poses, lifts])
@@ -102,7 +102,7 @@ class VectorPrivilegedStage(VectorWrapper[Any, Any, Any, Any, Any]):
         return seen, rewards, terminations, truncations, _mark(infos)
 
 
-def _stage_at(worlds: Worlds, slot: int, pose: np.ndarray, previous: Stage | None) -> Stage:
+def stage_at(worlds: Worlds, slot: int, pose: np.ndarray, previous: Stage | None) -> Stage:
     """The stage that the task's rule gives for a pick at x, y of `pose` (6,)."""
     task: Task = worlds.task
     snapshot = worlds.episodes[slot].snapshot

@@ -37,6 +37,7 @@ class Transport(nn.Module):
         crop_before_query: run the query network on rotated crops of the image, as the first
             Transporters did; else rotate and crop its features, as the paper's
         width: channels relative to the original's
+        gain: what place logits are multiplied by
         exact: correlate directly, as the original does
         bfloat16: convolve in bfloat16; the correlation stays float32
         generator: draws the initial weights
@@ -49,6 +50,7 @@ class Transport(nn.Module):
         crop: int = 64,
         crop_before_query: bool = False,
         width: float = 1.0,
+        gain: float = 1.0,
         exact: bool = False,
         bfloat16: bool = False,
         generator: torch.Generator,
@@ -56,6 +58,7 @@ class Transport(nn.Module):
         super().__init__()
         self.crop = crop
         self.crop_before_query = crop_before_query
+        self.gain = gain
         self.exact = exact
         self.key, self.query = (
             ResNet43(6 * images, _FEATURES, width=width, bfloat16=bfloat16, generator=generator)
@@ -72,7 +75,7 @@ class Transport(nn.Module):
         else:
             window = _Window(x, centres, crop=self.crop, n_rotations=n_rotations)
             kernels = window.crops(self.query(window.of(x)))
-        return _correlate(key, kernels, exact=self.exact)
+        return _correlate(key, kernels, gain=self.gain, exact=self.exact)
 
 
 class TransportGoalSplit(nn.Module):
@@ -80,7 +83,10 @@ class TransportGoalSplit(nn.Module):
 
     A third network sees the goal; its features multiply those of key and query before the crop,
     so the kernel holds the goal's features at the pick. The crop is always after the query.
-    29,500,299 parameters at width 1. Arguments as of `Transport`.
+    29,500,299 parameters at width 1. Arguments as of `Transport`, and
+
+        goal_bias: added to the goal's features, which begin near 0; with 1 the goal changes at
+            first little, and key and query learn from the first step on
     """
 
     def __init__(
@@ -88,12 +94,15 @@ class TransportGoalSplit(nn.Module):
         *,
         crop: int = 64,
         width: float = 1.0,
+        gain: float = 1.0,
+        goal_bias: float = 0.0,
         exact: bool = False,
         bfloat16: bool = False,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.crop = crop
+        self.gain, self.goal_bias = gain, goal_bias
         self.exact = exact
         self.key, self.query, self.goal = (
             ResNet43(6, _FEATURES, width=width, bfloat16=bfloat16, generator=generator)
@@ -104,9 +113,11 @@ class TransportGoalSplit(nn.Module):
         """Place logits (B, R, H, W); `pick` (B, 2) int64 row and column within the image."""
         current, centres = _pad(image[:, :CHANNELS], pick, self.crop)
         goal = self.goal(_pad(image[:, CHANNELS:], pick, self.crop)[0])
+        goal = goal + self.goal_bias if self.goal_bias else goal
         window = _Window(current, centres, crop=self.crop, n_rotations=n_rotations)
         kernels = window.crops(self.query(window.of(current)) * window.of(goal))
-        return _correlate(self.key(current) * goal, kernels, exact=self.exact)
+        key = self.key(current) * goal
+        return _correlate(key, kernels, gain=self.gain, exact=self.exact)
 
 
 def _pad(image: Tensor, pick: Tensor, crop: int) -> tuple[Tensor, Tensor]:
@@ -115,8 +126,9 @@ def _pad(image: Tensor, pick: Tensor, crop: int) -> tuple[Tensor, Tensor]:
     return normalise(functional.pad(image, (half, half, half, half))), pick.cpu() + half
 
 
-def _correlate(key: Tensor, kernels: Tensor, *, exact: bool) -> Tensor:
-    return (correlate_direct if exact else correlate_fft)(key, kernels)
+def _correlate(key: Tensor, kernels: Tensor, *, gain: float, exact: bool) -> Tensor:
+    logits = (correlate_direct if exact else correlate_fft)(key, kernels)
+    return logits if gain == 1.0 else gain * logits
 
 
 class _Window:

@@ -51,6 +51,11 @@ class TransporterConfig:
     """Side of the crop around the pick [network pixels]; 64 are 0.2 m at scale 1."""
     crop_before_query: bool | None = None
     """Run the query on crops of the image; None: as the original does for the agent."""
+    gain: float = 1.0
+    """What place logits are multiplied by. The original's, means over a crop of products of small
+    features, start within 0.001 of each other, and learning where to place begins late."""
+    goal_bias: float = 0.0
+    """Added to the goal's features in Goal-Split: with 1 they multiply by about 1 at first."""
     n_rotations_train: int = 24
     """Place rotations told apart in training; 24 are steps of 15 degrees."""
     n_rotations_eval: int = 1
@@ -91,7 +96,9 @@ class TransporterConfig:
 PRESETS = {
     "paper": TransporterConfig(),
     # A step costs nearly 30 times less CPU time than the paper's (benchmarks/models.py).
-    "fast": TransporterConfig(scale=2, width=0.25, crop=32, n_rotations_train=1),
+    "fast": TransporterConfig(
+        scale=2, width=0.25, crop=32, gain=100.0, goal_bias=1.0, n_rotations_train=1
+    ),
 }
 
 
@@ -183,6 +190,7 @@ class Transporter(nn.Module):
             crop=config.crop,
             crop_before_query=self.crop_before_query if before is None else before,
             width=config.width,
+            gain=config.gain,
             exact=config.exact,
             bfloat16=config.bfloat16,
             generator=generator,
@@ -228,15 +236,20 @@ class Transporter(nn.Module):
         return Losses(attention, transport, lift)
 
     @torch.no_grad()
-    def act(self, image: Tensor) -> PixelActions:
+    def act(self, image: Tensor, *, avoid: Tensor | None = None) -> PixelActions:
         """Most likely pick, then place and lift given the pick, for images (B, 4 k, H, W).
+
+        avoid: (B, H, W) bool, network pixels that are not to be picked; not all of a picture
 
         Raises:
             InputError: an image of another shape.
         """
         self._check(image)
         n, (rows, columns) = self.config.n_rotations_eval, self.config.shape
-        best = self.attention(image).flatten(1).argmax(dim=1).cpu()
+        heat = self.attention(image)
+        if avoid is not None:
+            heat = heat.masked_fill(avoid.to(heat.device), -math.inf)
+        best = heat.flatten(1).argmax(dim=1).cpu()
         pick = torch.stack([best // columns, best % columns], dim=1)
         best = self.transport(image, pick, n_rotations=n).flatten(1).argmax(dim=1).cpu()
         rotation, best = best // (rows * columns), best % (rows * columns)
@@ -274,6 +287,8 @@ class GoalSplit(Transporter):
         return TransportGoalSplit(
             crop=config.crop,
             width=config.width,
+            gain=config.gain,
+            goal_bias=config.goal_bias,
             exact=config.exact,
             bfloat16=config.bfloat16,
             generator=generator,

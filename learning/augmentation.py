@@ -1,0 +1,139 @@
+"""Turns and shifts of the whole table, which multiply few demonstrations.
+
+One transform moves the current picture, the goal's and both labelled pixels. It is drawn again
+until both pixels stay in view. The relative yaw of pick and place does not change.
+
+Source: Seita et al., ICRA 2021, appendix on training; Zeng et al., CoRL 2020, data augmentation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from warp_deform.errors import InputError
+from warp_deform.rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world, world_to_pixel
+from warp_deform.tasks.ground_truth import YAW_SCALE
+from warp_deform.tasks.metrics import wrap_angle
+
+__all__ = ["RigidTransform", "draw_transform", "move_action", "move_picture", "move_state"]
+
+_TURN = 2 * math.pi / 6
+"""Standard deviation of the turn [rad]."""
+_SHIFT = min(SHAPE) / 6
+"""Standard deviation of the shift along either axis [pixels]."""
+_PIVOT = np.array([SHAPE[1] / 2, SHAPE[0] / 2])
+_MOST_DRAWS = 10_000
+
+_POSE, _POINT, _VECTOR, _FIXED = "pose", "point", "vector", "fixed"
+_BAG = ((_POSE, 32), (_VECTOR, 1))
+_BAGS_AND_BLOCK = (*_BAG, *_BAG, (_POSE, 1), (_FIXED, 2))
+_ROWS: dict[str, tuple[tuple[str, int], ...]] = {
+    "cable-ring": ((_POSE, 64),),
+    "cable-ring-notarget": ((_POSE, 32),),
+    "cable-shape": ((_POSE, 49),),
+    "cable-shape-notarget": ((_POSE, 48),),
+    "cable-line-notarget": ((_POSE, 48),),
+    "fabric-cover": ((_POSE, 1), (_POINT, 100)),
+    "fabric-flat": ((_POSE, 1), (_POINT, 100)),
+    "fabric-flat-notarget": ((_POINT, 200),),
+    "bag-alone-open": _BAG,
+    "bag-items-1": ((_POSE, 1), *_BAG, (_POSE, 1)),
+    "bag-items-2": ((_POSE, 1), *_BAG, (_POSE, 2)),
+    "bag-color-goal": (*_BAGS_AND_BLOCK, *_BAGS_AND_BLOCK),
+    "block-notarget": ((_POSE, 2),),
+}
+"""What the rows of three of a task's ground truth are: poses x, y, -yaw / 15; points x, y, z;
+displacements x, y, -yaw / 15; or something that does not move, as colours."""
+
+
+@dataclass(frozen=True)
+class RigidTransform:
+    """A turn about the middle of the table, then a shift.
+
+    turn: [rad], from x to y, which is from columns to rows in a picture too
+    shift: along x (columns) and y (rows) [pixels]
+    """
+
+    turn: float
+    shift: tuple[float, float]
+
+    def matrix(self) -> np.ndarray:
+        """(2, 3) float64, of column and row [pixels]."""
+        c, s = math.cos(self.turn), math.sin(self.turn)
+        linear = np.array([[c, -s], [s, c]])
+        return np.column_stack([linear, _PIVOT + self.shift - linear @ _PIVOT])
+
+    def of_pixels(self, pixels: np.ndarray) -> np.ndarray:
+        """Where pixels (n, 2), row and column, go: float64 (n, 2)."""
+        moved = self.matrix() @ np.column_stack([pixels[:, ::-1], np.ones(len(pixels))]).T
+        return np.asarray(moved.T[:, ::-1])
+
+    def of_world(self, xy: np.ndarray) -> np.ndarray:
+        """Where world points (n, 2) [m] go."""
+        matrix = self.matrix()
+        origin = pixel_to_world(np.zeros(2))
+        shift = matrix[:, 2] * PIXEL_SIZE
+        return np.asarray((xy - origin) @ matrix[:, :2].T + shift + origin)
+
+
+def draw_transform(action: np.ndarray, *, rng: np.random.Generator) -> RigidTransform:
+    """A random transform that keeps pick and place of `action` (7,) within the picture.
+
+    Raises:
+        InputError: pick and place lie too far apart for one picture.
+    """
+    pixels = world_to_pixel(np.stack([action[:2], action[3:5]]))
+    for _ in range(_MOST_DRAWS):
+        turn = float(rng.normal(0.0, _TURN))
+        x, y = rng.normal(0.0, _SHIFT, size=2)
+        drawn = RigidTransform(turn, (float(x), float(y)))
+        moved = np.round(drawn.of_pixels(pixels))
+        if ((moved >= 0) & (moved < SHAPE)).all():
+            return drawn
+    raise InputError(
+        f"pick {action[:2].tolist()} and place {action[3:5].tolist()} [m] of a demonstration do "
+        "not fit into one picture"
+    )
+
+
+def move_picture(
+    color: np.ndarray, height: np.ndarray, transform: RigidTransform
+) -> tuple[np.ndarray, np.ndarray]:
+    """A picture, colour (H, W, 3) uint8 and height (H, W) [m], moved; what comes into view is 0."""
+    matrix = transform.matrix()
+    size = SHAPE[1], SHAPE[0]
+    moved_color, moved_height = (
+        np.asarray(cv2.warpAffine(image, matrix, size, flags=cv2.INTER_NEAREST))
+        for image in (color, height)
+    )
+    return moved_color, moved_height
+
+
+def move_action(action: np.ndarray, transform: RigidTransform) -> np.ndarray:
+    """An action (7,) with pick and place moved; yaws stay, as in the original."""
+    moved = np.array(action, dtype=float)
+    moved[[0, 1]], moved[[3, 4]] = transform.of_world(np.stack([action[:2], action[3:5]]))
+    return moved
+
+
+def move_state(task: str, state: np.ndarray, transform: RigidTransform) -> np.ndarray:
+    """A task's ground-truth state (D,) float32, moved.
+
+    Raises:
+        InputError: the task's ground truth has another size, or the task is not the benchmark's.
+    """
+    kinds = _ROWS.get(task, ())
+    if len(state) != 3 * sum(count for _, count in kinds):
+        raise InputError(f"{task}: a ground truth of {len(state)} numbers cannot be moved")
+    rows = state.reshape(-1, 3).astype(float)
+    kind = np.repeat([name for name, _ in kinds], [count for _, count in kinds])
+    placed, turned = (kind == _POSE) | (kind == _POINT), kind == _POSE
+    rows[placed, :2] = transform.of_world(rows[placed, :2])
+    rows[kind == _VECTOR, :2] = rows[kind == _VECTOR, :2] @ transform.matrix()[:, :2].T
+    yaw = -YAW_SCALE * rows[turned, 2] + transform.turn
+    rows[turned, 2] = -np.array([wrap_angle(each) for each in yaw]) / YAW_SCALE
+    return rows.ravel().astype(np.float32)

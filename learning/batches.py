@@ -1,0 +1,99 @@
+"""From demonstrations to what the networks learn from: pictures or states with their labels."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from warp_deform.errors import InputError
+from warp_deform.rendering.pixels import SHAPE, world_to_pixel
+from warp_deform.tasks.task import Task
+
+from .augmentation import draw_transform, move_action, move_picture, move_state
+from .dataset import Demonstrations
+from .models.gt_state import encode_action
+from .models.transporter import Batch, Transporter
+
+__all__ = ["image_batch", "state_batch", "task_lifts"]
+
+StateBatch = tuple[Tensor, Tensor, Tensor]
+"""States (B, D), encoded actions (B, 6), lift indices (B,)."""
+
+
+def task_lifts(task: Task) -> tuple[float, ...]:
+    """Lifts of the task's stages [m], each once, from low to high.
+
+    >>> from warp_deform.tasks.registry import task
+    >>> task_lifts(task("bag-items-1"))
+    (0.05, 0.3, 0.4)
+    """
+    return tuple(sorted({stage.lift for stage in task.stages}))
+
+
+def image_batch(
+    data: Demonstrations,
+    agent: Transporter,
+    *,
+    count: int,
+    rng: np.random.Generator,
+    augment: bool = True,
+) -> Batch:
+    """`count` moments, drawn and moved by `rng`, as an agent over pictures sees them.
+
+    Raises:
+        InputError: a pick or place is out of view.
+    """
+    images, picks, places, thetas, lifts = [], [], [], [], []
+    for _ in range(count):
+        moment = data.moment(*data.draw(rng))
+        pictures = [(moment.color, moment.height)]
+        if agent.pictures == 2:
+            pictures.append((moment.goal_color, moment.goal_height))
+        pixels = world_to_pixel(np.stack([moment.action[:2], moment.action[3:5]]))
+        if augment:
+            moved = draw_transform(moment.action, rng=rng)
+            pictures = [move_picture(*picture, moved) for picture in pictures]
+            pixels = np.round(moved.of_pixels(pixels)).astype(np.int64)
+        if not ((pixels >= 0) & (pixels < SHAPE)).all():
+            raise InputError(f"a demonstration acts out of view, at {moment.action.tolist()}")
+        images.append(agent.image(*pictures))
+        pick, place = agent.config.to_network(pixels)
+        picks.append(pick)
+        places.append(place)
+        thetas.append(moment.action[2] - moment.action[5])
+        lifts.append(_lift_index(moment.action, agent.config.lifts))
+    return Batch(
+        torch.stack(images),
+        torch.from_numpy(np.stack(picks)),
+        torch.from_numpy(np.stack(places)),
+        torch.tensor(thetas, dtype=torch.float32),
+        torch.tensor(lifts),
+    )
+
+
+def state_batch(
+    data: Demonstrations,
+    lifts: tuple[float, ...],
+    *,
+    count: int,
+    rng: np.random.Generator,
+    augment: bool = True,
+) -> StateBatch:
+    """`count` moments, drawn and moved by `rng`, as a ground-truth baseline sees them."""
+    states, actions = [], []
+    for _ in range(count):
+        state, action = data.state(*data.draw(rng))
+        if augment:
+            moved = draw_transform(action, rng=rng)
+            state = move_state(data.task.name, state, moved)
+            action = move_action(action, moved)
+        states.append(state)
+        actions.append(action)
+    target = encode_action(np.stack(actions))
+    indices = torch.tensor([_lift_index(action, lifts) for action in actions])
+    return torch.from_numpy(np.stack(states)), torch.from_numpy(target), indices
+
+
+def _lift_index(action: np.ndarray, lifts: tuple[float, ...]) -> int:
+    return int(np.abs(np.array(lifts) - action[6]).argmin())

@@ -1,0 +1,165 @@
+"""The verbs of the `warp-deform` command that train and evaluate."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from warp_deform.cli import CommandOptions, Outcome
+from warp_deform.errors import InputError
+from warp_deform.quiet import quiet_warp
+from warp_deform.tasks.registry import task as find_task
+
+__all__ = ["EvalOptions", "TrainOptions", "evaluate", "train"]
+
+_Task = Annotated[Positional[str], arg(metavar="TASK")]
+_Folder = Annotated[Positional[Path], arg(metavar="RUN")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions(CommandOptions):
+    """Train an agent on demonstrations; the same command goes on where it was interrupted."""
+
+    task: _Task
+    """Name of the task, see `warp-deform list`."""
+    agent: Literal["transporter", "goal-split", "goal-stack", "gt-mlp", "gt-mlp-2step"]
+    """Transporters see pictures (goal-split and goal-stack the goal's too), the others see the
+    simulator's state."""
+    data: Annotated[Path, arg(metavar="DIR")]
+    """Folder of demonstrations, see `warp-deform demo`."""
+    demos: Annotated[int | None, arg(metavar="N")] = None
+    """Demonstrations to learn from, drawn by --seed; all when left out."""
+    seed: int = 0
+    """Of the initial weights, of what is drawn, and of which demonstrations are used."""
+    preset: Literal["paper", "fast"] = "paper"
+    """The paper's network and schedule, or one for two CPU cores."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder of the run."""
+    steps: Annotated[int | None, arg(metavar="N")] = None
+    """Steps of training; the preset's when left out."""
+    batch: Annotated[int | None, arg(metavar="N")] = None
+    """Moments a step; the preset's when left out."""
+    lr: Annotated[float | None, arg(metavar="LR")] = None
+    """Step size of Adam; the preset's when left out."""
+    snapshots: Annotated[int | None, arg(metavar="N")] = None
+    """Snapshots, evenly spread; the preset's when left out."""
+    validate: Annotated[int, arg(metavar="N")] = 0
+    """Validation episodes that every snapshot plays during training."""
+    patience: Annotated[int | None, arg(metavar="N")] = None
+    """Stop when so many snapshots in a row played no better; needs --validate."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where the network computes; under `torchrun`, each process takes one GPU."""
+    threads: Annotated[int, arg(metavar="N")] = 1
+    """Threads of torch."""
+    tensorboard: bool = False
+    """Write for TensorBoard too (needs the extra `train`)."""
+
+
+def train(options: TrainOptions) -> Outcome:
+    """Train an agent."""
+    find_task(options.task)
+    from .training import TrainConfig
+    from .training import train as run_training
+
+    quiet_warp()
+    config = TrainConfig(
+        task=options.task,
+        agent=options.agent,
+        data=options.data,
+        out=options.out,
+        demos=options.demos,
+        seed=options.seed,
+        preset=options.preset,
+        device=options.device,
+        threads=options.threads,
+        validate=options.validate,
+        patience=options.patience,
+        tensorboard=options.tensorboard,
+    )
+    changes: dict[str, Any] = {
+        name: value
+        for name in ("steps", "batch", "lr", "snapshots")
+        if (value := getattr(options, name)) is not None
+    }
+    if changes:
+        config = replace(config, schedule=replace(config.plan, **changes))
+    report = asdict(run_training(config))
+    return Outcome(data=report, text=_lines(report))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalOptions(CommandOptions):
+    """Choose a run's best snapshot on validation seeds and play the test seeds with it.
+
+    Goals are constructed from goal seeds. Results are kept: what was played is not played again.
+    """
+
+    run: _Folder
+    """Folder of a training run."""
+    episodes: Annotated[int, arg(metavar="N")] = 200
+    """Test episodes, seeds 10,000 and up."""
+    validation_episodes: Annotated[int, arg(metavar="N")] = 20
+    """Validation episodes a snapshot, seeds 50,000 and up."""
+    paper: bool = False
+    """Also the paper's protocol: every snapshot plays 20 test episodes with demonstrated goals, and
+    the best result counts, which is optimistic."""
+    stage_rule: Literal["action", "privileged"] = "action"
+    """Who chooses the lift: the policy, or the paper's rule, which reads the simulator."""
+    retry: bool = True
+    """Agents over pictures pick elsewhere after an action that changed nothing that they see; the
+    paper's do not."""
+    robot: Literal["ur5", "panda"] = "ur5"
+    """The arm."""
+    workers: Annotated[int | None, arg(metavar="W")] = None
+    """Processes; left out, one per core, fewer for few episodes. The result is the same."""
+
+
+def evaluate(options: EvalOptions) -> Outcome:
+    """Evaluate a training run."""
+    from .report_run import evaluate_run
+
+    if options.workers is not None and options.workers < 1:
+        raise InputError(f"--workers is {options.workers}; it must be 1 or more")
+    quiet_warp()
+    report = evaluate_run(
+        options.run,
+        episodes=options.episodes,
+        validation_episodes=options.validation_episodes,
+        paper=options.paper,
+        stage_rule=options.stage_rule,
+        retry=options.retry,
+        robot=options.robot,
+        workers=options.workers,
+    )
+    return Outcome(data=report, text=_describe(report))
+
+
+def _describe(report: dict[str, Any]) -> str:
+    """The report in a few lines."""
+    test = report["test"]
+    low, high = test["pc_success_ci95"]
+    lines = {
+        "task": report["task"],
+        "agent": f"{report['agent']}, {report['demos']} demonstrations, seed {report['seed']}",
+        "snapshot": f"step {report['selected']}, chosen on validation seeds",
+        "test": f"{test['n_success']} of {test['n_episodes']} episodes solved, "
+        f"{test['pc_success']:.1f} % (95 % Wilson interval {low:.1f} to {high:.1f})",
+        "mean score": f"{test['mean_score']:.4f}",
+        "mean actions": f"{test['mean_actions']:.2f}",
+        "paper's value": f"{test['paper_value']:.1f} %",
+    }
+    if report["paper"] is not None:
+        paper = report["paper"]
+        lines["paper's way"] = (
+            f"{paper['paper_value']:.1f} %, best of {paper['n_snapshots']} snapshots on "
+            f"{paper['n_episodes']} test episodes themselves (optimistic)"
+        )
+    return _lines(lines)
+
+
+def _lines(data: dict[str, Any]) -> str:
+    width = max(map(len, data))
+    return "\n".join(f"{key.replace('_', ' '):<{width}}  {value}" for key, value in data.items())

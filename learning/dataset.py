@@ -1,0 +1,202 @@
+"""Random access to demonstrations with little memory: a cache of plain rows that is memory-mapped.
+
+An episode's file holds compressed pictures; what training reads again and again is a derived cache,
+`rows/` in the dataset's folder, one NumPy file per episode, named after the contents of the episode
+it was made from. It may be deleted at any time, and several processes may make it at once.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from warp_deform.episodes import Episode, EpisodeReader, episode_name, read_index
+from warp_deform.errors import InputError
+from warp_deform.tasks.registry import task as find_task
+
+__all__ = ["Demonstrations", "Moment", "choose"]
+
+_FOLDER = "rows"
+_FORMAT = 1
+
+
+class Moment(NamedTuple):
+    """One demonstrated action: what was seen, what was done, and what came of the episode.
+
+    color (H, W, 3) uint8 and height (H, W) float32 [m], of the moment and of the episode's end
+    action: (7,) float64 pick x, y, yaw, place x, y, yaw, lift [m, rad]
+    """
+
+    color: np.ndarray
+    height: np.ndarray
+    goal_color: np.ndarray
+    goal_height: np.ndarray
+    action: np.ndarray
+
+
+def choose(seeds: tuple[int, ...], count: int, *, seed: int) -> tuple[int, ...]:
+    """The `count` episodes that training run `seed` learns from, drawn without replacement.
+
+    Source: Seita et al., ICRA 2021, section on training (1, 10, 100 of 1000, drawn by run).
+
+    >>> choose((3, 5, 8, 13), 2, seed=0)
+    (8, 13)
+
+    Raises:
+        InputError: there are not so many.
+    """
+    if not 1 <= count <= len(seeds):
+        raise InputError(
+            f"--demos is {count}; the data holds {len(seeds)} demonstrations, so ask for 1 to "
+            f"{len(seeds)} or collect more"
+        )
+    chosen = np.random.default_rng(seed).choice(np.array(seeds), count, replace=False)
+    return tuple(sorted(chosen.tolist()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """An episode as training needs it."""
+
+    path: Path
+    actions: np.ndarray  # (T, 7) float64
+    ground_truth: np.ndarray  # (T + 1, D) float32
+
+
+class Demonstrations:
+    """Demonstrations of one task, of which `count` were chosen for training run `seed`.
+
+    Pictures stay on the disk: one moment takes two reads, and memory holds only actions and
+    ground truth. Building reads each chosen episode once, unless the cache has it.
+
+    Args:
+        folder: what `warp-deform demo` wrote
+        task: the task that must be in it
+        count: demonstrations to learn from; None takes all
+        seed: which ones, see `choose`
+
+    Raises:
+        InputError: no folder, another task's episodes, failures among them, or too few.
+    """
+
+    def __init__(self, folder: Path, *, task: str, count: int | None = None, seed: int = 0) -> None:
+        self.task = find_task(task)
+        reader = EpisodeReader(Path(folder))
+        index = read_index(Path(folder))["episodes"]
+        for name, entry in index.items():
+            if entry["task"] != task:
+                raise InputError(
+                    f"{Path(folder) / name} is an episode of {entry['task']}, not of {task}; "
+                    "name the folder of its demonstrations"
+                )
+            if not entry["success"] or entry["actions"] == 0:
+                raise InputError(
+                    f"{Path(folder) / name} is no successful demonstration; train on a folder "
+                    "that `warp-deform demo` wrote"
+                )
+        self.seeds = choose(reader.seeds, len(reader) if count is None else count, seed=seed)
+        self.seals = tuple(index[episode_name(number)]["seal"] for number in self.seeds)
+        cache = Path(folder) / _FOLDER
+        self._episodes = [
+            _open(reader, number, cache / f"{number:09d}-{seal}-{_FORMAT}.npy")
+            for number, seal in zip(self.seeds, self.seals, strict=True)
+        ]
+
+    def __len__(self) -> int:
+        """Number of demonstrations."""
+        return len(self._episodes)
+
+    def lengths(self) -> list[int]:
+        """Actions of every demonstration."""
+        return [len(episode.actions) for episode in self._episodes]
+
+    @property
+    def state_size(self) -> int:
+        """Length of a ground-truth state."""
+        return int(self._episodes[0].ground_truth.shape[1])
+
+    def draw(self, rng: np.random.Generator) -> tuple[int, int]:
+        """A demonstration and one of its moments: first the one, then the other, both uniformly.
+
+        Source: Seita et al., ICRA 2021, code of the training loop.
+        """
+        episode = int(rng.integers(len(self._episodes)))
+        return episode, int(rng.integers(len(self._episodes[episode].actions)))
+
+    def moment(self, episode: int, t: int) -> Moment:
+        """Moment t of a demonstration; its goal is how the demonstration ended (hindsight)."""
+        found = self._episodes[episode]
+        rows = np.load(found.path, mmap_mode="r", allow_pickle=False)
+        now, end = rows[t], rows[-1]
+        return Moment(
+            np.array(now["color"]),
+            np.array(now["height"]),
+            np.array(end["color"]),
+            np.array(end["height"]),
+            found.actions[t],
+        )
+
+    def state(self, episode: int, t: int) -> tuple[np.ndarray, np.ndarray]:
+        """Ground truth (D,) float32 of moment t, and the action (7,) taken there.
+
+        Where the task has a goal, the second half is the goal's state: here that of the
+        demonstration's end (hindsight), as in `moment`.
+        """
+        found = self._episodes[episode]
+        state = found.ground_truth[t].copy()
+        if self.task.goal_conditioned:
+            half = len(state) // 2
+            state[half:] = found.ground_truth[-1, :half]
+        return state, found.actions[t]
+
+
+def _open(reader: EpisodeReader, seed: int, path: Path) -> _Rows:
+    """The cached rows of an episode, made first where they are missing or damaged."""
+    try:
+        rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError):  # not made yet, or cut short by a full disk
+        _write(_rows(reader.read(seed)), path)
+        rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    return _Rows(path, np.array(rows["action"][:-1]), np.array(rows["ground_truth"]))
+
+
+def _rows(episode: Episode) -> np.ndarray:
+    """An episode as a structured array; the action of its last row is not a number."""
+    first = episode.steps[0]
+    shape = first.height.shape
+    kind = np.dtype(
+        [
+            ("color", "u1", (*shape, 3)),
+            ("height", "<f4", shape),
+            ("action", "<f8", (7,)),
+            ("ground_truth", "<f4", first.ground_truth.shape),
+        ]
+    )
+    rows = np.zeros(len(episode.steps), kind)
+    for row, step in zip(rows, episode.steps, strict=True):
+        row["color"], row["height"] = step.color, step.height
+        row["action"] = np.nan if step.action is None else step.action
+        row["ground_truth"] = step.ground_truth
+    return rows
+
+
+def _write(rows: np.ndarray, path: Path) -> None:
+    """Store rows under a temporary name, then give them theirs."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    try:
+        path.parent.mkdir(exist_ok=True)
+        with temporary.open("xb") as file:
+            np.save(file, rows, allow_pickle=False)
+        temporary.replace(path)
+    except OSError as error:
+        raise InputError(
+            f"the cache {path.parent} cannot be written ({error.strerror}); make room or copy the "
+            "demonstrations to where you may write"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)

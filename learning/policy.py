@@ -1,0 +1,264 @@
+"""Policies: `act(observation, goal)` from a snapshot, in simulation and on a robot alike.
+
+    policy = load_policy("runs/line")
+    action = policy.act(observation)
+
+An observation is the environment's: `color` and `height`, and `goal_color` and `goal_height` where
+the policy needs a goal that is not handed in. The lift is the network's own choice; the paper's
+privileged rule, which reads the simulator, is `evaluation.Protocol(stage_rule="privileged")`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from warp_deform.errors import InputError
+from warp_deform.rendering.pixels import SHAPE, pixel_to_world
+from warp_deform.tasks.registry import task as find_task
+
+from .models.gt_state import GtState, GtState2Step, GtStateConfig
+from .models.transporter import GoalSplit, GoalStack, Transporter, TransporterConfig
+from .snapshots import RunFolder, read_snapshot
+
+__all__ = ["AGENTS", "Agent", "AgentDescription", "ImagePolicy", "Policy", "RetryingPolicy",
+           "StatePolicy", "load_policy", "make_agent"]  # fmt: skip
+
+Agent = Transporter | GtState | GtState2Step
+
+_AVOIDED = 0.008
+"""Around a missed pick [m]: a bead's diameter and more."""
+_MOST_TRIED = 20
+_LEVELS, _PIXELS = 10, 4
+"""A picture has changed if so many colour levels differ in more than so many pixels; a bead of 1 cm
+covers 8."""
+
+AGENTS: dict[str, type[Transporter] | type[GtState] | type[GtState2Step]] = {
+    cls.name: cls for cls in (Transporter, GoalSplit, GoalStack, GtState, GtState2Step)
+}
+"""The agents by the names of the command line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentDescription:
+    """All that it takes to build an agent but its weights.
+
+    config: fields of its `TransporterConfig` or `GtStateConfig`
+    state_size: length of the ground truth, for agents that see it
+    """
+
+    task: str
+    agent: str
+    config: dict[str, Any]
+    state_size: int | None = None
+
+    def __post_init__(self) -> None:
+        goal = find_task(self.task).goal_conditioned
+        if self.agent not in AGENTS:
+            raise InputError(f"there is no agent {self.agent!r}; there are: {', '.join(AGENTS)}")
+        needs = self.agent in (GoalSplit.name, GoalStack.name)
+        if needs and not goal:
+            raise InputError(
+                f"{self.agent} sees a goal image and {self.task} has none; use --agent transporter"
+            )
+        if goal and self.agent == Transporter.name:
+            raise InputError(
+                f"{self.task} shows its goal in an image, which a transporter does not see; use "
+                "--agent goal-split or goal-stack"
+            )
+
+
+def make_agent(description: AgentDescription, *, seed: int = 0) -> Agent:
+    """The agent with its initial weights.
+
+    Raises:
+        InputError: the configuration is not this agent's.
+    """
+    cls = AGENTS[description.agent]
+    kind = TransporterConfig if issubclass(cls, Transporter) else GtStateConfig
+    unknown = description.config.keys() - {field.name for field in dataclasses.fields(kind)}
+    if unknown:
+        raise InputError(f"{description.agent} has no setting {min(unknown)!r}")
+    values = {**description.config, "lifts": tuple(description.config["lifts"])}
+    if issubclass(cls, Transporter):
+        return cls(TransporterConfig(**values), seed=seed)
+    if description.state_size is None:
+        raise InputError(f"{description.agent} needs the size of the state")
+    return cls(description.state_size, GtStateConfig(**values), seed=seed)
+
+
+class Policy(Protocol):
+    """Acts on what is seen."""
+
+    description: AgentDescription
+
+    def act(
+        self,
+        observation: Mapping[str, np.ndarray],
+        goal: Mapping[str, np.ndarray] | None = None,
+        *,
+        rng: np.random.Generator | None = None,
+    ) -> np.ndarray:
+        """Action (7,) float64: pick x, y, yaw, place x, y, yaw, lift [m, rad].
+
+        goal: `color` and `height` of the goal, where they are not part of the observation
+        rng: for policies that draw their actions
+        """
+
+
+class ImagePolicy:
+    """A Transporter over pictures; the same observation gives the same action."""
+
+    def __init__(self, agent: Transporter, description: AgentDescription) -> None:
+        self.agent, self.description = agent.eval(), description
+
+    def act(
+        self,
+        observation: Mapping[str, np.ndarray],
+        goal: Mapping[str, np.ndarray] | None = None,
+        *,
+        rng: np.random.Generator | None = None,
+        avoid: Sequence[np.ndarray] = (),
+    ) -> np.ndarray:
+        """See `Policy.act`.
+
+        avoid: points x, y [m] within 8 mm of which nothing is to be picked
+
+        Raises:
+            InputError: a picture is missing, or is not a top-down picture of the table.
+        """
+        current = _picture(observation, "")
+        aim = None
+        if self.agent.pictures == 2:
+            aim = _picture(observation, "goal_") if goal is None else _picture(goal, "")
+        device = next(self.agent.parameters()).device
+        image = self.agent.image(current, aim)[None].to(device)
+        found = self.agent.act(image, avoid=self._near(avoid) if len(avoid) else None)
+        pick, place = pixel_to_world(found.pick[0]), pixel_to_world(found.place[0])
+        return np.array([*pick, 0.0, *place, found.place_yaw[0], found.lift[0]])
+
+    def _near(self, points: Sequence[np.ndarray]) -> torch.Tensor:
+        """Network pixels (1, H, W) bool near any of the points."""
+        config = self.agent.config
+        rows, columns = config.shape
+        grid = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1)
+        world = pixel_to_world(config.to_camera(grid))
+        gaps = [np.linalg.norm(world - point, axis=-1) for point in points]
+        return torch.from_numpy(np.min(gaps, axis=0) < _AVOIDED)[None]
+
+
+class RetryingPolicy:
+    """An image policy that picks elsewhere after an action that changed nothing in the picture.
+
+    A policy without memory would repeat a missed grasp for ever. This one remembers, within an
+    episode, where it picked since the picture last changed; nothing else is taken from the past,
+    and nothing from the simulator. `reset` it between episodes.
+    """
+
+    def __init__(self, policy: ImagePolicy) -> None:
+        self.policy, self.description = policy, policy.description
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the episode."""
+        self._seen: np.ndarray | None = None
+        self._tried: list[np.ndarray] = []
+
+    def act(
+        self,
+        observation: Mapping[str, np.ndarray],
+        goal: Mapping[str, np.ndarray] | None = None,
+        *,
+        rng: np.random.Generator | None = None,
+    ) -> np.ndarray:
+        """See `Policy.act`."""
+        color = np.array(observation.get("color", ()), dtype=np.int16)
+        if self._seen is None or color.shape != self._seen.shape or _changed(color, self._seen):
+            self._tried = []
+        self._seen = color
+        action = self.policy.act(observation, goal, avoid=self._tried[-_MOST_TRIED:])
+        self._tried.append(action[:2])
+        return action
+
+
+class StatePolicy:
+    """A ground-truth baseline: it sees `ground_truth`, as in the environments' `info`."""
+
+    def __init__(self, agent: GtState | GtState2Step, description: AgentDescription) -> None:
+        self.agent, self.description = agent.eval(), description
+
+    def act(
+        self,
+        observation: Mapping[str, np.ndarray],
+        goal: Mapping[str, np.ndarray] | None = None,
+        *,
+        rng: np.random.Generator | None = None,
+    ) -> np.ndarray:
+        """See `Policy.act`; the goal is part of the ground truth, and the action is drawn by `rng`.
+
+        The action may lie outside of the action space: nothing is clamped.
+
+        Raises:
+            InputError: the state is missing or has another size, or there is no `rng`.
+        """
+        state = np.asarray(observation.get("ground_truth", ()), dtype=np.float32)
+        if state.shape != (self.description.state_size,):
+            raise InputError(
+                f"{self.agent.name} needs `ground_truth` of {self.description.state_size} numbers, "
+                f"got shape {state.shape}"
+            )
+        if rng is None:
+            raise InputError(f"{self.agent.name} draws its actions: hand in a generator as `rng`")
+        device = next(self.agent.parameters()).device
+        return self.agent.act(torch.from_numpy(state[None]).to(device), rng=rng)[0]
+
+
+def load_policy(path: str | Path, *, device: str = "cpu") -> ImagePolicy | StatePolicy:
+    """The policy of a snapshot file, or of a training run's folder.
+
+    Of a run's snapshots, that is the one that `warp-deform eval` chose, or the last one.
+
+    Raises:
+        InputError: there is none, or it is not one of ours.
+    """
+    path = Path(path)
+    file = path if path.suffix == ".safetensors" else RunFolder(path).chosen_snapshot()
+    weights, record = read_snapshot(file)
+    try:
+        description = AgentDescription(**record["agent"])
+        agent = make_agent(description)
+        agent.load_state_dict(weights)
+    except (KeyError, TypeError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{file} is no snapshot of this release's agents: {reason}") from error
+    agent.to(device)
+    if isinstance(agent, Transporter):
+        return ImagePolicy(agent, description)
+    return StatePolicy(agent, description)
+
+
+def _changed(now: np.ndarray, before: np.ndarray) -> bool:
+    return bool((np.abs(now - before).max(axis=-1) > _LEVELS).sum() > _PIXELS)
+
+
+def _picture(source: Mapping[str, np.ndarray], prefix: str) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and height under the names `prefix` + "color" and "height"."""
+    found = []
+    for name, shape, kind in (("color", (*SHAPE, 3), np.uint8), ("height", SHAPE, np.float32)):
+        array = source.get(prefix + name)
+        if array is None:
+            raise InputError(f"the observation has no {prefix + name!r}")
+        array = np.asarray(array)
+        if array.shape != shape or array.dtype != kind:
+            raise InputError(
+                f"{prefix + name}: shape {shape} of {np.dtype(kind)} is needed, got {array.shape} "
+                f"of {array.dtype}"
+            )
+        found.append(array)
+    return found[0], found[1]

@@ -1,0 +1,184 @@
+"""A training run's folder: settings, log, snapshots and the state to go on from.
+
+run.json                     what is trained, on what, and by which versions
+log.jsonl                    losses, a line every few steps
+snapshots/step_*.safetensors weights, and beside each a JSON file that says whose they are
+state.safetensors            all that training goes on from
+evaluations/*.json           results of snapshots, episode by episode
+eval_info.json               the report of `warp-deform eval`
+
+Weights are safetensors: loading runs no code.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from warp_deform.errors import InputError, WarpDeformError
+
+__all__ = ["RunFolder", "read_json", "read_snapshot", "write_json"]
+
+_FORMAT = 1
+_NAME = re.compile(r"step_(\d{8})\.safetensors")
+
+
+class RunFolder:
+    """Where a training run keeps its files."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self.settings = self.path / "run.json"
+        self.log = self.path / "log.jsonl"
+        self.state = self.path / "state.safetensors"
+        self.report = self.path / "eval_info.json"
+        self.evaluations = self.path / "evaluations"
+        self._snapshots = self.path / "snapshots"
+
+    def create(self) -> None:
+        """Make the folders.
+
+        Raises:
+            InputError: they cannot be made.
+        """
+        try:
+            self._snapshots.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"--out {self.path} cannot be made: {error.strerror}") from error
+
+    def read_settings(self) -> dict[str, Any]:
+        """What `run.json` says.
+
+        Raises:
+            InputError: this is no training run's folder.
+        """
+        if not self.settings.is_file():
+            raise InputError(
+                f"{self.path} holds no training run; `warp-deform train` makes one with --out"
+            )
+        return read_json(self.settings)
+
+    def snapshot(self, step: int) -> Path:
+        """Path of the weights after so many steps."""
+        return self._snapshots / f"step_{step:08d}.safetensors"
+
+    def steps(self) -> list[int]:
+        """Steps of which there are snapshots, in order."""
+        matches = (_NAME.fullmatch(path.name) for path in self._snapshots.glob("*.safetensors"))
+        return sorted(int(match[1]) for match in matches if match)
+
+    def chosen_snapshot(self) -> Path:
+        """The snapshot that the evaluation chose, or the last one.
+
+        Raises:
+            InputError: there is none.
+        """
+        self.read_settings()
+        steps = self.steps()
+        if not steps:
+            raise InputError(f"{self.path} has no snapshot yet; run `warp-deform train` to its end")
+        if self.report.is_file():
+            chosen = read_json(self.report).get("selected")
+            if chosen in steps:
+                return self.snapshot(chosen)
+        return self.snapshot(steps[-1])
+
+    def write_snapshot(
+        self, step: int, weights: Mapping[str, Tensor], record: Mapping[str, Any]
+    ) -> Path:
+        """Store weights, and a record of what they are beside them."""
+        path = self.snapshot(step)
+        write_json(path.with_suffix(".json"), {"format": _FORMAT, "step": step, **record})
+        _publish(path, save({name: each.contiguous() for name, each in weights.items()}))
+        return path
+
+    def write_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """Store what training goes on from, in place of what was stored before."""
+        metadata = {"format": str(_FORMAT), "step": str(step)}
+        data = save({name: each.contiguous() for name, each in tensors.items()}, metadata)
+        _publish(self.state, data)
+
+    def read_state(self) -> tuple[dict[str, Tensor], int]:
+        """What `write_state` stored, and its step; nothing and 0 at the beginning.
+
+        Raises:
+            InputError: it is damaged.
+        """
+        if not self.state.exists():
+            return {}, 0
+        tensors, metadata = _read(self.state)
+        try:
+            return tensors, int(metadata["step"])
+        except (KeyError, ValueError) as error:
+            raise InputError(f"{self.state} is damaged; train into another folder") from error
+
+
+def read_snapshot(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights of a snapshot, and the record beside them.
+
+    Raises:
+        InputError: a file is missing or damaged, or of another format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"there is no snapshot {path}; `warp-deform train` makes them")
+    record = read_json(path.with_suffix(".json"))
+    if record.get("format") != _FORMAT:
+        raise InputError(
+            f"{path} has format {record.get('format')!r}; this release reads {_FORMAT}"
+        )
+    return _read(path)[0], record
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file.
+
+    Raises:
+        InputError: the file is missing or holds something else.
+    """
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} cannot be read as JSON") from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path} holds no JSON object")
+    return found
+
+
+def write_json(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a JSON object, whole or not at all."""
+    text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
+    _publish(path, text.encode() + b"\n")
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors: dict[str, torch.Tensor] = {key: file.get_tensor(key) for key in file.keys()}
+            return tensors, file.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path} is damaged or no safetensors file") from error
+
+
+def _publish(path: Path, data: bytes) -> None:
+    """Write `data` under a temporary name, then give it its name."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise WarpDeformError(f"{path} cannot be written: {error.strerror}") from error
+    finally:
+        temporary.unlink(missing_ok=True)

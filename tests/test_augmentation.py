@@ -1,0 +1,115 @@
+"""Augmentation: pictures, pixels, actions and states move as one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learning import augmentation
+from learning.augmentation import (
+    RigidTransform,
+    draw_transform,
+    move_action,
+    move_picture,
+    move_state,
+)
+from warp_deform.errors import InputError
+from warp_deform.rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world, world_to_pixel
+from warp_deform.tasks.ground_truth import pose_rows
+from warp_deform.tasks.registry import TASKS
+
+ACTION = np.array([0.45, -0.1, 0.0, 0.55, 0.2, 0.7, 0.04])
+turns = st.floats(-math.pi, math.pi)
+shifts = st.tuples(st.floats(-30, 30), st.floats(-30, 30))
+
+
+@settings(derandomize=True, deadline=None, max_examples=50)
+@given(turns, shifts)
+def test_world_and_pixels_move_alike(turn: float, shift: tuple[float, float]) -> None:
+    moved = RigidTransform(turn, shift)
+    pixels = np.array([[0.0, 0.0], [319.0, 159.0], [100.0, 20.0]])
+    expected = pixel_to_world(moved.of_pixels(pixels))
+    assert np.abs(moved.of_world(pixel_to_world(pixels)) - expected).max() < 1e-12
+
+
+@settings(derandomize=True, deadline=None, max_examples=50)
+@given(turns, shifts)
+def test_a_mark_in_the_picture_goes_where_its_pixel_goes(
+    turn: float, shift: tuple[float, float]
+) -> None:
+    moved = RigidTransform(turn, shift)
+    color, height = np.zeros((*SHAPE, 3), np.uint8), np.zeros(SHAPE, np.float32)
+    color[149:152, 89:92], height[149:152, 89:92] = 255, 0.1
+    new_color, new_height = move_picture(color, height, moved)
+    row, column = np.round(moved.of_pixels(np.array([[150, 90]])))[0].astype(int)
+    assert (0 <= row < SHAPE[0]) and (0 <= column < SHAPE[1])
+    assert (new_color[row, column] == 255).all() and new_height[row, column] == np.float32(0.1)
+    assert np.argwhere(new_height).mean(axis=0) == pytest.approx([row, column], abs=1.0)
+
+
+def test_drawn_transforms_keep_both_pixels_in_view_and_have_the_papers_spread() -> None:
+    rng = np.random.default_rng(0)
+    middle = np.array([0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.04])
+    drawn = [draw_transform(middle, rng=rng) for _ in range(2000)]
+    assert np.std([t.turn for t in drawn]) == pytest.approx(2 * math.pi / 6, rel=0.05)
+    assert np.std([t.shift for t in drawn], axis=0) == pytest.approx(160 / 6, rel=0.05)
+    corner = np.array([0.25, -0.5, 0.0, 0.7, 0.45, 0.0, 0.04])
+    pixels = world_to_pixel(np.stack([corner[:2], corner[3:5]]))
+    for _ in range(100):
+        moved = np.round(draw_transform(corner, rng=rng).of_pixels(pixels))
+        assert ((moved >= 0) & (moved < SHAPE)).all()
+
+
+def test_what_fits_no_picture_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(augmentation, "_MOST_DRAWS", 20)
+    far = np.array([0.3, -3.0, 0.0, 0.6, 3.0, 0.0, 0.04])
+    with pytest.raises(InputError, match="do not fit into one picture"):
+        draw_transform(far, rng=np.random.default_rng(0))
+
+
+def test_an_action_keeps_its_yaws_and_lift() -> None:
+    moved = RigidTransform(0.5, (3.0, -4.0))
+    action = move_action(ACTION, moved)
+    assert action[[2, 5, 6]].tolist() == ACTION[[2, 5, 6]].tolist()
+    lengths = [np.hypot(*(a[:2] - a[3:5])) for a in (ACTION, action)]
+    assert lengths[0] == pytest.approx(lengths[1])
+    centre = np.array([0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.04])
+    shifted = np.array([0.5 + 3 * PIXEL_SIZE, -4 * PIXEL_SIZE])
+    assert move_action(centre, moved)[:2] == pytest.approx(shifted)
+
+
+def test_a_pose_turns_by_the_turn() -> None:
+    before = pose_rows(np.array([[0.5, 0.1], [0.4, 0.0]]), np.array([0.2, 3.0])).ravel()
+    after = move_state("block-notarget", before, RigidTransform(math.pi / 2, (0.0, 0.0)))
+    yaws = np.array([0.2 + math.pi / 2, 3.0 - 1.5 * math.pi])
+    expected = pose_rows(np.array([[0.4, 0.0], [0.5, -0.1]]), yaws).ravel()
+    assert after == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_tasks_state_moves_rigidly_and_back(name: str) -> None:
+    rng = np.random.default_rng(0)
+    state = rng.uniform(0.0, 0.2, TASKS[name].ground_truth_size).astype(np.float32)
+    moved = move_state(name, state, RigidTransform(0.7, (0.0, 0.0)))
+    assert moved.shape == state.shape and moved.dtype == np.float32
+    assert np.abs(moved - state).max() > 0.01
+    back = move_state(name, moved, RigidTransform(-0.7, (0.0, 0.0)))
+    assert np.abs(back - state).max() < 1e-6
+    heights = move_state(name, state, RigidTransform(0.0, (8.0, 0.0))).reshape(-1, 3)
+    assert (np.abs(heights - state.reshape(-1, 3)).max(axis=0)[1:] < 1e-6).all()
+
+
+def test_colours_and_displacements_of_bags_are_not_shifted() -> None:
+    state = np.full(414, 0.1, np.float32)
+    moved = move_state("bag-color-goal", state, RigidTransform(0.0, (16.0, 0.0))).reshape(-1, 3)
+    still = np.flatnonzero(np.abs(moved[:, 0] - 0.1) < 1e-6)
+    assert still.tolist() == [32, 65, 67, 68, 101, 134, 136, 137]
+
+
+def test_a_state_of_another_size_is_refused() -> None:
+    with pytest.raises(InputError, match="cannot be moved"):
+        move_state("cable-ring", np.zeros(9, np.float32), RigidTransform(0.0, (0.0, 0.0)))

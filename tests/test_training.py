@@ -1,0 +1,261 @@
+"""Training: the same bits twice and after an interruption, and one line for what cannot be."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from training_samples import write_demonstrations
+
+from learning import training
+from learning.policy import ImagePolicy, RetryingPolicy, StatePolicy, load_policy
+from learning.snapshots import RunFolder, read_snapshot
+from learning.training import SCHEDULES, Schedule, TrainConfig, TrainReport, train
+from warp_deform.cli import main
+from warp_deform.errors import InputError, WarpDeformError
+
+TASK = "cable-line-notarget"
+SHORT = Schedule(steps=4, batch=1, lr=1e-3, warmup=2, decay=True, ema=0.9, snapshots=2)
+STATES = replace(SHORT, steps=60, batch=16, lr=3e-3)
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_demonstrations(tmp_path_factory.mktemp("data") / "demos", 4)
+
+
+def config(folder: Path, out: Path, **changes: Any) -> TrainConfig:
+    values = {"agent": "goal-stack", "preset": "fast", "schedule": SHORT} | changes
+    return TrainConfig(task=TASK, data=folder, out=out, demos=3, **values)
+
+
+@pytest.fixture(scope="module")
+def straight(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainReport]:
+    out = tmp_path_factory.mktemp("run") / "straight"
+    return out, train(config(folder, out))
+
+
+def test_the_same_command_gives_the_same_bits(
+    folder: Path, straight: tuple[Path, TrainReport], tmp_path: Path
+) -> None:
+    out, report = straight
+    again = train(config(folder, tmp_path))
+    assert again.weights_hash == report.weights_hash
+    assert report.snapshots == (2, 4) and report.steps == 4
+    for step in report.snapshots:
+        files = [RunFolder(run).snapshot(step).read_bytes() for run in (out, tmp_path)]
+        assert files[0] == files[1]
+    other = train(config(folder, tmp_path / "other", seed=1))
+    assert other.weights_hash != report.weights_hash
+
+
+@pytest.mark.parametrize("agent", ["goal-stack", "gt-mlp"])
+def test_an_interrupted_run_goes_on_to_the_same_bits(
+    agent: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = train(config(folder, tmp_path / "whole", agent=agent))
+    calls: list[int] = []
+    name = "image_batch" if agent == "goal-stack" else "state_batch"
+    original = getattr(training, name)
+
+    def interrupted(*args: Any, **options: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return original(*args, **options)
+
+    monkeypatch.setattr(training, name, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(config(folder, tmp_path / "cut", agent=agent))
+    resumed = train(config(folder, tmp_path / "cut", agent=agent))
+    assert len(calls) == 4 + 2, "steps 3 and 4 alone are done again"
+    assert resumed.weights_hash == whole.weights_hash
+    ended = train(config(folder, tmp_path / "cut", agent=agent))
+    assert len(calls) == 6 and ended.weights_hash == whole.weights_hash
+
+
+def test_a_folder_with_another_run_is_refused(
+    folder: Path, straight: tuple[Path, TrainReport]
+) -> None:
+    with pytest.raises(InputError, match="holds a run with another seed"):
+        train(config(folder, straight[0], seed=3))
+
+
+@pytest.mark.parametrize("agent", ["gt-mlp", "gt-mlp-2step"])
+def test_a_baseline_learns_and_its_log_shows_it(agent: str, folder: Path, tmp_path: Path) -> None:
+    schedule = replace(STATES, steps=300)
+    report = train(config(folder, tmp_path, agent=agent, schedule=schedule))
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [50, 100, 150, 200, 250, 300]
+    assert lines[-1]["loss"] == report.loss
+    assert lines[-1]["loss"] < lines[0]["loss"] - 1.0
+    policy = load_policy(tmp_path)
+    assert isinstance(policy, StatePolicy)
+    seen = {"ground_truth": np.zeros(144, np.float32)}
+    actions = [policy.act(seen, rng=np.random.default_rng(k)) for k in (0, 0, 1)]
+    assert actions[0].shape == (7,) and (actions[0] == actions[1]).all()
+    assert (actions[0] != actions[2]).any()
+    with pytest.raises(InputError, match="hand in a generator"):
+        policy.act(seen)
+    with pytest.raises(InputError, match="`ground_truth` of 144 numbers"):
+        policy.act({}, rng=np.random.default_rng(0))
+
+
+def test_a_policy_acts_on_what_the_environment_shows(
+    folder: Path, straight: tuple[Path, TrainReport]
+) -> None:
+    policy = load_policy(straight[0])
+    rng = np.random.default_rng(0)
+    color = rng.integers(0, 255, (320, 160, 3), dtype=np.uint8)
+    height = rng.random((320, 160), dtype=np.float32) * 0.05
+    seen = {"color": color, "height": height, "goal_color": color[::-1], "goal_height": height}
+    action = policy.act(seen)
+    assert action.shape == (7,) and action[6] == 0.04 and action[2] == 0.0
+    assert (0.25 <= action[[0, 3]]).all() and (action[[0, 3]] <= 0.75).all()
+    goal = {"color": color[::-1], "height": height}
+    given = policy.act({"color": color, "height": height}, goal)
+    assert (given == action).all()
+    with pytest.raises(InputError, match="no 'goal_color'"):
+        policy.act({"color": color, "height": height})
+    with pytest.raises(InputError, match="height: shape"):
+        policy.act({**seen, "height": height.astype(float)})
+
+
+def test_a_retrying_policy_picks_elsewhere_until_something_changes(
+    straight: tuple[Path, TrainReport],
+) -> None:
+    policy = load_policy(straight[0])
+    assert isinstance(policy, ImagePolicy)
+    retrying = RetryingPolicy(policy)
+    color = np.random.default_rng(0).integers(0, 255, (320, 160, 3), dtype=np.uint8)
+    height = np.zeros((320, 160), np.float32)
+    seen = {"color": color, "height": height, "goal_color": color, "goal_height": height}
+    picks = [retrying.act(seen)[:2] for _ in range(5)]
+    assert (picks[0] == policy.act(seen)[:2]).all()
+    gaps = [np.linalg.norm(a - b) for i, a in enumerate(picks) for b in picks[:i]]
+    assert min(gaps) >= 0.008
+    moved = {**seen, "color": np.roll(color, 7, axis=0)}
+    assert (retrying.act(moved)[:2] == policy.act(moved)[:2]).all()
+    noisy = {**moved, "color": np.clip(moved["color"].astype(int) + 5, 0, 255).astype(np.uint8)}
+    assert np.linalg.norm(retrying.act(noisy)[:2] - policy.act(moved)[:2]) >= 0.008
+    retrying.reset()
+    assert (retrying.act(seen) == policy.act(seen)).all()
+
+
+def test_snapshots_hold_averaged_weights(folder: Path, tmp_path: Path) -> None:
+    plain = replace(SHORT, ema=0.0)
+    train(config(folder, tmp_path, schedule=plain))
+    run = RunFolder(tmp_path)
+    weights = read_snapshot(run.snapshot(4))[0]
+    state = run.read_state()[0]
+    assert all(torch.equal(each, state[f"weights.{name}"]) for name, each in weights.items())
+
+
+def test_a_loss_that_is_not_finite_ends_the_run(folder: Path, tmp_path: Path) -> None:
+    wild = replace(STATES, lr=1e30, warmup=0)
+    with pytest.raises(WarpDeformError, match="lower the step size"):
+        train(config(folder, tmp_path, agent="gt-mlp", schedule=wild))
+
+
+def test_damaged_and_foreign_snapshots_are_refused(
+    straight: tuple[Path, TrainReport], tmp_path: Path
+) -> None:
+    source = RunFolder(straight[0]).snapshot(4)
+    weights, record = source.read_bytes(), source.with_suffix(".json").read_text()
+
+    def refused(data: bytes, text: str, match: str) -> None:
+        (tmp_path / "step_00000004.safetensors").write_bytes(data)
+        (tmp_path / "step_00000004.json").write_text(text)
+        with pytest.raises(InputError, match=match):
+            load_policy(tmp_path / "step_00000004.safetensors")
+
+    refused(weights[:1000], record, "damaged or no safetensors")
+    refused(weights, "{", "cannot be read as JSON")
+    refused(weights, record.replace('"format": 1', '"format": 2'), "has format 2")
+    refused(weights, record.replace("goal-stack", "goal-split"), "no snapshot of this release")
+    refused(weights, record.replace('"width"', '"girth"'), "no setting 'girth'")
+    with pytest.raises(InputError, match="there is no snapshot"):
+        load_policy(tmp_path / "step_00000009.safetensors")
+    with pytest.raises(InputError, match="holds no training run"):
+        load_policy(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"agent": "transporter"}, "does not see; use --agent goal-split"),
+        ({"agent": "resnet"}, "there is no agent"),
+        ({"preset": "slow"}, "preset is 'slow'"),
+        ({"seed": -1}, "seed"),
+        ({"patience": 2}, "needs validation"),
+        ({"schedule": replace(SHORT, steps=0)}, "1 or more"),
+        ({"schedule": replace(SHORT, lr=0.0)}, "lr must be positive"),
+        ({"device": "tpu"}, "must be 'cpu' or 'cuda'"),
+    ],
+)
+def test_bad_settings(folder: Path, tmp_path: Path, changes: dict[str, Any], match: str) -> None:
+    with pytest.raises(InputError, match=match):
+        train(config(folder, tmp_path, **changes))
+
+
+def test_a_goal_agent_needs_a_goal(tmp_path: Path) -> None:
+    write_demonstrations(tmp_path, 1, task="cable-ring")
+    with pytest.raises(InputError, match="cable-ring has none; use --agent transporter"):
+        train(
+            TrainConfig(
+                task="cable-ring", agent="goal-split", data=tmp_path, out=tmp_path / "run",
+                preset="fast", schedule=SHORT,
+            )
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train", "cable-line", "--agent", "gt-mlp", "--data", "x", "--out", "y"],
+        ["train", TASK, "--agent", "gt-mlp", "--data", "missing", "--out", "y"],
+        ["train", TASK, "--agent", "dqn", "--data", "x", "--out", "y"],
+        ["eval", "missing"],
+        ["eval", "missing", "--workers", "0"],
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    arguments: list[str],
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and len(err.splitlines()) == 1
+
+
+def test_presets_are_the_papers_and_ours() -> None:
+    paper = SCHEDULES["paper"]
+    assert (paper.steps, paper.batch, paper.lr, paper.snapshots) == (20_000, 1, 1e-4, 10)
+    assert (paper.ema, paper.decay, paper.warmup) == (0.0, False, 0)
+
+
+def test_two_processes_train_together(folder: Path, tmp_path: Path) -> None:
+    """Under torchrun the gradients are averaged, so both end with one set of weights."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2",
+               "-m", "warp_deform", "train", TASK, "--agent", "gt-mlp", "--data", str(folder),
+               "--preset", "fast", "--steps", "4", "--snapshots", "1", "--batch", "4"]  # fmt: skip
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    hashes = []
+    for name in ("first", "second"):
+        out = tmp_path / name
+        subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, env=env)
+        assert json.loads((out / "run.json").read_text())["processes"] == 2
+        hashes.append(RunFolder(out).snapshot(4).read_bytes())
+    assert hashes[0] == hashes[1]
