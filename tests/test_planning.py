@@ -118,3 +118,18 @@ def test_a_search_that_cannot_be_is_refused():
         SearchConfig(method="luck")
     with pytest.raises(InputError, match="must be 1 or more"):
         SearchConfig(budget=0)
+
+
+def test_given_actions_are_tried_first_and_drawn_ones_say_so(started):
+    worlds, lookahead = started
+    state = worlds.state(0)
+    given = _moves(worlds, 0, 3)[2] + np.array([0, 0, 0, 0.001, 0, 0, 0])
+    config = SearchConfig(method="random", depth=1, budget=3, candidates=1)
+    rng = np.random.default_rng(2)
+    found = search(lookahead, worlds.task, state, rng, config, also=[given, given])
+    assert sum(np.array_equal(o.action, given) for o in found) == 1
+    if not any(o.solved for o in found):
+        assert sorted(o.origin for o in found) == ["candidate", "candidate", "drawn"]
+    only = SearchConfig(method="enumerate", depth=1, budget=1, candidates=8)
+    (one,) = search(lookahead, worlds.task, state, rng, only, also=[given])
+    assert np.array_equal(one.action, given)

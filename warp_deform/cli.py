@@ -44,7 +44,14 @@ VERBS: dict[str, Verb] = {
     "goals": Verb("warp_deform.commands:goals", "make a task's set of goals"),
     "replay": Verb("warp_deform.commands:replay", "simulate recorded episodes again and compare"),
     "inspect": Verb("warp_deform.commands:inspect", "statistics and contact sheets of a dataset"),
+    "convert": Verb("learning.convert_cli:convert", "datasets to and from other formats"),
+    "train": Verb("learning.cli:train", "train an agent on demonstrations"),
+    "eval": Verb("learning.cli:evaluate", "choose a run's best snapshot and test it"),
+    "refine": Verb("learning.refine_cli:refine", "improve demonstrations by search"),
     "bench": Verb("warp_deform.commands:bench", "time the simulator, alone or beside a peer"),
+    "gradcheck": Verb(
+        "warp_deform.commands:gradcheck", "compare derivatives with finite differences"
+    ),
     "doctor": Verb("warp_deform.commands:doctor", "versions, devices, caches and what is missing"),
 }
 

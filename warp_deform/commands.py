@@ -21,6 +21,7 @@ __all__ = [
     "DemoOptions",
     "DoctorOptions",
     "GoalsOptions",
+    "GradcheckOptions",
     "InspectOptions",
     "ListOptions",
     "ReplayOptions",
@@ -28,6 +29,7 @@ __all__ = [
     "demo",
     "doctor",
     "goals",
+    "gradcheck",
     "inspect",
     "list_tasks",
     "replay",
@@ -262,6 +264,54 @@ def bench(options: BenchOptions) -> Outcome:
     quiet_warp()
     report = run(scene=options.scene, peer=options.peer)
     return Outcome(data=report, text=_lines(report))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradcheckOptions(CommandOptions):
+    """Compare derivatives of the solver with finite differences, in states of real episodes."""
+
+    task: Annotated[Positional[str | None], arg(metavar="[TASK]")] = None
+    """Name of a task; left out, all that have derivatives."""
+    levels: tuple[Literal["substep", "window", "action"], ...] = ("substep", "window", "action")
+    """One substep; 0.1 s; whole actions."""
+    states: Annotated[int, arg(metavar="N")] = 200
+    """States whose next substep is differentiated."""
+    windows: Annotated[int, arg(metavar="N")] = 30
+    """States from which 0.1 s are differentiated."""
+    actions: Annotated[int, arg(metavar="N")] = 16
+    """Whole actions that are differentiated."""
+    seed: int = 0
+    """First episode, and the random directions."""
+
+
+def gradcheck(options: GradcheckOptions) -> Outcome:
+    """Check the adjoint."""
+    if options.task is not None:
+        find_task(options.task)
+    for flag in ("states", "windows", "actions"):
+        _check_positive(f"--{flag}", getattr(options, flag))
+    from .gradcheck import GradcheckConfig, check
+
+    quiet_warp()
+    rows, notes = check(
+        options.task,
+        GradcheckConfig(
+            levels=options.levels,
+            states=options.states,
+            windows=options.windows,
+            actions=options.actions,
+            seed=options.seed,
+        ),
+    )
+    found = [asdict(row) for row in rows]
+    head = tuple(key.replace("_", " ") for key in asdict(rows[0])) if rows else ()
+    cells = [tuple("-" if v is None else _number(v) for v in row.values()) for row in found]
+    failure = None if rows else "nothing was checked, see the notes"
+    return Outcome(
+        data={"rows": found, "notes": notes},
+        text="\n".join([*([_table([head, *cells])] if rows else []), *notes]),
+        failure=failure,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -67,15 +67,18 @@ def search(
     state: WorldState,
     rng: np.random.Generator,
     config: SearchConfig,
+    *,
+    also: Sequence[Action] = (),
 ) -> list[Outlook]:
     """Outlooks tried from `state`, the best first; empty when the task has no candidate.
 
+    also: actions to try before the task's candidates, within the budget; of equals they come first
     With `depth` 2 and no first action that solves the task, the actions whose second action leads
     farthest come first, in the order of what that one leads to.
     """
     deep = config.depth > 1
     first = config.budget if not deep else max(1, config.budget // 2)
-    tried = _around(lookahead, task, state, rng, config, first, keep=deep)
+    tried = _around(lookahead, task, state, rng, config, first, also, keep=deep)
     tried.sort(key=lambda o: o.rank, reverse=True)
     if not deep or not tried or tried[0].solved:
         return tried
@@ -86,7 +89,7 @@ def search(
     led = []
     for outlook in beam:
         assert outlook.after is not None
-        seconds = _around(lookahead, task, outlook.after, rng, config, each, keep=False)
+        seconds = _around(lookahead, task, outlook.after, rng, config, each, (), keep=False)
         best = max((o.rank for o in seconds), default=(0, 0.0))
         led.append((best if best > outlook.rank else outlook.rank, outlook))
     led.sort(key=lambda pair: pair[0], reverse=True)
@@ -101,6 +104,7 @@ def _around(
     rng: np.random.Generator,
     config: SearchConfig,
     budget: int,
+    also: Sequence[Action],
     *,
     keep: bool,
 ) -> list[Outlook]:
@@ -116,11 +120,12 @@ def _around(
                 new.append(action)
         return new
 
-    def tries(actions: Sequence[Action]) -> list[Outlook]:
-        return lookahead.try_each([(state, action) for action in actions], keep=keep)
+    def tries(actions: Sequence[Action], origin: str) -> list[Outlook]:
+        outlooks = lookahead.try_each([(state, action) for action in actions], keep=keep)
+        return [replace(outlook, origin=origin) for outlook in outlooks]
 
     proposed = task.candidates(layout, snapshot, rng, config.candidates)
-    tried = tries(fresh(proposed, budget))
+    tried = tries(fresh([*also, *proposed], budget), "candidate")
     if config.method == "enumerate" or not tried or any(o.solved for o in tried):
         return tried
     left = budget - len(tried)
@@ -128,7 +133,8 @@ def _around(
         return tried + _downhill(lookahead, task, state, rng, config, tried, left, keep=keep)
     if config.method == "random":
         around = [tried[i].action for i in rng.integers(len(tried), size=left)]
-        return tried + tries([_drawn(a, rng, config.spread, config.turn_spread) for a in around])
+        drawn = [_drawn(a, rng, config.spread, config.turn_spread) for a in around]
+        return tried + tries(drawn, "drawn")
     for k in range(config.rounds):
         if any(o.solved for o in tried):
             break
@@ -138,7 +144,7 @@ def _around(
         around = [elites[i % len(elites)].action for i in range(count)]
         scale = 0.5**k
         drawn = [_drawn(a, rng, config.spread * scale, config.turn_spread * scale) for a in around]
-        tried += tries(fresh(drawn, count))
+        tried += tries(fresh(drawn, count), "drawn")
     return tried
 
 
