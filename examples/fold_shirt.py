@@ -70,14 +70,8 @@ class FoldShirt(Task):
 
 
 def main(seeds: range) -> None:
-    task = FoldShirt()
-    worlds = Worlds(task, len(seeds), lanes=len(seeds))
-
-    def look(worlds, slot):
-        episode = worlds.episodes[slot]
-        return task.score(episode.layout, episode.snapshot)
-
-    for _, run in play(worlds, seeds, act=demonstrator("mpc"), look=look):
+    worlds = Worlds(FoldShirt(), len(seeds), lanes=len(seeds))
+    for _, run in play(worlds, seeds, act=demonstrator("mpc"), look=Worlds.score):
         print(f"seed {run.seed}: {run.ended}, scores", *(f"{score:.2f}" for score in run.rows))
 
 
