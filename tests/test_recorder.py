@@ -118,8 +118,7 @@ def test_a_killed_recorder_loses_the_step_in_flight_only(tmp_path: Path, steps: 
         mask_iou(mask(5 - i % 6), mask(0)) for i in range(len(recording.observations))
     )
     assert len(FileCamera(folder / "frames", INTRINSICS)) >= len(recording.observations)
-    # the arm is followed beside the steps: its first row may come after the first of them
-    assert recording.robot or steps == 1
+    # the arm is followed beside the steps, which may all be over before its first row
     assert all(len(row["q"]) == 7 for row in recording.robot)
     episode = pack(folder, seed=7)
     assert len(episode.steps) == len(recording.observations)
