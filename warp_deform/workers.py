@@ -99,6 +99,9 @@ class Workers:
         return self
 
     def __exit__(self, *error: object) -> None:
+        if error[0] is KeyboardInterrupt:
+            # joblib's own thread stumbles over processes that an interrupted start left half-made
+            threading.excepthook = lambda _: None
         if self._starting is not None:
             _close(self._starting)
 
