@@ -1,10 +1,13 @@
-"""The demonstrators beside each other: success, actions, CPU seconds, and how the sheets fare.
+"""Who chooses actions how well: success, actions, CPU seconds, and how the sheets fare.
 
     python benchmarks/demonstrators.py [--tasks cable-ring] [--seeds 50] [--out rows.jsonl]
+    python benchmarks/demonstrators.py --by mpc enumerate random cem gradient planner --budget 64
 
-Plays whole episodes in this process on the same seeds, eight side by side, with the images that a
-collection would render. One episode before each row, not timed, compiles or loads the kernels.
-With --out, rows already in that file are not measured again. Intervals are Wilson's, 95 %.
+Besides the demonstrators there are the searches of `warp_deform.planning` one action ahead; they
+and `planner`, two ahead, may simulate `--budget` actions a choice. Plays whole episodes in this
+process on the same seeds, eight side by side, with the images that a collection would render. One
+episode before each row, not timed, compiles or loads the kernels. With --out, rows already in that
+file are not measured again. Intervals of rates are Wilson's, others 1.96 standard errors, 95 %.
 """
 
 from __future__ import annotations
@@ -23,10 +26,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bag_scenes import pierced
 from cloth_scenes import edges_of
 
-from warp_deform.demonstrators import DEMONSTRATORS, demonstrator
-from warp_deform.episode_loop import SOLVED, play, worlds_for
+from warp_deform.demonstrators import DEMONSTRATORS, demonstrator, planner
+from warp_deform.episode_loop import SOLVED, Act, play, worlds_for
 from warp_deform.episodes import Step
 from warp_deform.objects import Bag, Cloth
+from warp_deform.planning import METHODS, SearchConfig
 from warp_deform.quiet import quiet_warp
 from warp_deform.recording import observe
 from warp_deform.tasks.registry import TASKS
@@ -38,19 +42,23 @@ WARM_UP = 999_000  # seed
 
 @dataclass(frozen=True)
 class Row:
-    """A task played by a demonstrator."""
+    """A task played by a demonstrator or a search."""
 
     task: str
-    demonstrator: str
+    by: str
+    budget: int | None
+    """Simulated actions a choice; None where it is not ours to set."""
     first_seed: int
     attempts: int
     successes: int
     interval: tuple[float, float]
     """Wilson's, of the success rate, 95 %."""
     mean_actions: float
-    """Of all attempts."""
+    """Of all attempts, with the half-width of its interval below."""
+    actions_error: float
     mean_actions_solved: float
     mean_score: float
+    score_error: float
     cpu_s_per_attempt: float
     states: int
     """How many states at rest were looked at: each start, and what followed every action."""
@@ -98,7 +106,9 @@ class Watch:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
-    parser.add_argument("--demonstrators", nargs="+", default=list(DEMONSTRATORS))
+    parser.add_argument("--by", nargs="+", default=["scripted", "visible", "mpc"],
+                        choices=[*DEMONSTRATORS, *METHODS])  # fmt: skip
+    parser.add_argument("--budget", type=int, default=64, help="simulated actions a choice")
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--quick", action="store_true", help="a smoke run; not for publication")
@@ -106,20 +116,21 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="file of JSON lines to which rows are added")
     options = parser.parse_args()
     if options.quick:
-        options.tasks, options.seeds = ["block-notarget"], 2
+        options.tasks, options.seeds, options.budget = ["block-notarget"], 2, 4
     quiet_warp()
     done = _rows(options.out)
     rows = []
     if not options.json:
-        print("| task | demonstrator | successes / attempts | 95 % | mean actions "
+        print("| task | by | successes / attempts | 95 % | mean actions | mean score "
               "| CPU s an attempt | pierced edges, mean / worst state |")  # fmt: skip
-        print("|---|---|---|---|---|---|---|")
+        print("|---|---|---|---|---|---|---|---|")
     for task in options.tasks:
-        for name in options.demonstrators:
-            seeds = range(options.first, options.first + options.seeds)
-            row = done.get((task, name, options.first, options.seeds)) or measure(task, name, seeds)
+        for name in options.by:
+            budget = options.budget if name == "planner" or name in METHODS else None
+            key = (task, name, budget, options.first, options.seeds)
+            row = done.get(key) or measure(*key)
             rows.append(row)
-            if options.out and (task, name, options.first, options.seeds) not in done:
+            if options.out and key not in done:
                 with options.out.open("a") as file:
                     file.write(json.dumps(asdict(row)) + "\n")
             if not options.json:
@@ -128,30 +139,45 @@ def main() -> None:
         print(json.dumps({"rows": [asdict(row) for row in rows]}))
 
 
-def measure(task: str, name: str, seeds: range) -> Row:
+def acting(name: str, budget: int | None) -> Act[Step]:
+    """Who acts under a name."""
+    if budget is None:
+        return demonstrator(name)
+    if name in METHODS:
+        return planner(SearchConfig(method=name, budget=budget, depth=1))
+    return planner(SearchConfig(budget=budget))
+
+
+def measure(task: str, by: str, budget: int | None, first: int, count: int) -> Row:
     """Play every seed once; says on stderr how far it is."""
-    worlds, act = worlds_for(task, "ur5"), demonstrator(name)
+    worlds, act, seeds = worlds_for(task, "ur5"), acting(by, budget), range(first, first + count)
     with single_threaded():
         list(play(worlds, [WARM_UP], act=act, look=observe))
         watch, runs = Watch(), []
         began = time.process_time()
         for _, run in play(worlds, seeds, act=act, look=watch.look):
             runs.append(run)
-            print(f"\r{task} {name} {len(runs)}/{len(seeds)}", end="", file=sys.stderr)
+            print(f"\r{task} {by} {len(runs)}/{count}", end="", file=sys.stderr)
         cpu = time.process_time() - began - watch.cpu
     print(file=sys.stderr)
     solved = [run for run in runs if run.ended == SOLVED]
-    interval = binomtest(len(solved), len(runs)).proportion_ci(method="wilson")
+    interval = binomtest(len(solved), count).proportion_ci(method="wilson")
+    actions = np.array([len(run.actions) for run in runs], dtype=float)
+    scores = np.array([run.rows[-1].score if run.rows else 0.0 for run in runs])
+    error = 1.96 / np.sqrt(max(count - 1, 1))
     return Row(
         task=task,
-        demonstrator=name,
-        first_seed=seeds.start,
-        attempts=len(runs),
+        by=by,
+        budget=budget,
+        first_seed=first,
+        attempts=count,
         successes=len(solved),
         interval=(float(interval.low), float(interval.high)),
-        mean_actions=float(np.mean([len(run.actions) for run in runs])),
+        mean_actions=float(actions.mean()),
+        actions_error=float(error * actions.std()),
         mean_actions_solved=float(np.mean([len(run.actions) for run in solved] or [np.nan])),
-        mean_score=float(np.mean([run.rows[-1].score if run.rows else 0.0 for run in runs])),
+        mean_score=float(scores.mean()),
+        score_error=float(error * scores.std()),
         cpu_s_per_attempt=cpu / len(runs),
         states=watch.states,
         still_moving=watch.still_moving,
@@ -159,12 +185,12 @@ def measure(task: str, name: str, seeds: range) -> Row:
     )
 
 
-def _rows(path: Path | None) -> dict[tuple[str, str, int, int], Row]:
-    """Rows measured before, by task, demonstrator, first seed and number of seeds."""
+def _rows(path: Path | None) -> dict[tuple[str, str, int | None, int, int], Row]:
+    """Rows measured before, by what `measure` is called with."""
     if path is None or not path.exists():
         return {}
     rows = [Row(**json.loads(line)) for line in path.read_text().splitlines()]
-    return {(row.task, row.demonstrator, row.first_seed, row.attempts): row for row in rows}
+    return {(r.task, r.by, r.budget, r.first_seed, r.attempts): r for r in rows}
 
 
 def _line(row: Row) -> str:
@@ -172,8 +198,9 @@ def _line(row: Row) -> str:
     shares = row.pierced
     edges = f"{100 * shares['mean']:.2f} / {100 * shares['worst']:.1f} %" if shares else "-"
     return (
-        f"| {row.task} | {row.demonstrator} | {row.successes} / {row.attempts} "
-        f"| {100 * low:.1f}-{100 * high:.1f} % | {row.mean_actions:.2f} "
+        f"| {row.task} | {row.by} | {row.successes} / {row.attempts} "
+        f"| {100 * low:.1f}-{100 * high:.1f} % | {row.mean_actions:.2f} ± {row.actions_error:.2f} "
+        f"| {row.mean_score:.3f} ± {row.score_error:.3f} "
         f"| {row.cpu_s_per_attempt:.3f} | {edges} |"
     )
 

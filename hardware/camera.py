@@ -6,14 +6,14 @@ import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
 from warp_deform.errors import InputError, WarpDeformError
 
+from .closing import Closing
 from .json_file import read_numbers
 
 __all__ = [
@@ -135,7 +135,7 @@ class Frame:
             )
 
 
-class Camera(Protocol):
+class Camera(Closing, Protocol):
     """A source of frames."""
 
     def read(self) -> Frame:
@@ -150,17 +150,8 @@ class Camera(Protocol):
         """Let the device go; may be called twice."""
         ...
 
-    def __enter__(self) -> Self: ...
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None: ...
-
-
-class FileCamera:
+class FileCamera(Closing):
     """Replays recorded frames: `NNN_rgb.png`, and `NNN_depth.png` where there is one, in order.
 
     Args:
@@ -200,17 +191,6 @@ class FileCamera:
 
     def close(self) -> None:
         """There is nothing to close."""
-
-    def __enter__(self) -> FileCamera:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def read_image(path: Path, *, color: bool) -> np.ndarray:

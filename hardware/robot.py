@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 
 from warp_deform.errors import InputError, WarpDeformError
 
+from .closing import Closing
 from .panda_arm import GRIPPER_MAX_WIDTH, Q_MAX, Q_MIN
 
 
@@ -168,7 +168,7 @@ class SafetyViolation(RobotError):
     default_advice = "change the command; the limits stand in the configuration"
 
 
-class Robot(Protocol):
+class Robot(Closing, Protocol):
     """An arm with a parallel gripper."""
 
     def state(self) -> RobotState:
@@ -248,15 +248,6 @@ class Robot(Protocol):
     def close(self) -> None:
         """End the connection; moves nothing, and may be called twice."""
         ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None: ...
 
 
 def check_joints(q: np.ndarray) -> np.ndarray:

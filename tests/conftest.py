@@ -1,7 +1,58 @@
-"""What holds for every test."""
+"""What holds for every test, and fixtures that several files use; it imports nothing heavy."""
 
 import signal
+
+import pytest
 
 # a shell that runs the suite in the background has it ignore Ctrl-C, and so would what tests start
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="module")
+def one_torch_thread():
+    """Torch on one thread, as on shared cores."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def emulator():
+    """An emulated Panda before a table, in a process of its own."""
+    from emulator_worlds import RecordingWorld
+
+    from hardware.emulator import EmulatorProcess
+
+    with EmulatorProcess(world=RecordingWorld, free_host=True) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def client(emulator):
+    """The vendor's client, connected to it."""
+    from emulator_client import vendor_client
+
+    with vendor_client(emulator.host) as client:
+        yield client
+
+
+@pytest.fixture
+def panda(emulator, client):
+    """The vendor's client of an arm at home."""
+    from emulator_client import reset
+
+    reset(client, emulator)
+    return client
+
+
+@pytest.fixture(scope="module")
+def connection(emulator):
+    """Our backend, connected to the emulated Panda."""
+    from hardware.backends.panda import PandaConfig, PandaRobot
+
+    with PandaRobot(PandaConfig(host=emulator.host)) as robot:
+        yield robot

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,11 +14,9 @@ from emulator_client import (
     libfranka,
     min_jerk,
     panda_py,
-    reset,
     timed,
-    vendor_client,
 )
-from emulator_worlds import TABLE_Z, RecordingWorld
+from emulator_worlds import TABLE_Z
 
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.protocol import ERRORS
@@ -28,25 +26,6 @@ pytestmark = [
     pytest.mark.emulator,
     pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
 ]
-
-
-@pytest.fixture(scope="module")
-def emulator() -> Iterator[EmulatorProcess]:
-    with EmulatorProcess(world=RecordingWorld, free_host=True) as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
-def client(emulator: EmulatorProcess) -> Iterator[SimpleNamespace]:
-    with vendor_client(emulator.host) as client:
-        yield client
-
-
-@pytest.fixture
-def panda(emulator: EmulatorProcess, client: SimpleNamespace) -> SimpleNamespace:
-    """The vendor's client of an arm at home."""
-    reset(client, emulator)
-    return client
 
 
 def test_clients_model_is_the_emulators(panda: SimpleNamespace, emulator: EmulatorProcess) -> None:

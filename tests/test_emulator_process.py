@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from emulator_client import HOME, OFF_HOME, libfranka, reset, timed, vendor_client
+from emulator_client import HOME, OFF_HOME, libfranka, timed, vendor_client
 from emulator_worlds import RecordingWorld
 
 from hardware.emulator import EmulatorFailed, EmulatorProcess, TableWorld
@@ -27,25 +27,6 @@ pytestmark = [
     pytest.mark.emulator,
     pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
 ]
-
-
-@pytest.fixture(scope="module")
-def emulator() -> Iterator[EmulatorProcess]:
-    with EmulatorProcess(world=RecordingWorld, free_host=True) as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
-def client(emulator: EmulatorProcess) -> Iterator[SimpleNamespace]:
-    with vendor_client(emulator.host) as client:
-        yield client
-
-
-@pytest.fixture
-def panda(emulator: EmulatorProcess, client: SimpleNamespace) -> SimpleNamespace:
-    """The vendor's client of an arm at home."""
-    reset(client, emulator)
-    return client
 
 
 # User stop, time, and the process.

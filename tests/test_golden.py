@@ -6,7 +6,6 @@ tests/data/README.md says what the file holds. Errors are relative to the larges
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,8 @@ from learning.models.images import image_tensor
 from learning.models.resnet import ResNet43
 from learning.models.transport import Transport, TransportGoalSplit
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 GOLDEN = Path(__file__).parent / "data" / "transporter_tf.npz"
 MODULES = {
     "attention": lambda g: Attention(exact=True, generator=g),
@@ -32,14 +33,6 @@ MODULES = {
     ),
     "transport_goal_split": lambda g: TransportGoalSplit(exact=True, generator=g),
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -23,15 +22,9 @@ from learning.models.gt_state import (
 )
 from warp_deform.errors import InputError
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 AGENTS = (GtState, GtState2Step)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def mixture(seed: int = 0, batch: int = 4, k: int = 3, d: int = 2) -> Mixture:

@@ -6,7 +6,6 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -34,18 +33,6 @@ pytestmark = [
     pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
     pytest.mark.timeout(60),
 ]
-
-
-@pytest.fixture(scope="module")
-def emulator() -> Iterator[EmulatorProcess]:
-    with EmulatorProcess(world=RecordingWorld, free_host=True) as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
-def connection(emulator: EmulatorProcess) -> Iterator[PandaRobot]:
-    with PandaRobot(PandaConfig(host=emulator.host)) as robot:
-        yield robot
 
 
 @pytest.fixture

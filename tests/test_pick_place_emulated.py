@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from emulator_client import HOME
-from emulator_worlds import TABLE_Z, RecordingWorld
+from emulator_worlds import TABLE_Z
 
 from hardware import RobotMode, SafetyViolation
-from hardware.backends.panda import PandaConfig, PandaRobot
+from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.pick_place import PickPlaceAction, PickPlaceOutcome, execute
 from hardware.safety import SafeRobot
@@ -27,18 +26,6 @@ pytestmark = [
 # The emulated table meets the TCP itself, the limits' table the fingertips 9 mm below it.
 SURFACE = TABLE_Z - 0.009
 ACTION = PickPlaceAction((0.42, -0.12), 0.4, (0.55, 0.10), 0.9)
-
-
-@pytest.fixture(scope="module")
-def emulator() -> Iterator[EmulatorProcess]:
-    with EmulatorProcess(world=RecordingWorld, free_host=True) as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
-def connection(emulator: EmulatorProcess) -> Iterator[PandaRobot]:
-    with PandaRobot(PandaConfig(host=emulator.host)) as robot:
-        yield robot
 
 
 @pytest.fixture

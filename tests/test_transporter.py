@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -21,16 +20,10 @@ from learning.models.transporter import (
 )
 from warp_deform.errors import InputError
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 AGENTS = (Transporter, GoalSplit, GoalStack)
 TINY = TransporterConfig(scale=4, width=0.125, crop=16, n_rotations_train=4, n_rotations_eval=4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("agent_class", AGENTS)

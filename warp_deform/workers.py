@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import signal
 import socket
@@ -14,7 +15,7 @@ from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 import joblib
-from joblib.externals.loky.process_executor import TerminatedWorkerError
+from joblib.externals.loky.process_executor import TerminatedWorkerError, _ExecutorManagerThread
 
 from .errors import InputError, WarpDeformError
 from .quiet import quiet_warp
@@ -100,8 +101,7 @@ class Workers:
 
     def __exit__(self, *error: object) -> None:
         if error[0] is KeyboardInterrupt:
-            # joblib's own thread stumbles over processes that an interrupted start left half-made
-            threading.excepthook = lambda _: None
+            threading.excepthook = functools.partial(_report_others, threading.excepthook)
         if self._starting is not None:
             _close(self._starting)
 
@@ -178,6 +178,18 @@ def _leave_with(owner: int) -> None:
     while os.getppid() == owner:
         time.sleep(_LOOK_SECONDS)
     os._exit(1)
+
+
+def _report_others(
+    report: Callable[[threading.ExceptHookArgs], object], error: threading.ExceptHookArgs
+) -> None:
+    """Report a thread's exception, but not that of loky's own.
+
+    That thread stumbles over the processes that an interrupted start left half-made; the user has
+    been told of the interruption.
+    """
+    if not isinstance(error.thread, _ExecutorManagerThread):
+        report(error)
 
 
 def _import() -> None:

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from ..closing import Closing
 from ..panda_arm import GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
 from ..robot import (
     MoveResult,
@@ -51,7 +51,7 @@ class RecordedCommand:
     arguments: dict[str, Any]
 
 
-class DryRunRobot:
+class DryRunRobot(Closing):
     """A `Robot` that records.
 
     Args:
@@ -133,14 +133,3 @@ class DryRunRobot:
 
     def close(self) -> None:
         """There is nothing to close."""
-
-    def __enter__(self) -> DryRunRobot:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()

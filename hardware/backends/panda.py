@@ -15,11 +15,11 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, TypeVar
 
 import numpy as np
 
+from ..closing import Closing
 from ..joint_path import path_pieces
 from ..panda_arm import DDQ_MAX, DQ_MAX, GRIPPER_MAX_WIDTH
 from ..robot import (
@@ -87,7 +87,7 @@ class PandaConfig:
     """Time for the connection and the model library [s]."""
 
 
-class PandaRobot:
+class PandaRobot(Closing):
     """A `Robot`: a Franka Panda with its hand.
 
     Connecting loads the robot's model and reads a state; it moves nothing. A robot that stands in a
@@ -254,17 +254,6 @@ class PandaRobot:
         del self._panda, self._robot
         self._gripper = None
         ctypes.pythonapi.Py_DecRef(ctypes.py_object(panda))
-
-    def __enter__(self) -> PandaRobot:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     # Below: the vendor's calls, with what they return and raise made into typed errors.
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Protocol, Self, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from warp_deform.errors import InputError
 
 from ..backends.bounded import run_bounded
 from ..camera import CameraError, CameraIntrinsics, Frame
+from ..closing import Closing
 
 __all__ = ["Device", "StreamConfig", "StreamingCamera"]
 
@@ -57,7 +57,7 @@ class Device(Protocol):
         ...
 
 
-class StreamingCamera:
+class StreamingCamera(Closing):
     """A `Camera` over a device that may hang.
 
     A device that once gave no answer in time is given up: its thread may still hold it.
@@ -114,17 +114,6 @@ class StreamingCamera:
                 run_bounded(device.release, timeout_s=_CLOSE_TIMEOUT)
             except TimeoutError:
                 self._gone = True
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _grab(self) -> tuple[np.ndarray, np.ndarray | None]:
         if self._device is None:

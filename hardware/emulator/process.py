@@ -10,13 +10,13 @@ import dataclasses
 import multiprocessing
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
 from warp_deform.errors import WarpDeformError
 
+from ..closing import Closing
 from .model_library import model_library
 from .server import AddressTaken, EmulatorConfig, FciServer
 from .world import TableWorld, World
@@ -60,7 +60,7 @@ def _serve(
     connection.send(failure)
 
 
-class EmulatorProcess:
+class EmulatorProcess(Closing):
     """A running emulator; a context manager that ends it.
 
     Attributes:
@@ -167,14 +167,3 @@ class EmulatorProcess:
                 pass  # it is going, or gone: the join below sees to both
             self._process.join(2.0)
         self.kill()
-
-    def __enter__(self) -> EmulatorProcess:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()

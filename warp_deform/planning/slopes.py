@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..differentiable import DifferentiableRollout
-from ..errors import InputError
 from ..running import Carry, RunningEpisode
 from ..tasks.task import Action, Task
 from ..world_state import WorldState
@@ -133,8 +132,6 @@ def slopes_for(task: Task, robot: str, precision: str) -> Slopes:
     """This process's worlds to differentiate actions in, built once and used again.
 
     Raises:
-        InputError: the task has bodies that derivatives do not reach.
+        InputError: the task has rigid bodies, which derivatives do not reach.
     """
-    if any("box" in name or "block" in name for name in task.objects):
-        raise InputError(f"{task.name}: actions that move boxes have no derivatives yet")
     return Slopes(task, robot=robot, precision=precision)

@@ -140,7 +140,7 @@ class FabricCover(Task):
         half = self.cube.parts[0].size[0] / 2
         spots = half * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
         points = body_q[0, :2] + body_q.new_tensor(spots)
-        upper = particle_q[particle_q[:, 2] > float(body_q[0, 2])]
+        upper = particle_q[particle_q[:, 2] > body_q[0, 2]]
         centre = particle_q[list(self.fabric.inner_corners), :2].mean(0)
         apart = ((body_q[0, :2] - centre).square().sum() + 1e-8).sqrt()
         cell = self.fabric.side / self.fabric.columns

@@ -1,0 +1,27 @@
+"""What is closed at the end of a `with` block: robots, cameras, the emulator's process."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Protocol, Self
+
+__all__ = ["Closing"]
+
+
+class Closing(Protocol):
+    """Enters a `with` block as itself and closes itself at its end."""
+
+    def close(self) -> None:
+        """Give back what is held; may be called twice."""
+        ...
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
