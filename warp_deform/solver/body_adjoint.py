@@ -53,6 +53,10 @@ def body_adjoint(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     turned_by = grip_adjoint(scalar, lanes, False).turned_by
 
     @wp.func
+    def itself(x: S) -> S:
+        return x
+
+    @wp.func
     def sweep_body_pairs(
         g: int, lane: int, k: int, at: int, push: S, counts: int, top: Topology, shapes: Shapes,
         group: Group, bodies: Bodies, contacts: Contacts, tape: Tape, ba: BodyAdjoint,
@@ -61,6 +65,8 @@ def body_adjoint(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
         """Poses before these contacts are on the tape from `at` on; returns the derivatives by
         friction of the table and of contacts.
         """
+        # Warp puts functions that take gradients last: what calls them has to be such a one, too
+        one = wp.grad(itself)(push)
         count = top.body_count[k]
         b0 = group.body_start[g] + lane * count
         first = group.shape_start[g] + lane * top.shape_count[k]
@@ -91,7 +97,7 @@ def body_adjoint(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
             sweep_end_body(b, bodies.q[b], bodies, ba)
         log = start * wp.static(PASSES * VISIT)
         sweep_visits(start, c, passes, log, lane, counts, bodies, contacts, ba, adj)
-        by_table = S(0.0)
+        by_table = one - one
         by_contact = S(0.0)
         for r in range(c - start):
             i = c - 1 - r
@@ -128,7 +134,8 @@ def body_adjoint(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
         b0 = group.body_start[g] + lane * top.body_count[k]
         mv = group.contact_friction[g]
         radii = top.particle_start[k]
-        by_mu = S(0.0)
+        one = wp.grad(itself)(push)
+        by_mu = one - one
         tk = word - 1
         ts = int(scalar)
         for _ in range(tape.k[word - 1]):

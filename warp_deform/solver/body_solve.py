@@ -10,9 +10,9 @@ from .body_contact import body_contact
 from .box_box import box_box
 from .box_particle import box_particle
 from .box_particle_adjoint import box_particle_adjoint
+from .box_table import box_table
 from .box_triangle import box_triangle
 from .box_triangle_adjoint import box_triangle_adjoint
-from .box_table import box_table
 from .rigid_adjoint import rigid_adjoint
 from .structures import structures
 from .tape import BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS
@@ -21,9 +21,7 @@ __all__ = ["body_solve"]
 
 
 @functools.cache
-def body_solve(
-    scalar: Any, lanes: int, with_sheets: bool, taped: bool = False
-) -> SimpleNamespace:
+def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) -> SimpleNamespace:
     """`solve_bodies(g, lane, k, ...)`: the contacts of the bodies of one lane, in a fixed order.
 
     `taped`, each that acts with a particle or a triangle leaves what its adjoint needs on the tape

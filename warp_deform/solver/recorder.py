@@ -188,9 +188,7 @@ class Recorder:
             words = springs + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
             bodies = top.body_count * data.lanes
             words += BODY_WORDS * bodies
-            rows.append(
-                (2 * springs + 4 * particles, particles + 8, words, BODY_SCALARS * bodies)
-            )
+            rows.append((2 * springs + 4 * particles, particles + 8, words, BODY_SCALARS * bodies))
         return np.array(rows)
 
     def _solid_room(self) -> np.ndarray:
@@ -325,8 +323,13 @@ class Recorder:
                 counts = data.arrays[name].view[: data.group_count * data.lanes]
                 if len(counts) == data.group_count * data.lanes:
                     listed += counts.reshape(-1, data.lanes).sum(axis=1)
-        return self._least_room() + self._solid_room() + 1.5 * np.stack(
-            [2 * near, near, near + TRIANGLE_WORDS * listed, TRIANGLE_SCALARS * listed], axis=1
+        return (
+            self._least_room()
+            + self._solid_room()
+            + 1.5
+            * np.stack(
+                [2 * near, near, near + TRIANGLE_WORDS * listed, TRIANGLE_SCALARS * listed], axis=1
+            )
         )
 
     def _launch(self, tape: _Tape, begin: int, end: int, last: bool) -> None:

@@ -17,7 +17,9 @@ import warp as wp
 
 from .structures import structures
 
-__all__ = ["BODY_SCALARS", "BODY_WORDS", "BOX_PARTICLE_SCALARS", "BOX_TRIANGLE_SCALARS", "COUNTERS", "GRIP_WORDS", "STATE", "TRIANGLE_SCALARS", "TRIANGLE_WORDS", "Kind", "tape"]
+__all__ = ["BODY_SCALARS", "BODY_WORDS", "BOX_PARTICLE_SCALARS", "BOX_TRIANGLE_SCALARS",
+           "COUNTERS", "GRIP_WORDS", "STATE", "TRIANGLE_SCALARS", "TRIANGLE_WORDS", "Kind",
+           "tape"]  # fmt: skip
 
 STATE = 14
 """Lane vectors of the kernel's own state per group."""
@@ -102,8 +104,11 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
             tops[0] + 2 * springs + 4 * particles + 2 * near <= end[0]
             and tops[1] + near + particles + 8 <= end[1]
             and tops[2] + words <= end[2]
-            and tops[3] + wp.static(TRIANGLE_SCALARS) * listed
-            + wp.static(BODY_SCALARS) * bodies + wp.static(BOX_TRIANGLE_SCALARS) * solid <= end[3]
+            and tops[3]
+            + wp.static(TRIANGLE_SCALARS) * listed
+            + wp.static(BODY_SCALARS) * bodies
+            + wp.static(BOX_TRIANGLE_SCALARS) * solid
+            <= end[3]
         )
 
     @wp.func
