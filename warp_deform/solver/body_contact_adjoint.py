@@ -60,11 +60,17 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             ba.q[b] = ba.q[b] + gq
 
     @wp.func
+    def add_mass(b: int, g: S, bodies: Bodies, ba: BodyAdjoint):
+        """Derivative by inverse mass; a held body's is 0 whatever it is when free."""
+        if bodies.w[b] > S(0.0):
+            ba.w[b] = ba.w[b] + g
+
+    @wp.func
     def sweep_apply_to(b: int, r: R3, impulse: R3, bodies: Bodies, ba: BodyAdjoint):
         """`apply` to one body: derivatives by its inverse masses; returns those by impulse."""
         gx = ba.dx[b]
         gr = ba.dr[b]
-        ba.w[b] = ba.w[b] + wp.dot(gx, impulse)
+        add_mass(b, wp.dot(gx, impulse), bodies, ba)
         ba.spread[b] = ba.spread[b] + wp.outer(gr, wp.cross(r, impulse))
         return gx * bodies.w[b] + wp.cross(bodies.spread[b] * gr, r)
 
@@ -293,10 +299,10 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             s, total, contacts.mu[c], S(code[3]), n, u, v, ba.impulse[c], g
         )
         ba.mu[c] = ba.mu[c] + g_mu
-        ba.w[b] = ba.w[b] + g_total
+        add_mass(b, g_total, bodies, ba)
         oa = b
         if a >= 0:
-            ba.w[a] = ba.w[a] + g_total
+            add_mass(a, g_total, bodies, ba)
             oa = a
         (
             _two, _push, hn, hpa, gxa, gqa, gxpa, gqpa, gwa, gsa, hpb, gxb, gqb, gxpb, gqpb, gwb,
@@ -311,14 +317,14 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         ba.q[b] = ba.q[b] + gqb
         ba.xp[b] = ba.xp[b] + gxpb
         ba.qp[b] = ba.qp[b] + gqpb
-        ba.w[b] = ba.w[b] + gwb
+        add_mass(b, gwb, bodies, ba)
         ba.spread[b] = ba.spread[b] + gsb
         if a >= 0:
             ba.x[a] = ba.x[a] + gxa
             ba.q[a] = ba.q[a] + gqa
             ba.xp[a] = ba.xp[a] + gxpa
             ba.qp[a] = ba.qp[a] + gqpa
-            ba.w[a] = ba.w[a] + gwa
+            add_mass(a, gwa, bodies, ba)
             ba.spread[a] = ba.spread[a] + gsa
         return hpa, hpb, hn
 

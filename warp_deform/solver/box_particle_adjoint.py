@@ -124,13 +124,16 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return hit
 
     @wp.func
-    def add_to_body(b: int, gx: R3, gq: Q, gxp: R3, gqp: Q, gw: S, ba: BodyAdjoint):
+    def add_to_body(
+        b: int, w: S, gx: R3, gq: Q, gxp: R3, gqp: Q, gw: S, ba: BodyAdjoint
+    ):  # fmt: skip
         """gx, gq take the place of what was there: a push leaves the rest of a pose as it was."""
         ba.x[b] = gx
         ba.q[b] = gq
         ba.xp[b] = ba.xp[b] + gxp
         ba.qp[b] = ba.qp[b] + gqp
-        ba.w[b] = ba.w[b] + gw
+        if w > S(0.0):
+            ba.w[b] = ba.w[b] + gw
 
     @wp.func
     def add_mass(i: int, lane: int, w: S, g: S, adj: Adjoint):
@@ -189,7 +192,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             put(adj.x_flat, i, lane, gp)
             put(adj.xp_flat, i, lane, get(adj.xp_flat, i, lane) + gpo)
             add_mass(i, lane, wi, gwi, adj)
-            add_to_body(b, gx, gq, gxp, gqp, gw, ba)
+            add_to_body(b, bodies.w[b], gx, gq, gxp, gqp, gw, ba)
             by_mu = g_mu * rub
         return by_mu
 

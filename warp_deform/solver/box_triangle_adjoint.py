@@ -282,7 +282,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             add_mass(ia, lane, wa, gwa, adj)
             add_mass(ib, lane, wb, gwb, adj)
             add_mass(ic, lane, wc, gwc, adj)
-            add_to_body(b, gx, gq, gxp, gqp, gw, ba)
+            add_to_body(b, bodies.w[b], gx, gq, gxp, gqp, gw, ba)
             by_mu = g_mu * rub
         return by_mu
 

@@ -399,6 +399,8 @@ class Recorder:
         self._checkpoints.restore(self._final)
         out = {name: mirrored.view.copy() for name, mirrored in adjoint.items()}
         views, dt = data.views, self.solver.config.dt
+        # what is pinned has no mass to derive by
+        out["body.w"] *= data.views["bodies.w0"] > 0.0
         out["damping"] *= np.where(views["group.damping"] * dt < 1.0, -dt, 0.0)
         out["stiffness"] *= -1.0 / (views["group.stiffness"] * dt) ** 2
         out["fired"] = out["fired"].reshape(data.group_count, len(Kind), data.lanes)
