@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,10 @@ class Gradients:
     positions, velocities (W, P, 3): by the particles at the start
     inverse_masses (W, P): by those of free particles; what is pinned, or while it is held, has none
     damping, table_friction, contact_friction, stiffness (W,): by the parameters of the worlds
+    body_poses (W, B, 7): by the poses of the bodies' frames at the start, position and quat_xyzw;
+    the last four along the sphere of unit quaternions
+    body_velocities (W, B, 6): by the twists there
+    body_inverse_masses (W, B): by those of free bodies at the same inertia
     way_points, knot_times, knot_rotations: by world number, by the knots of its path (K, 3), (K,),
     (K, 4)
     fired (W, kinds): how often constraints of each `Kind` acted, and contacts in which branch
@@ -42,6 +47,9 @@ class Gradients:
     table_friction: np.ndarray
     contact_friction: np.ndarray
     stiffness: np.ndarray
+    body_poses: np.ndarray
+    body_velocities: np.ndarray
+    body_inverse_masses: np.ndarray
     way_points: dict[int, np.ndarray]
     knot_times: dict[int, np.ndarray]
     knot_rotations: dict[int, np.ndarray]
@@ -75,6 +83,7 @@ class DifferentiableRollout:
         self.recorder = Recorder(solver, storage=storage, memory=memory, sleep=sleep)
         self.watch: list[WatchValues] = []
         self._worlds: list[int] = []
+        self.body_poses = np.zeros((0, 0, 0, 7))
 
     def forward(
         self,
@@ -85,6 +94,8 @@ class DifferentiableRollout:
         pushes: Mapping[int, Sequence[Push]] | None = None,
         positions: np.ndarray | None = None,
         velocities: np.ndarray | None = None,
+        body_poses: np.ndarray | None = None,
+        body_velocities: np.ndarray | None = None,
         parameters: Mapping[str, np.ndarray] | None = None,
         until_rest: bool = False,
         calm: float | Mapping[int, float] = 0.0,
@@ -92,7 +103,12 @@ class DifferentiableRollout:
     ) -> np.ndarray:
         """Positions (W, T, P, 3) [m] at `times` [s] from the start, ascending.
 
+        Poses of the bodies' frames at these times are then in `body_poses` (W, T, B, 7), position
+        and quat_xyzw.
+
         positions (W, P, 3) [m], velocities (W, P, 3) [m/s]: the start; None: as the worlds are
+        body_poses (W, B, 7), body_velocities (W, B, 6: linear at the centre of mass, angular):
+        likewise
         parameters: by name "damping", "table_friction", "contact_friction", "stiffness" (W,) or
         "inverse_masses" (W, P) [1/kg]; they stay set
         until_rest: worlds freeze once they rest, as in `rollout`; otherwise they run on
@@ -113,6 +129,14 @@ class DifferentiableRollout:
         for name, start in (("particles.x", positions), ("particles.v", velocities)):
             for k, w in enumerate(self._worlds) if start is not None else ():
                 data.lane(name, w)[:] = np.asarray(start)[k]
+        if body_poses is not None or body_velocities is not None:
+            for k, w in enumerate(self._worlds):
+                poses, twists = data.body_poses(w)
+                data.set_bodies(
+                    w, poses if body_poses is None else np.asarray(body_poses)[k],
+                    twists if body_velocities is None else np.asarray(body_velocities)[k],
+                )  # fmt: skip
+        self._turns = [data.views["bodies.q"][data.body_rows(w)].copy() for w in self._worlds]
         end = marks[-1] * dt if marks else 0.0
         prepare(
             self.solver, self._worlds, paths=paths, pushes=pushes, most=2 * end,
@@ -124,6 +148,7 @@ class DifferentiableRollout:
             if w in (paths or {})
         }
         self.watch = self.recorder.forward(marks)
+        self.body_poses = np.stack([self._poses(m) for m in marks], axis=1)
         states = [self._worldwise(self.recorder.states[m]["particles.x"]) for m in marks]
         return np.stack(states, axis=1)
 
@@ -141,10 +166,18 @@ class DifferentiableRollout:
                 self.solver.set_world(w, **{name: float(values[k])})
 
     def backward(
-        self, positions: np.ndarray | None = None, velocities: np.ndarray | None = None
+        self,
+        positions: np.ndarray | None = None,
+        velocities: np.ndarray | None = None,
+        *,
+        bodies: np.ndarray | None = None,
+        body_velocities: np.ndarray | None = None,
     ) -> Gradients:
         """Derivatives of a loss from those by the positions (W, T, P, 3) and the velocities at the
         times of `forward`. May be called again with others.
+
+        bodies (W, T, B, 7), body_velocities (W, T, B, 6): the same by `body_poses` and by twists;
+        what is across the sphere of unit quaternions does not count
         """
         given = {"particles.x": positions, "particles.v": velocities}
         cotangents: dict[int, dict[str, np.ndarray]] = {}
@@ -154,6 +187,7 @@ class DifferentiableRollout:
                 for name, values in given.items()
                 if values is not None
             }
+            self._body_cotangents(cotangents[mark], t, mark, bodies, body_velocities)
         out = self.recorder.backward(cotangents)
         knots = {
             name: {w: out[name][rows] for w, rows in self._knots.items()}
@@ -164,11 +198,66 @@ class DifferentiableRollout:
             velocities=self._worldwise(out["v"]),
             inverse_masses=self._worldwise(out["mass"]),
             **{name: self._of_groups(out[name]) for name in WORLD_PARAMETERS},
+            body_poses=np.stack(
+                [
+                    self._by_frame(w, turn, out["body.x"], out["body.q"])
+                    for w, turn in zip(self._worlds, self._turns, strict=True)
+                ]
+            ),
+            body_velocities=np.concatenate(
+                [self._of_bodies(out["body.v"]), self._of_bodies(out["body.omega"])], axis=-1
+            ),
+            body_inverse_masses=self._of_bodies(out["body.w"]),
             way_points=knots["position"],
             knot_times=knots["time"],
             knot_rotations=knots["rotation"],
             fired=self._of_groups(out["fired"]),
         )
+
+    def _poses(self, mark: int) -> np.ndarray:
+        """Poses (W, B, 7) of the bodies' frames at a mark."""
+        data, state = self.solver.data, self.recorder.states[mark]
+        x, q = self._of_bodies(state["bodies.x"]), self._of_bodies(state["bodies.q"])
+        com = data.topologies[data.world_topology[self._worlds[0]]].body_com
+        return np.stack([data.frame_poses(xw, qw, com) for xw, qw in zip(x, q, strict=True)])
+
+    def _of_bodies(self, rows: np.ndarray) -> np.ndarray:
+        """An array by row of bodies -> (W, B, ...)."""
+        return np.stack([rows[self.solver.data.body_rows(w)] for w in self._worlds])
+
+    def _body_cotangents(
+        self,
+        cotangent: dict[str, np.ndarray],
+        t: int,
+        mark: int,
+        bodies: np.ndarray | None,
+        twists: np.ndarray | None,
+    ) -> None:
+        """Add derivatives by poses of frames and twists as those by centres of mass."""
+        data, state = self.solver.data, self.recorder.states[mark]
+        com = data.topologies[data.world_topology[self._worlds[0]]].body_com
+        for names, given in ((("x", "q"), bodies), (("v", "omega"), twists)):
+            if given is None:
+                continue
+            for name in names:
+                key = f"bodies.{name}"
+                cotangent[key] = np.zeros_like(data.views[key])
+            for k, w in enumerate(self._worlds):
+                rows, g = data.body_rows(w), np.asarray(given, dtype=float)[k, t]
+                cotangent[f"bodies.{names[0]}"][rows] = g[:, :3]
+                rest = g[:, 3:]
+                if names[1] == "q":
+                    turn = state["bodies.q"][rows]
+                    rest = _on_sphere(turn, rest - _turned_by(com, turn, g[:, :3]))
+                cotangent[f"bodies.{names[1]}"][rows] = rest
+
+    def _by_frame(self, world: int, turn: np.ndarray, x: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Derivatives (B, 7) by the frames of one world's bodies at the start."""
+        data = self.solver.data
+        rows = data.body_rows(world)
+        com = data.topologies[data.world_topology[world]].body_com
+        by_turn = _on_sphere(turn, q[rows] + _turned_by(com, turn, x[rows]))
+        return np.concatenate([x[rows], by_turn], axis=-1)
 
     def _worldwise(self, lanes: np.ndarray) -> np.ndarray:
         """An array of particles in lanes (P..., 3, L) or (P..., L) -> (W, P, 3) or (W, P)."""
@@ -193,6 +282,20 @@ class DifferentiableRollout:
         data = self.solver.data
         slots = [divmod(int(data.slot[w]), data.lanes) for w in self._worlds]
         return np.stack([lanes[group, ..., lane] for group, lane in slots])
+
+
+def _turned_by(offset: np.ndarray, turn: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Derivatives (B, 4) by quaternions of g . (offsets turned by them)."""
+    v, w = turn[:, :3], turn[:, 3:]
+    dot = functools.partial(np.einsum, "bi,bi->b")
+    by_v = 2 * w * np.cross(offset, g) + 2 * g * dot(v, offset)[:, None]
+    by_v += 2 * offset * dot(v, g)[:, None] - 4 * v * dot(g, offset)[:, None]
+    return np.column_stack([by_v, 2 * dot(g, np.cross(v, offset))])
+
+
+def _on_sphere(turn: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Derivatives by unit quaternions without their share along these."""
+    return g - turn * (turn * g).sum(axis=-1, keepdims=True)
 
 
 def substep_vjp(

@@ -14,15 +14,17 @@ import warp as wp
 from ..objects.attributes import SpringMode
 from ..objects.push import MOST_PUSHES
 from .bending import bending_adjoint
+from .body_adjoint import body_adjoint
 from .distance import distance_adjoint
 from .edge_contact_adjoint import edge_contact_adjoint
 from .grip import grip_adjoint
 from .internal_friction import internal_friction_adjoint
 from .lanes import KERNEL_OPTIONS, add, any_less, div, less, mul, select, sub  # noqa: F401
+from .rigid_adjoint import rigid_adjoint
 from .sphere_contact import sphere_contact_adjoint
 from .structures import structures
 from .table_contact import table_contact_adjoint
-from .tape import GRIP_WORDS, TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind, tape
+from .tape import BODY_SCALARS, GRIP_WORDS, TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind, tape
 from .tether import tether_adjoint
 from .triangle_contact_adjoint import triangle_contact_adjoint
 
@@ -55,8 +57,14 @@ def adjoint_kernel(
     sweep_triangle = triangle_contact_adjoint(scalar, lanes).sweep_triangle
     sweep_edge = edge_contact_adjoint(scalar, lanes).sweep_edge
     sweep_spring = internal_friction_adjoint(scalar, lanes).sweep_spring
-    grips_ = grip_adjoint(scalar, lanes)
+    grips_ = grip_adjoint(scalar, lanes, with_bodies)
     sweep_grip, held_again = grips_.sweep_grip, grips_.held_again
+    rigid_ = rigid_adjoint(scalar, lanes)
+    load_body, sweep_finish_body = rigid_.load_body, rigid_.sweep_finish_body
+    sweep_predict_body = rigid_.sweep_predict_body
+    solid_ = body_adjoint(scalar, lanes, with_sheets)
+    sweep_body_pairs, sweep_body_contacts = solid_.sweep_body_pairs, solid_.sweep_body_contacts
+    R3, Shapes, Bodies, Contacts, BodyAdjoint = t.R3, t.Shapes, t.Bodies, t.Contacts, t.BodyAdjoint
     Settings, Topology, Springs, Pairs = t.Settings, t.Topology, t.Springs, t.Pairs
     Group, Grips, Tape, Adjoint = t.Group, t.Grips, t.Tape, t.Adjoint
     Particles, Sheets = t.Particles, t.Sheets
@@ -70,8 +78,9 @@ def adjoint_kernel(
 
     @wp.kernel(module="unique", enable_backward=False, module_options=dict(KERNEL_OPTIONS))
     def sweep(
-        st: Settings, top: Topology, springs: Springs, pairs: Pairs, group: Group, q: Particles,
-        grips: Grips, sheets: Sheets, tape: Tape, adj: Adjoint,
+        st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
+        q: Particles, bodies: Bodies, contacts: Contacts, grips: Grips, sheets: Sheets, tape: Tape,
+        adj: Adjoint, ba: BodyAdjoint,
     ):  # fmt: skip
         g = wp.tid()
         k = group.topology[g]
@@ -82,6 +91,8 @@ def adjoint_kernel(
         s1 = top.spring_start[k + 1]
         w0 = g * wp.static(L)
         counts = g * wp.static(KINDS)
+        b0 = group.body_start[g]
+        body_count = top.body_count[k]
         zero = V(S(0.0))
         one = V(S(1.0))
         dt = st.dt
@@ -115,8 +126,8 @@ def adjoint_kernel(
         tk -= 1
         for _ in range(tape.k[tk]):
             tk -= 2
-            if tape.k[tk + 1] >= 0:
-                held_again(tape.k[tk], tape.k[tk + 1], p0, adj)
+            lane = tape.k[tk]
+            held_again(lane, tape.k[tk + 1], p0, b0 + lane * body_count, adj, ba)
         last = int(tx)
         for back in range(tape.steps[g]):
             substep = tape.until[g] - 1 - back
@@ -129,6 +140,18 @@ def adjoint_kernel(
             fastest = tape.v[tv + 1]
             count(counts + wp.static(int(Kind.STRETCH)), on, stretches, adj)
             count(counts + wp.static(int(Kind.BEND)), on, bends, adj)
+            if wp.static(with_bodies):
+                for r in range(wp.static(L)):
+                    lane = wp.static(L) - 1 - r
+                    if on[lane] > S(0.0):
+                        for rb in range(body_count):
+                            b = b0 + lane * body_count + body_count - 1 - rb
+                            tk -= 1
+                            ts -= wp.static(BODY_SCALARS - 7)
+                            load_body(ts, b, bodies, tape)
+                            sweep_finish_body(
+                                b, lane, tape.k[tk], dt, fastest[lane], counts, bodies, ba, adj
+                            )  # fmt: skip
             # velocities, table
             if wp.static(with_sheets):
                 if st.viscous > S(0.0):
@@ -165,6 +188,22 @@ def adjoint_kernel(
                 by_kept = by_kept + by_share
             finished = int(tx)
             tv_end = int(tv)
+            # contacts of bodies
+            if wp.static(with_bodies):
+                for r in range(wp.static(L)):
+                    lane = wp.static(L) - 1 - r
+                    if on[lane] > S(0.0):
+                        ts -= 7 * body_count
+                        by_floor, by_mu_pairs = sweep_body_pairs(
+                            g, lane, k, ts, push, counts, top, shapes, group, bodies, contacts,
+                            tape, ba, adj,
+                        )  # fmt: skip
+                        tk, ts, by_mu_solid = sweep_body_contacts(
+                            g, lane, k, tk, ts, finished, push, counts, top, shapes, group, bodies,
+                            sheets, tape, ba, adj,
+                        )  # fmt: skip
+                        by_table[lane] = by_table[lane] + by_floor
+                        by_contact[lane] = by_contact[lane] + by_mu_pairs + by_mu_solid
             # contacts of fabrics
             if wp.static(with_sheets):
                 if sheets.first[k + 1] > sheets.first[k]:
@@ -245,7 +284,7 @@ def adjoint_kernel(
             tk -= 1
             for _ in range(tape.k[tk]):
                 tk -= wp.static(GRIP_WORDS)
-                sweep_grip(tk, w0, p0, dt, counts, grips, tape, adj)
+                sweep_grip(tk, w0, p0, b0, body_count, dt, counts, grips, tape, adj, ba)
             # pushes
             for k_push in range(wp.static(L * MOST_PUSHES)):
                 lane = k_push // wp.static(MOST_PUSHES)
@@ -257,6 +296,15 @@ def adjoint_kernel(
                     by_kept[lane] = by_kept[lane] + (
                         gx.x[lane] * kick[0] + gx.y[lane] * kick[1] + gx.z[lane] * kick[2]
                     )
+            if wp.static(with_bodies):
+                gravity = group.gravity[g]
+                for lane in range(wp.static(L)):
+                    if on[lane] > S(0.0):
+                        pull = R3(gravity.x[lane], gravity.y[lane], gravity.z[lane])
+                        for b in range(b0 + lane * body_count, b0 + (lane + 1) * body_count):
+                            by_kept[lane] = by_kept[lane] + sweep_predict_body(
+                                b, dt, kept[lane], pull, bodies, ba
+                            )
             # prediction; without fabrics it is taken back with the substep before
             if wp.static(with_sheets):
                 for i in range(n):

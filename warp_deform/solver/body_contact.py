@@ -16,7 +16,7 @@ import warp as wp
 from .rigid import rigid
 from .structures import structures
 
-__all__ = ["AHEAD", "body_contact"]
+__all__ = ["AHEAD", "GIVEN_BACK", "PASSES", "VISIT", "body_contact"]
 
 PASSES = 6
 """Passes over the contacts at most."""
@@ -25,13 +25,19 @@ EXACT = 1.0e-7
 GIVEN_BACK = 0.2
 """Share of an overlap that a substep undoes: all at once, it would become speed and rock the
 box."""
+VISIT = 5
+"""Scalars of `Contacts.log` for a visit."""
 AHEAD = 1.0e-4
 """Points this far apart are listed: the solution itself may bring them together [m]."""
 
 
 @functools.cache
-def body_contact(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`begin_body`, `list_contact` for every pair of points, `solve_contacts`, `end_body`."""
+def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
+    """`begin_body`, `list_contact` for every pair of points, `solve_contacts`, `end_body`.
+
+    `noted`: for the backward sweep, impulses before every visit are written to `Contacts.log`, and
+    how many contacts share a load to `Contacts.code`; `solve_contacts` returns its passes.
+    """
     t = structures(scalar, lanes)
     S, R3, M33, Bodies, Contacts = t.S, t.R3, t.M33, t.Bodies, t.Contacts
     body = rigid(scalar, lanes)
@@ -143,12 +149,16 @@ def body_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             fv = -s[2] * part
             f = wp.sqrt(fu * fu + fv * fv)
             share = wp.min(contacts.mu[c] * normal / wp.max(f, S(1.0e-30)), S(1.0))
+            if wp.static(noted):
+                code = contacts.code[c]
+                code[3] = wp.max(int(loaded), 1)
+                contacts.code[c] = code
             contacts.impulse[c] = R3(normal, fu * share, fv * share)
             across = contacts.u[c] * (fu * share) + contacts.v[c] * (fv * share)
             apply(c, contacts.normal[c] * normal + across, bodies, contacts)
 
     @wp.func
-    def solve_contact(c: int, bodies: Bodies, contacts: Contacts):
+    def solve_contact(c: int, at: int, bodies: Bodies, contacts: Contacts):
         """One contact once; returns the largest step that it made [m]."""
         n = contacts.normal[c]
         u = contacts.u[c]
@@ -156,6 +166,9 @@ def body_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         w = contacts.weights[c]
         s = contacts.steps[c]
         old = contacts.impulse[c]
+        if wp.static(noted):
+            for k in range(3):
+                contacts.log[at + k] = old[k]
         normal = wp.max(old[0] - (s[0] + wp.dot(relative(c, bodies, contacts), n)) / w[0], S(0.0))
         largest = wp.abs(normal - old[0]) * w[0]
         if normal > S(0.0) or old[0] > S(0.0):
@@ -164,6 +177,9 @@ def body_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             d = relative(c, bodies, contacts)
             fu = old[1] - (s[1] + wp.dot(d, u)) / w[1]
             fv = old[2] - (s[2] + wp.dot(d, v)) / w[2]
+            if wp.static(noted):
+                contacts.log[at + 3] = fu
+                contacts.log[at + 4] = fv
             budget = contacts.mu[c] * normal
             f = wp.sqrt(fu * fu + fv * fv)
             if f > budget:
@@ -179,14 +195,19 @@ def body_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     def solve_contacts(start: int, end: int, bodies: Bodies, contacts: Contacts):
         """Solve contacts start .. end, forwards and backwards in turn."""
         p = int(0)
+        done = int(0)
+        at = start * wp.static(PASSES * VISIT)
         while p < wp.static(PASSES):
             largest = S(0.0)
             for k in range(end - start):
                 c = start + k
                 if p % 2 == 1:
                     c = end - 1 - k
-                largest = wp.max(largest, solve_contact(c, bodies, contacts))
+                largest = wp.max(largest, solve_contact(c, at, bodies, contacts))
+                if wp.static(noted):
+                    at += wp.static(VISIT)
             p += 1
+            done = p
             if largest < S(EXACT):
                 p = wp.static(PASSES)
         for c in range(start, end):
@@ -199,6 +220,7 @@ def body_contact(scalar: Any, lanes: int) -> SimpleNamespace:
                     bodies.support[a] = bodies.support[a] + 1
                     bodies.touching[a] = bodies.touching[a] + 1
                     bodies.touching[b] = bodies.touching[b] + 1
+        return done
 
     return SimpleNamespace(
         begin_body=begin_body, list_contact=list_contact, share_load=share_load,

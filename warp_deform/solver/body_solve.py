@@ -9,24 +9,37 @@ import warp as wp
 from .body_contact import body_contact
 from .box_box import box_box
 from .box_particle import box_particle
+from .box_particle_adjoint import box_particle_adjoint
 from .box_table import box_table
 from .box_triangle import box_triangle
+from .box_triangle_adjoint import box_triangle_adjoint
+from .rigid_adjoint import rigid_adjoint
 from .structures import structures
+from .tape import BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS
 
 __all__ = ["body_solve"]
 
 
 @functools.cache
-def body_solve(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
-    """`solve_bodies(g, lane, k, ...)`: the contacts of the bodies of one lane, in a fixed order."""
+def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) -> SimpleNamespace:
+    """`solve_bodies(g, lane, k, ...)`: the contacts of the bodies of one lane, in a fixed order.
+
+    `taped`, each that acts with a particle or a triangle leaves what its adjoint needs on the tape
+    from `tops` on, and bodies their poses before contacts with each other. Returns the tops after
+    that.
+    """
     t = structures(scalar, lanes)
     S, R3 = t.S, t.R3
     Topology, Shapes, Group, Particles = t.Topology, t.Shapes, t.Group, t.Particles
     Bodies, Contacts, Sheets, Cells = t.Bodies, t.Contacts, t.Sheets, t.Cells
+    Tape = t.Tape
     list_table = box_table(scalar, lanes).list_table
     project_box_particle = box_particle(scalar, lanes).project_box_particle
     project_box_triangles = box_triangle(scalar, lanes).project_box_triangles
     list_boxes = box_box(scalar, lanes).list_boxes
+    record_box_particle = box_particle_adjoint(scalar, lanes).record_box_particle
+    record_box_triangles = box_triangle_adjoint(scalar, lanes).record_box_triangles
+    push_pose = rigid_adjoint(scalar, lanes).push_pose
     bodies_ = body_contact(scalar, lanes)
     begin_body, solve_contacts, end_body = (
         getattr(bodies_, n) for n in ("begin_body", "solve_contacts", "end_body")
@@ -35,7 +48,8 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     @wp.func
     def solve_bodies(
         g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
-        q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets, cells: Cells,
+        tops: wp.vec4i, q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets,
+        cells: Cells, tape: Tape,
     ):  # fmt: skip
         """Contacts of one lane's bodies with particles, each other and the table."""
         p0 = group.particle_start[g]
@@ -47,6 +61,7 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
         mu = mv[lane]
         tv = group.table_friction[g]
         radii = top.particle_start[k]
+        mark = int(tops[2])
         for shape in range(first, last):
             b = b0 + shapes.body[shape]
             far = wp.length(shapes.half[shape])
@@ -58,14 +73,37 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
                 x = q.x[p0 + i]
                 d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
                 if wp.dot(d, d) < (far + radius) * (far + radius):
-                    project_box_particle(
-                        p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
-                    )
-            if wp.static(with_sheets):
+                    if wp.static(taped):
+                        if record_box_particle(
+                            tops[3], p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies,
+                            tape,
+                        ):  # fmt: skip
+                            tape.k[tops[2]] = i
+                            tape.k[tops[2] + 1] = shape
+                            tops[2] += wp.static(BODY_WORDS)
+                            tops[3] += wp.static(BOX_PARTICLE_SCALARS)
+                    else:
+                        project_box_particle(
+                            p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
+                        )
+            if wp.static(with_sheets and taped):
+                found = record_box_triangles(
+                    tops[2], tops[3], lane, k, p0, radii, shape, b, far + thickest, mu, push, top,
+                    shapes, bodies, sheets, cells, tape,
+                )  # fmt: skip
+                tops[2] += wp.static(BODY_WORDS) * found
+                tops[3] += wp.static(BOX_TRIANGLE_SCALARS) * found
+            elif wp.static(with_sheets):
                 project_box_triangles(
                     lane, k, p0, radii, shape, b, far + thickest, mu, push, top, shapes, bodies,
                     sheets, cells,
                 )  # fmt: skip
+        if wp.static(taped):
+            tape.k[tops[2]] = (tops[2] - mark) // wp.static(BODY_WORDS)
+            tops[2] += 1
+            for b in range(b0, b0 + count):
+                push_pose(tops[3], bodies.x[b], bodies.q[b], tape)
+                tops[3] += 7
         for b in range(b0, b0 + count):
             begin_body(b, bodies)
         start = group.contact_start[g]
@@ -83,5 +121,6 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
         solve_contacts(start, c, bodies, contacts)
         for b in range(b0, b0 + count):
             end_body(b, bodies)
+        return tops
 
     return SimpleNamespace(solve_bodies=solve_bodies)

@@ -22,14 +22,15 @@ POINTS = 12
 
 
 @functools.cache
-def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
+def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     """`list_boxes(c, sa, a, sb, b, ...)`: adds the contacts of shape sa of body a with shape sb of
     body b to the list, from number c on, and returns the next number.
+    `noted`: with the axis, edge and end in `Contacts.code`.
     """
     t = structures(scalar, lanes)
     S, R3, M33 = t.S, t.R3, t.M33
     Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
-    contact = body_contact(scalar, lanes)
+    contact = body_contact(scalar, lanes, noted)
     list_contact, share_load = contact.list_contact, contact.share_load
 
     @wp.func
@@ -108,6 +109,8 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
                         gap = wp.dot(at, n) - face
                         if gap < S(AHEAD):
                             list_contact(c, a, b, at - n * gap, at, n, mu, push, bodies, contacts)
+                            if wp.static(noted):
+                                contacts.code[c] = wp.vec4i(axis, k, edge * 4 + end, 0)
                             c += 1
             # corner of a's face inside b's side
             q = ca + n * ha[axis] + u * (hu * s0) + v * (hv * s1)
@@ -118,6 +121,8 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
                 gap = wp.dot(side - q, m) / wp.dot(m, n)
                 if gap < S(AHEAD):
                     list_contact(c, a, b, q, q + n * gap, n, mu, push, bodies, contacts)
+                    if wp.static(noted):
+                        contacts.code[c] = wp.vec4i(axis, k, edge * 4 + 2, 0)
                     c += 1
         return c
 
@@ -189,7 +194,17 @@ def box_box(scalar: Any, lanes: int) -> SimpleNamespace:
                     pa += u * su
                     pb += v * sv
                     list_contact(c, a, b, pa, pb, normal, mu, push, bodies, contacts)
+                    if wp.static(noted):
+                        contacts.code[c] = wp.vec4i(ea, eb, 16, 0)
                     c += 1
+        if wp.static(noted):
+            # the axis and the faces stay; shapes in the order of the contact's bodies
+            for k in range(start, c):
+                code = contacts.code[k]
+                if contacts.a[k] == a:
+                    contacts.code[k] = wp.vec4i(sa, sb, code[2] * 16 + code[0] * 4 + code[1], 0)
+                else:
+                    contacts.code[k] = wp.vec4i(sb, sa, code[2] * 16 + code[0] * 4 + code[1], 0)
         share_load(start, c, bodies, contacts)
         return c
 

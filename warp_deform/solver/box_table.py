@@ -13,14 +13,15 @@ __all__ = ["box_table"]
 
 
 @functools.cache
-def box_table(scalar: Any, lanes: int) -> SimpleNamespace:
+def box_table(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     """`list_table(c, b, local, first, last, ...)`: adds the corners of body b with shapes
     first..last that may touch the table to the contacts, from number c on; returns the next number.
+    `noted`: with the number of the corner in `Contacts.code`.
     """
     t = structures(scalar, lanes)
     S, R3 = t.S, t.R3
     Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
-    contact = body_contact(scalar, lanes)
+    contact = body_contact(scalar, lanes, noted)
     list_contact, share_load = contact.list_contact, contact.share_load
 
     @wp.func
@@ -48,6 +49,8 @@ def box_table(scalar: Any, lanes: int) -> SimpleNamespace:
                         foot = R3(p[0], p[1], S(0.0))
                         table_mu = mu * shapes.friction[shape]
                         list_contact(c, -1, b, foot, p, up, table_mu, push, bodies, contacts)
+                        if wp.static(noted):
+                            contacts.code[c] = wp.vec4i(-1, shape, k, 0)
                         c += 1
         share_load(start, c, bodies, contacts)
         return c

@@ -83,26 +83,10 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
         )
 
     @wp.func
-    def project_box_triangle(
-        f: int, lane: int, p0: int, radii: int, shape: int, b: int, center: R3, mu: S, push: S,
-        top: Topology, shapes: Shapes, bodies: Bodies, sheets: Sheets, cells: Cells,
-    ):  # fmt: skip
-        """Returns whether the two met, which may have moved the box."""
-        met = bool(False)
-        tri = sheets.triangle[f]
-        radius = top.radius[radii + tri[0]]
-        ia = p0 + tri[0]
-        ib = p0 + tri[1]
-        ic = p0 + tri[2]
-        xa = get(cells.x, ia, lane)
-        xb = get(cells.x, ib, lane)
-        xc = get(cells.x, ic, lane)
-        # in the box's own frame
-        h = shapes.half[shape]
-        turn = bodies.q[b] * shapes.rotation[shape]
-        a = wp.quat_rotate_inv(turn, xa - center)
-        e = wp.quat_rotate_inv(turn, xb - center)
-        c = wp.quat_rotate_inv(turn, xc - center)
+    def separate(a: R3, e: R3, c: R3, h: R3, radius: S):
+        """Distance along the best axis (at least `radius`: apart), which it is, and the axis: 0 a
+        face of the box, 1 the triangle's normal, 2 + 3 * edge + axis across both.
+        """
         low = wp.min(a, wp.min(e, c)) - h
         high = -wp.max(a, wp.max(e, c)) - h
         gap = wp.max(low[0], wp.max(low[1], low[2]))
@@ -146,6 +130,30 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
                         gap = apart
                         kind = int(2) + k
                         n = m
+        return gap, kind, n
+
+    @wp.func
+    def project_box_triangle(
+        f: int, lane: int, p0: int, radii: int, shape: int, b: int, center: R3, mu: S, push: S,
+        top: Topology, shapes: Shapes, bodies: Bodies, sheets: Sheets, cells: Cells,
+    ):  # fmt: skip
+        """Returns whether the two met, which may have moved the box."""
+        met = bool(False)
+        tri = sheets.triangle[f]
+        radius = top.radius[radii + tri[0]]
+        ia = p0 + tri[0]
+        ib = p0 + tri[1]
+        ic = p0 + tri[2]
+        xa = get(cells.x, ia, lane)
+        xb = get(cells.x, ib, lane)
+        xc = get(cells.x, ic, lane)
+        # in the box's own frame
+        h = shapes.half[shape]
+        turn = bodies.q[b] * shapes.rotation[shape]
+        a = wp.quat_rotate_inv(turn, xa - center)
+        e = wp.quat_rotate_inv(turn, xb - center)
+        c = wp.quat_rotate_inv(turn, xc - center)
+        gap, kind, n = separate(a, e, c, h, radius)
         if gap < radius and kind > 0:
             u = R3()
             near = corner_towards(h, n)
@@ -230,4 +238,7 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
                 center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
             f = next_near(sheets.triangle, cells.x, f + 1, end, p0, lane, center, wide)
 
-    return SimpleNamespace(project_box_triangles=project_box_triangles)
+    return SimpleNamespace(
+        project_box_triangles=project_box_triangles, project_box_triangle=project_box_triangle,
+        separate=separate, corner_towards=corner_towards, next_near=next_near,
+    )  # fmt: skip

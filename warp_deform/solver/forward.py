@@ -32,10 +32,11 @@ from .lanes import (  # noqa: F401  (operators are found by name)
 )
 from .particle_solve import particle_solve
 from .rigid import rigid
+from .rigid_adjoint import rigid_adjoint
 from .sphere_contact import sphere_contact
 from .structures import structures
 from .table_contact import table_contact, table_contact_adjoint
-from .tape import COUNTERS, GRIP_WORDS, tape
+from .tape import BODY_SCALARS, COUNTERS, GRIP_WORDS, tape
 from .watch import watch
 
 __all__ = ["forward_kernel"]
@@ -73,10 +74,11 @@ def forward_kernel(
     follow_path, take, let_go = grips_.follow_path, grips_.take, grips_.let_go
     body = rigid(scalar, lanes)
     predict_body, finish_body = body.predict_body, body.finish_body
-    solve_bodies = body_solve(scalar, lanes, with_sheets).solve_bodies
+    solve_bodies = body_solve(scalar, lanes, with_sheets, taped).solve_bodies
+    record_body = rigid_adjoint(scalar, lanes).record_body
     watch_group = watch(scalar, lanes, with_bodies).watch_group
     record_finish = table_contact_adjoint(scalar, lanes, with_sheets).record_finish
-    record_grip = grip_adjoint(scalar, lanes).record_grip
+    record_grip = grip_adjoint(scalar, lanes, with_bodies).record_grip
     record_spring = internal_friction_adjoint(scalar, lanes).record_spring
     tapes = tape(scalar, lanes)
     has_room, load_state, save_state = tapes.has_room, tapes.load_state, tapes.save_state
@@ -265,7 +267,11 @@ def forward_kernel(
                         listed += cells.count[w0 + lane]
                         if wp.static(with_edges):
                             listed += cells.edge_count[w0 + lane]
-                if not has_room(g, tops, s1 - s0, n, near_count, listed, tape):
+                triangles = sheets.first[k + 1] - sheets.first[k]
+                solid = top.shape_count[k] * (n + triangles) * wp.static(L)
+                if not has_room(
+                    g, tops, s1 - s0, n, near_count, listed, body_count * wp.static(L), solid, tape
+                ):
                     tape.full[g] = 1
                     break
             # constraints
@@ -280,9 +286,9 @@ def forward_kernel(
                         for b in range(body_count):
                             bodies.touching[b0 + lane * body_count + b] = 0
                             bodies.support[b0 + lane * body_count + b] = 0
-                        solve_bodies(
-                            g, lane, k, push, top, shapes, group, q, bodies, contacts, sheets,
-                            cells,
+                        tops = solve_bodies(
+                            g, lane, k, push, top, shapes, group, tops, q, bodies, contacts,
+                            sheets, cells, tape,
                         )  # fmt: skip
             # table, velocities
             fastest = select(calm, V(st.calm_speed * dt), V(st.max_speed * dt))
@@ -340,6 +346,12 @@ def forward_kernel(
                     if on[lane] > S(0.0):
                         for b in range(body_count):
                             at = b0 + lane * body_count + b
+                            if wp.static(taped):
+                                tape.k[tops[2]] = record_body(
+                                    tops[3], at, dt, drowsy[lane], bodies, tape
+                                )  # fmt: skip
+                                tops[2] += 1
+                                tops[3] += wp.static(BODY_SCALARS - 7)
                             m = finish_body(at, dt, fastest[lane], drowsy[lane], bodies)
                             moved2[lane] = wp.max(moved2[lane], m)
                             unrest2[lane] = wp.max(unrest2[lane], m)
@@ -392,6 +404,8 @@ def forward_kernel(
                 if wp.static(taped):
                     tape.k[tops[2]] = lane
                     tape.k[tops[2] + 1] = grips.particle[w0 + lane]
+                    if grips.particle[w0 + lane] < 0:
+                        tape.k[tops[2] + 1] = -1 - grips.body[w0 + lane]
                     tops[2] += 2
                 let_go(w0 + lane, lane, p0, b0 + lane * body_count, q, bodies, grips)
         if wp.static(taped):

@@ -170,7 +170,7 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
 
 
 @functools.cache
-def grip_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
     """`record_grip` notes on the tape where on its path a lane's grip is, `sweep_grip` gives the
     derivatives by what is held to the knots; `held_again` takes back what the end of a launch let
     go.
@@ -180,7 +180,7 @@ def grip_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     """
     t = structures(scalar, lanes)
     S, R3, Q = t.S, t.R3, t.Q
-    Grips, Tape, Adjoint = t.Grips, t.Tape, t.Adjoint
+    Grips, Tape, Adjoint, BodyAdjoint = t.Grips, t.Tape, t.Adjoint, t.BodyAdjoint
 
     @wp.func
     def record_grip(
@@ -236,20 +236,26 @@ def grip_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             adj.time[k + 1] = adj.time[k + 1] - gu * u / span
 
     @wp.func
-    def held_again(lane: int, held: int, p0: int, adj: Adjoint):
-        i = p0 + held
-        mass = adj.w[i]
-        mass[lane] = S(0.0)
-        adj.w[i] = mass
-        v = adj.v[i]
-        v.x[lane] = S(0.0)
-        v.y[lane] = S(0.0)
-        v.z[lane] = S(0.0)
-        adj.v[i] = v
+    def held_again(lane: int, held: int, p0: int, bl: int, adj: Adjoint, ba: BodyAdjoint):
+        """bl: row of the lane's first body; `held` as on the tape."""
+        if held >= 0:
+            i = p0 + held
+            mass = adj.w[i]
+            mass[lane] = S(0.0)
+            adj.w[i] = mass
+            v = adj.v[i]
+            v.x[lane] = S(0.0)
+            v.y[lane] = S(0.0)
+            v.z[lane] = S(0.0)
+            adj.v[i] = v
+        elif wp.static(with_bodies):
+            ba.v[bl - 1 - held] = R3()
+            ba.omega[bl - 1 - held] = R3()
 
     @wp.func
     def sweep_grip(
-        at: int, w0: int, p0: int, dt: S, counts: int, grips: Grips, tape: Tape, adj: Adjoint
+        at: int, w0: int, p0: int, b0: int, body_count: int, dt: S, counts: int, grips: Grips,
+        tape: Tape, adj: Adjoint, ba: BodyAdjoint,
     ):  # fmt: skip
         lane = tape.k[at]
         held = tape.k[at + 1]
@@ -258,6 +264,7 @@ def grip_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         w = w0 + lane
         clock = S(tick) * dt
         g = R3()
+        still = Q(S(0.0), S(0.0), S(0.0), S(0.0))
         turn = Q(S(0.0), S(0.0), S(0.0), S(0.0))
         kind = counts + wp.static(int(Kind.GRIP))
         if held >= 0:
@@ -272,12 +279,32 @@ def grip_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
                 go.y[lane] = S(0.0)
                 go.z[lane] = S(0.0)
                 adj.xp[i] = go
-                held_again(lane, held, p0, adj)
+                held_again(lane, held, p0, b0, adj, ba)
             g = R3(gx.x[lane], gx.y[lane], gx.z[lane])
             gx.x[lane] = S(0.0)
             gx.y[lane] = S(0.0)
             gx.z[lane] = S(0.0)
             adj.x[i] = gx
+        elif wp.static(with_bodies):
+            b = b0 + lane * body_count - 1 - held
+            g = ba.x[b]
+            gq = ba.q[b]
+            if tape.k[at + 4] > 0:
+                g += ba.xp[b]
+                gq = gq + ba.qp[b]
+                ba.xp[b] = R3()
+                ba.qp[b] = still
+                held_again(lane, held, p0, b0 + lane * body_count, adj, ba)
+            ba.x[b] = R3()
+            ba.q[b] = still
+            u = along(knot, clock, grips)
+            mixed = grips.rotation[knot] * (S(1.0) - u) + grips.rotation[knot + 1] * u
+            of = grips.turn[w]
+            pose = wp.normalize(mixed) * of
+            size = wp.length(pose)
+            pose = pose * (S(1.0) / size)
+            gq = (gq - pose * wp.dot(pose, gq)) * (S(1.0) / size)
+            turn = gq * Q(-of[0], -of[1], -of[2], of[3])
         if wp.length_sq(grips.offset[w]) > S(0.0):
             u = along(knot, clock, grips)
             mixed = grips.rotation[knot] * (S(1.0) - u) + grips.rotation[knot + 1] * u
@@ -287,7 +314,6 @@ def grip_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         before = tape.k[at + 5]
         if tick != before + 1:
             kind = counts + wp.static(int(Kind.REACHED))
-            still = Q(S(0.0), S(0.0), S(0.0), S(0.0))
             to_knots(knot, clock, -shift, still, grips, adj)
             here = S(before + 1) * dt - dt
             k = int(tape.k[at + 6])

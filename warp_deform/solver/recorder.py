@@ -11,11 +11,22 @@ import warp as wp
 
 from ..errors import InputError
 from .adjoint import adjoint_kernel
+from .body_contact import PASSES, VISIT
 from .checkpoint import Checkpoints
 from .data import KERNEL_ARGUMENTS
 from .forward import forward_kernel
 from .mirrored import Mirrored
-from .tape import COUNTERS, GRIP_WORDS, STATE, TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind
+from .tape import (
+    BODY_SCALARS,
+    BODY_WORDS,
+    BOX_TRIANGLE_SCALARS,
+    COUNTERS,
+    GRIP_WORDS,
+    STATE,
+    TRIANGLE_SCALARS,
+    TRIANGLE_WORDS,
+    Kind,
+)
 
 if TYPE_CHECKING:
     from .guards import WatchValues
@@ -26,8 +37,10 @@ __all__ = ["Recorder"]
 _NEAR = 4 * 2**20  # bytes of a tape that is replayed, where memory allows
 _MOST = 2**31 - 1  # elements of one stack: whole numbers of 32 bits count them
 _ORDER = KERNEL_ARGUMENTS
-_SWEPT = ("topology", "springs", "pairs", "group", "particles", "grips", "sheets")
-_ADJOINT_OF = {"particles.x": "x", "particles.v": "v"}
+_SWEPT = ("topology", "springs", "pairs", "shapes", "group", "particles", "bodies", "contacts",
+          "grips", "sheets")  # fmt: skip
+_BODY = ("x", "q", "v", "omega")
+_ADJOINT_OF = {"particles.x": "x", "particles.v": "v"} | {f"bodies.{n}": f"body.{n}" for n in _BODY}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +90,6 @@ class Recorder:
             raise InputError(f"storage must be replay or full, not {storage!r}")
         self.solver, self.storage, self.memory, self.sleep = solver, storage, memory, sleep
         data = solver.data
-        if data.has_bodies:
-            raise InputError("rollouts with rigid bodies cannot be differentiated")
         variant = (
             data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets, data.has_edges
         )  # fmt: skip
@@ -92,10 +103,15 @@ class Recorder:
         }
         self._checkpoints = Checkpoints(data, self._control)
         self._adjoint = self._new_adjoint()
+        contacts = len(data.arrays["contacts.mu"].view)
+        self._notes = {
+            "code": wp.zeros(contacts, dtype=wp.vec4i, device=data.device),
+            "log": wp.zeros(contacts * PASSES * VISIT, dtype=data.scalar, device=data.device),
+        }
         self._tape: _Tape | None = None
         self._spent: list[_Tape] = []
         self._use: np.ndarray | None = None
-        self._spare = 2.0 * self._least_room()
+        self._spare = 2.0 * self._least_room() + self._solid_room()
         self.nbytes = 0
         """Bytes of the tapes and checkpoints of the last rollout."""
 
@@ -119,6 +135,16 @@ class Recorder:
         arrays["shift"] = self._mirrored(groups * L, t.R3, (3,))
         arrays["pending"] = Mirrored(groups, wp.int32, data.device, np.int32, ())
         arrays["fired"] = self._mirrored(groups * len(Kind), t.V, (L,))
+        bodies, contacts = int(data.group_body[-1]), len(data.arrays["contacts.mu"].view)
+        for name in ("x", "v", "omega", "xp", "dx", "dr"):
+            arrays[f"body.{name}"] = self._mirrored(bodies, t.R3, (3,))
+        for name in ("q", "qp"):
+            arrays[f"body.{name}"] = self._mirrored(bodies, t.Q, (4,))
+        arrays["body.w"] = self._mirrored(bodies, t.S, ())
+        arrays["body.spread"] = self._mirrored(bodies, t.M33, (3, 3))
+        for name in ("ra", "rb", "normal", "across_u", "across_v", "weights", "steps", "impulse"):
+            arrays[f"body.{name}"] = self._mirrored(contacts, t.R3, (3,))
+        arrays["body.mu"] = self._mirrored(contacts, t.S, ())
         return arrays
 
     def _new_tape(self, room: np.ndarray) -> _Tape:
@@ -160,7 +186,19 @@ class Recorder:
             top = data.topologies[k]
             springs, particles = len(top.spring_ij), top.particle_count
             words = springs + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
-            rows.append((2 * springs + 4 * particles, particles + 8, words, 0))
+            bodies = top.body_count * data.lanes
+            words += BODY_WORDS * bodies
+            rows.append((2 * springs + 4 * particles, particles + 8, words, BODY_SCALARS * bodies))
+        return np.array(rows)
+
+    def _solid_room(self) -> np.ndarray:
+        """Room (groups, 4) that contacts of boxes with particles and triangles may need."""
+        data, rows = self.solver.data, []
+        for k in data.group_topology:
+            top = data.topologies[k]
+            solid = len(top.shape_body) * (top.particle_count + len(top.sheet_triangle))
+            solid *= data.lanes
+            rows.append((0, 0, BODY_WORDS * solid, BOX_TRIANGLE_SCALARS * solid))
         return np.array(rows)
 
     # -- running
@@ -285,8 +323,13 @@ class Recorder:
                 counts = data.arrays[name].view[: data.group_count * data.lanes]
                 if len(counts) == data.group_count * data.lanes:
                     listed += counts.reshape(-1, data.lanes).sum(axis=1)
-        return self._least_room() + 1.5 * np.stack(
-            [2 * near, near, near + TRIANGLE_WORDS * listed, TRIANGLE_SCALARS * listed], axis=1
+        return (
+            self._least_room()
+            + self._solid_room()
+            + 1.5
+            * np.stack(
+                [2 * near, near, near + TRIANGLE_WORDS * listed, TRIANGLE_SCALARS * listed], axis=1
+            )
         )
 
     def _launch(self, tape: _Tape, begin: int, end: int, last: bool) -> None:
@@ -321,7 +364,7 @@ class Recorder:
         Returns views, valid until the next call: "x", "v" (by the state at the start), "mass" (by
         inverse masses), per group "damping", "table_friction", "contact_friction", "stiffness";
         per knot "position", "rotation", "time"; "fired" (groups, kinds, L): how often constraints
-        acted.
+        acted. Per body "body.x", "body.q" (by the four numbers), "body.v", "body.omega", "body.w".
         """
         if not self._segments:
             raise InputError("there is nothing to sweep back: call forward first")
@@ -332,8 +375,10 @@ class Recorder:
         for mirrored in adjoint.values():
             mirrored.view[...] = 0
         adjoint["w"].view[...] = self._final["particles.w"]
-        struct = self._adjoint_struct()
+        struct, of_bodies = self._adjoint_struct()
         inputs = [self._structs[_ORDER.index(n)] for n in _SWEPT]
+        for name, array in self._notes.items():
+            setattr(inputs[_SWEPT.index("contacts")], name, array)
         for mirrored in adjoint.values():
             mirrored.to_device()
         for number in reversed(range(len(self._segments))):
@@ -346,7 +391,7 @@ class Recorder:
             struct.leave = int(segment.begin > 0 and segment.begin not in self._marks)
             wp.launch(
                 self._sweep, dim=data.group_count,
-                inputs=[self._settings(segment.end), *inputs, tape.struct, struct],
+                inputs=[self._settings(segment.end), *inputs, tape.struct, struct, of_bodies],
                 device=self.solver.model.device,
             )  # fmt: skip
         for mirrored in adjoint.values():
@@ -354,6 +399,8 @@ class Recorder:
         self._checkpoints.restore(self._final)
         out = {name: mirrored.view.copy() for name, mirrored in adjoint.items()}
         views, dt = data.views, self.solver.config.dt
+        # what is pinned has no mass to derive by
+        out["body.w"] *= data.views["bodies.w0"] > 0.0
         out["damping"] *= np.where(views["group.damping"] * dt < 1.0, -dt, 0.0)
         out["stiffness"] *= -1.0 / (views["group.stiffness"] * dt) ** 2
         out["fired"] = out["fired"].reshape(data.group_count, len(Kind), data.lanes)
@@ -378,17 +425,18 @@ class Recorder:
             mirrored.view[...] += values
             mirrored.to_device()
 
-    def _adjoint_struct(self) -> Any:
+    def _adjoint_struct(self) -> tuple[Any, Any]:
         data = self.solver.data
-        struct = data.types.Adjoint()
+        struct, of_bodies = data.types.Adjoint(), data.types.BodyAdjoint()
         for name, mirrored in self._adjoint.items():
-            setattr(struct, name, mirrored.array)
+            owner, _, field = name.rpartition(".")
+            setattr(of_bodies if owner else struct, field, mirrored.array)
         for name in ("x", "xp", "w", "mass"):
             array = self._adjoint[name].array
             count = array.capacity // np.dtype(data.number).itemsize
             flat = wp.array(ptr=array.ptr, dtype=data.scalar, shape=(count,), device=array.device)
             setattr(struct, f"{name}_flat", flat)
-        return struct
+        return struct, of_bodies
 
 
 def _nbytes(saved: dict[str, np.ndarray]) -> int:

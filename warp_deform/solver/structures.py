@@ -227,6 +227,9 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         steps: wp.array(dtype=R3)  # gap, with the overlap that may remain, and slip along u, v [m]
         impulse: wp.array(dtype=R3)  # along normal, u and v [kg m]
         mu: wp.array(dtype=S)
+        # only in the backward sweep
+        code: wp.array(dtype=wp.vec4i)  # shapes of a and b, which feature, how many share the load
+        log: wp.array(dtype=S)  # of every visit: impulse before, friction before its limit
 
     @wp.struct
     class Grips:
@@ -310,9 +313,34 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         w_flat: wp.array(dtype=S)
         mass_flat: wp.array(dtype=S)
 
+    @wp.struct
+    class BodyAdjoint:
+        """Derivatives of the loss by the state of bodies, and scratch for those by contacts."""
+
+        x: wp.array(dtype=R3)
+        q: wp.array(dtype=Q)  # by its four numbers
+        v: wp.array(dtype=R3)
+        omega: wp.array(dtype=R3)
+        xp: wp.array(dtype=R3)
+        qp: wp.array(dtype=Q)
+        w: wp.array(dtype=S)  # by inverse mass, at the same inertia
+        dx: wp.array(dtype=R3)
+        dr: wp.array(dtype=R3)
+        spread: wp.array(dtype=M33)
+        # by contact, as `Contacts`
+        ra: wp.array(dtype=R3)
+        rb: wp.array(dtype=R3)
+        normal: wp.array(dtype=R3)
+        across_u: wp.array(dtype=R3)
+        across_v: wp.array(dtype=R3)
+        weights: wp.array(dtype=R3)
+        steps: wp.array(dtype=R3)
+        impulse: wp.array(dtype=R3)
+        mu: wp.array(dtype=S)
+
     return SimpleNamespace(
         **vars(t), V4=V4, Settings=Settings, Topology=Topology, Springs=Springs, Pairs=Pairs,
         Shapes=Shapes, Group=Group, Particles=Particles, Near=Near, Bodies=Bodies, Grips=Grips,
         Watch=Watch, Contacts=Contacts, Sheets=Sheets, Cells=Cells, Tape=Tape,
-        Adjoint=Adjoint,
+        Adjoint=Adjoint, BodyAdjoint=BodyAdjoint,
     )  # fmt: skip

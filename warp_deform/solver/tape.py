@@ -17,7 +17,9 @@ import warp as wp
 
 from .structures import structures
 
-__all__ = ["COUNTERS", "GRIP_WORDS", "STATE", "TRIANGLE_SCALARS", "TRIANGLE_WORDS", "Kind", "tape"]
+__all__ = ["BODY_SCALARS", "BODY_WORDS", "BOX_PARTICLE_SCALARS", "BOX_TRIANGLE_SCALARS",
+           "COUNTERS", "GRIP_WORDS", "STATE", "TRIANGLE_SCALARS", "TRIANGLE_WORDS", "Kind",
+           "tape"]  # fmt: skip
 
 STATE = 14
 """Lane vectors of the kernel's own state per group."""
@@ -29,6 +31,15 @@ TRIANGLE_WORDS = 2
 """The same for a particle that touches a triangle, or an edge that touches another one."""
 TRIANGLE_SCALARS = 13
 """Scalars of that pair: distance at which they touch, and the four positions [m]."""
+
+BODY_SCALARS = 28
+"""Of a body: pose, old pose, twist, inverse mass, and pose before contacts of bodies."""
+BODY_WORDS = 2
+"""Of a body, or of its contact with a particle or a triangle."""
+BOX_PARTICLE_SCALARS = 13
+"""Of that contact: position and old position of the particle, pose of the body."""
+BOX_TRIANGLE_SCALARS = 16
+"""The same with the positions of the triangle's corners."""
 
 
 class Kind(IntEnum):
@@ -53,6 +64,13 @@ class Kind(IntEnum):
     DRY_FRICTION = 16
     SLEEP = 17
     VISCOSITY = 18
+    BODY_TABLE = 19
+    BODY_BODY = 20
+    BODY_SLIP = 21
+    BODY_SLEEP = 22
+    BODY_CLAMP = 23
+    BOX_PARTICLE = 24
+    BOX_TRIANGLE = 25
 
 
 @functools.cache
@@ -61,7 +79,8 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
     the sweep reads backwards, which hardware foresees badly.
 
     `has_room(...)`: whether a substep with so many springs, particles, near pairs and listed
-    pairs of triangles and edges fits on the tape, and the grips of the next substep with it.
+    pairs of triangles and edges fits on the tape, and the grips of the next substep with it;
+    `bodies`, `solid`: pairs of boxes with particles or triangles in all lanes.
 
     `load_state(g, tape)`, `save_state(g, ..., tape)`: the kernel's own state between launches.
     """
@@ -75,16 +94,21 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def has_room(
-        g: int, tops: wp.vec4i, springs: int, particles: int, near: int, listed: int, tape: Tape
-    ):
+        g: int, tops: wp.vec4i, springs: int, particles: int, near: int, listed: int,
+        bodies: int, solid: int, tape: Tape,
+    ):  # fmt: skip
         end = tape.end[g]
         words = springs + particles + near + wp.static(TRIANGLE_WORDS) * listed
-        words += wp.static(2 * L * (GRIP_WORDS + 4) + 8)
+        words += wp.static(2 * L * (GRIP_WORDS + 4) + 8) + wp.static(BODY_WORDS) * (bodies + solid)
         return (
             tops[0] + 2 * springs + 4 * particles + 2 * near <= end[0]
             and tops[1] + near + particles + 8 <= end[1]
             and tops[2] + words <= end[2]
-            and tops[3] + wp.static(TRIANGLE_SCALARS) * listed <= end[3]
+            and tops[3]
+            + wp.static(TRIANGLE_SCALARS) * listed
+            + wp.static(BODY_SCALARS) * bodies
+            + wp.static(BOX_TRIANGLE_SCALARS) * solid
+            <= end[3]
         )
 
     @wp.func
