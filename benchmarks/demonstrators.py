@@ -1,22 +1,26 @@
 """Who chooses actions how well: success, actions, CPU seconds, and how the sheets fare.
 
     python benchmarks/demonstrators.py [--tasks cable-ring] [--seeds 50] [--out rows.jsonl]
-    python benchmarks/demonstrators.py --by mpc enumerate random cem gradient planner --budget 64
+    python benchmarks/demonstrators.py --by scripted mpc enumerate cem gradient refined-cem
 
-Besides the demonstrators there are the searches of `warp_deform.planning` one action ahead; they
-and `planner`, two ahead, may simulate `--budget` actions a choice. Plays whole episodes in this
-process on the same seeds, eight side by side, with the images that a collection would render. One
-episode before each row, not timed, compiles or loads the kernels. With --out, rows already in that
-file are not measured again. Intervals of rates are Wilson's, others 1.96 standard errors, 95 %.
+Besides the demonstrators there are the searches of `warp_deform.planning`, which may simulate
+`--budget` actions a choice and look `--depth` actions ahead (`enumerate` one ahead is `mpc` with
+that budget), and `refined-`: the scripted demonstrator's successful episodes refined by a search.
+Plays whole episodes in this process on the same seeds, eight side by side, with the images that a
+collection would render. One episode before each row, not timed, compiles or loads the kernels. With
+--out, rows already in that file are not measured again. Intervals of rates are Wilson's, others
+1.96 standard errors, 95 %.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
+import tempfile
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +30,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bag_scenes import pierced
 from cloth_scenes import edges_of
 
+from learning.refinement import RefineConfig, refine
+from warp_deform.collect import CollectConfig, collect
 from warp_deform.demonstrators import DEMONSTRATORS, demonstrator, planner
-from warp_deform.episode_loop import SOLVED, Act, play, worlds_for
-from warp_deform.episodes import Step
+from warp_deform.episode_loop import SOLVED, play, worlds_for
+from warp_deform.episodes import EpisodeReader, Step
 from warp_deform.objects import Bag, Cloth
 from warp_deform.planning import METHODS, SearchConfig
 from warp_deform.quiet import quiet_warp
@@ -38,6 +44,7 @@ from warp_deform.workers import single_threaded
 from warp_deform.worlds import Worlds
 
 WARM_UP = 999_000  # seed
+REFINED = tuple(f"refined-{method}" for method in METHODS)
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,8 @@ class Row:
     by: str
     budget: int | None
     """Simulated actions a choice; None where it is not ours to set."""
+    depth: int | None
+    """Actions that a search looks ahead."""
     first_seed: int
     attempts: int
     successes: int
@@ -107,8 +116,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--by", nargs="+", default=["scripted", "visible", "mpc"],
-                        choices=[*DEMONSTRATORS, *METHODS])  # fmt: skip
+                        choices=[*DEMONSTRATORS, *METHODS, *REFINED])  # fmt: skip
     parser.add_argument("--budget", type=int, default=64, help="simulated actions a choice")
+    parser.add_argument("--depth", type=int, nargs="+", default=[2], choices=[1, 2],
+                        help="actions that searches look ahead")  # fmt: skip
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--quick", action="store_true", help="a smoke run; not for publication")
@@ -124,10 +135,11 @@ def main() -> None:
         print("| task | by | successes / attempts | 95 % | mean actions | mean score "
               "| CPU s an attempt | pierced edges, mean / worst state |")  # fmt: skip
         print("|---|---|---|---|---|---|---|---|")
-    for task in options.tasks:
-        for name in options.by:
-            budget = options.budget if name == "planner" or name in METHODS else None
-            key = (task, name, budget, options.first, options.seeds)
+    for task, name in itertools.product(options.tasks, options.by):
+        searches = name in METHODS or name in REFINED
+        for depth in options.depth if searches else [None]:
+            budget = options.budget if searches else None
+            key = (task, name, budget, depth, options.first, options.seeds)
             row = done.get(key) or measure(*key)
             rows.append(row)
             if options.out and key not in done:
@@ -139,66 +151,93 @@ def main() -> None:
         print(json.dumps({"rows": [asdict(row) for row in rows]}))
 
 
-def acting(name: str, budget: int | None) -> Act[Step]:
-    """Who acts under a name."""
-    if budget is None:
-        return demonstrator(name)
-    if name in METHODS:
-        return planner(SearchConfig(method=name, budget=budget, depth=1))
-    return planner(SearchConfig(budget=budget))
-
-
-def measure(task: str, by: str, budget: int | None, first: int, count: int) -> Row:
+def measure(
+    task: str, by: str, budget: int | None, depth: int | None, first: int, count: int
+) -> Row:
     """Play every seed once; says on stderr how far it is."""
-    worlds, act, seeds = worlds_for(task, "ur5"), acting(by, budget), range(first, first + count)
+    search = None
+    if budget is not None and depth is not None:
+        method, ahead = by.removeprefix("refined-"), budget if depth == 1 else budget // 2
+        candidates = ahead if method == "enumerate" else SearchConfig.candidates
+        search = SearchConfig(method=method, budget=budget, candidates=candidates, depth=depth)
     with single_threaded():
-        list(play(worlds, [WARM_UP], act=act, look=observe))
-        watch, runs = Watch(), []
-        began = time.process_time()
-        for _, run in play(worlds, seeds, act=act, look=watch.look):
-            runs.append(run)
-            print(f"\r{task} {by} {len(runs)}/{count}", end="", file=sys.stderr)
-        cpu = time.process_time() - began - watch.cpu
-    print(file=sys.stderr)
-    solved = [run for run in runs if run.ended == SOLVED]
-    interval = binomtest(len(solved), count).proportion_ci(method="wilson")
-    actions = np.array([len(run.actions) for run in runs], dtype=float)
-    scores = np.array([run.rows[-1].score if run.rows else 0.0 for run in runs])
+        watch = Watch()
+        if by in REFINED:
+            assert search is not None
+            solved, actions, scores, cpu = refined(task, search, first, count)
+        else:
+            act = demonstrator(by) if search is None else planner(search)
+            worlds, seeds = worlds_for(task, "ur5"), range(first, first + count)
+            list(play(worlds, [WARM_UP], act=act, look=observe))
+            runs = []
+            began = time.process_time()
+            for _, run in play(worlds, seeds, act=act, look=watch.look):
+                runs.append(run)
+                print(f"\r{task} {by} {len(runs)}/{count}", end="", file=sys.stderr)
+            cpu = time.process_time() - began - watch.cpu
+            print(file=sys.stderr)
+            solved = [run.ended == SOLVED for run in runs]
+            actions = [len(run.actions) for run in runs]
+            scores = [run.rows[-1].score if run.rows else 0.0 for run in runs]
+    interval = binomtest(sum(solved), count).proportion_ci(method="wilson")
     error = 1.96 / np.sqrt(max(count - 1, 1))
     return Row(
         task=task,
         by=by,
         budget=budget,
+        depth=depth,
         first_seed=first,
         attempts=count,
-        successes=len(solved),
+        successes=sum(solved),
         interval=(float(interval.low), float(interval.high)),
-        mean_actions=float(actions.mean()),
-        actions_error=float(error * actions.std()),
-        mean_actions_solved=float(np.mean([len(run.actions) for run in solved] or [np.nan])),
-        mean_score=float(scores.mean()),
-        score_error=float(error * scores.std()),
-        cpu_s_per_attempt=cpu / len(runs),
+        mean_actions=float(np.mean(actions)),
+        actions_error=float(error * np.std(actions)),
+        mean_actions_solved=float(np.mean(np.array(actions)[solved] if any(solved) else np.nan)),
+        mean_score=float(np.mean(scores)),
+        score_error=float(error * np.std(scores)),
+        cpu_s_per_attempt=cpu / count,
         states=watch.states,
         still_moving=watch.still_moving,
         pierced=watch.shares(),
     )
 
 
-def _rows(path: Path | None) -> dict[tuple[str, str, int | None, int, int], Row]:
+def refined(
+    task: str, search: SearchConfig, first: int, count: int
+) -> tuple[list[bool], list[int], list[float], float]:
+    """Success, actions and score of refined demonstrations, and CPU s of making all of them."""
+    with tempfile.TemporaryDirectory() as folder:
+        demos, out = Path(folder, "demos"), Path(folder, "refined")
+        warm = replace(search, budget=2)
+        for n, seed, by in ((1, WARM_UP, warm), (count, first, search)):
+            began = time.process_time()
+            collect(CollectConfig(task=task, episodes=n, seed=seed, out=demos / str(n), workers=1))
+            refine(RefineConfig(source=demos / str(n), out=out / str(n), search=by, workers=1))
+            cpu = time.process_time() - began
+        infos = EpisodeReader(out / str(count)).infos()
+    return (
+        [info.success for info in infos],
+        [info.actions for info in infos],
+        [info.score for info in infos],
+        cpu,
+    )
+
+
+def _rows(path: Path | None) -> dict[tuple[str, str, int | None, int | None, int, int], Row]:
     """Rows measured before, by what `measure` is called with."""
     if path is None or not path.exists():
         return {}
     rows = [Row(**json.loads(line)) for line in path.read_text().splitlines()]
-    return {(r.task, r.by, r.budget, r.first_seed, r.attempts): r for r in rows}
+    return {(r.task, r.by, r.budget, r.depth, r.first_seed, r.attempts): r for r in rows}
 
 
 def _line(row: Row) -> str:
     low, high = row.interval
     shares = row.pierced
+    name = row.by if row.depth is None else f"{row.by}, {row.depth} ahead"
     edges = f"{100 * shares['mean']:.2f} / {100 * shares['worst']:.1f} %" if shares else "-"
     return (
-        f"| {row.task} | {row.by} | {row.successes} / {row.attempts} "
+        f"| {row.task} | {name} | {row.successes} / {row.attempts} "
         f"| {100 * low:.1f}-{100 * high:.1f} % | {row.mean_actions:.2f} ± {row.actions_error:.2f} "
         f"| {row.mean_score:.3f} ± {row.score_error:.3f} "
         f"| {row.cpu_s_per_attempt:.3f} | {edges} |"
