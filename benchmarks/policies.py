@@ -1,6 +1,6 @@
 """From nothing to a tested policy: demonstrations, training with `fast` and evaluation, timed.
 
-    python benchmarks/learning.py --agent goal-stack --json
+    python benchmarks/policies.py --agent goal-stack --json
 
 By default cable-line-notarget from 10 demonstrations. The paper's values, best of ten snapshots on
 20 test seeds and mean of three runs, are 94.7 % (Goal-Split) and 99.7 % (Goal-Stack); ours is one
