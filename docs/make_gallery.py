@@ -50,8 +50,8 @@ PICTURES = {
     "gallery_bags.png": (
         Moment("bag", "bag-alone-open", 1),
         Moment("opened", "bag-alone-open", 1, actions=8),
-        Moment("cube in the bag", "bag-items-1", 0, actions=1),
-        Moment("carried by a bead", "bag-items-1", 0, actions=1, during=0.55),
+        Moment("cube in the bag", "bag-items-1", 3, actions=1),
+        Moment("carried by a bead", "bag-items-1", 3, actions=1, during=0.55),
     ),
 }
 
