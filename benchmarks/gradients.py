@@ -1,12 +1,14 @@
 """What derivatives cost: taped forward and backward beside the plain forward, in the same run.
 
-    python benchmarks/gradients.py [--scenes cable heap cloth10 bag] [--repeats 3] [--json]
+    python benchmarks/gradients.py [--scenes cable heap cloth10 bag bag-cube block] [--json]
 
 Process CPU milliseconds per simulated second and world, 8 worlds in 8 lanes, float32, kernels
-compiled before, median over repeats; MB (10^6 bytes) of tape and checkpoints likewise. `full` keeps
-every tape, `replay` checkpoints and one tape, and its backward runs every segment again.
+compiled before, median over repeats; MB (10^6 bytes) of tape and checkpoints at their peak
+likewise. `full` keeps every tape, `replay` checkpoints and one tape, and its backward runs every
+segment again.
 The worlds start as `warp-deform bench` starts them and run without a grip: beads crumpled (cable)
-or stacked (heap), a sheet crumpled above the table, a bag dropped.
+or stacked (heap), a sheet crumpled above the table, a bag dropped, alone or with the two boxes of
+bag-items-2 in it (bag-cube), the L-block dropped while it slides and turns.
 """
 
 from __future__ import annotations
@@ -23,14 +25,18 @@ import numpy as np
 from warp_deform.differentiable import DifferentiableRollout
 from warp_deform.objects import (
     BagConfig,
+    BoxConfig,
+    BoxPart,
     CableConfig,
     ClothConfig,
     add_bag,
+    add_box,
     add_cable,
     add_cloth,
     bag_shell,
     cable_line,
     cloth_sheet,
+    l_block,
 )
 from warp_deform.quiet import quiet_warp
 from warp_deform.rollout import rollout
@@ -40,17 +46,22 @@ from warp_deform.tasks.cloth_physics import CLOTH_SOLVER
 
 LANES = 8
 CABLE, CLOTH, BAG = CableConfig(), ClothConfig(), BagConfig()
+BOX = BoxConfig(parts=(BoxPart((0.035, 0.035, 0.03)),), mass=0.1, friction=1.5)
+BLOCK = l_block()
 MEMORY = 2**31
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Objects, physics, simulated time [s], and where the particles start, drawn."""
+    """Objects, physics, simulated time [s], and where particles (P, 3) and the frames (B, 7) and
+    twists (B, 6) of bodies start, drawn.
+    """
 
     add: Callable[[newton.ModelBuilder], object]
     solver: SolverConfig
     seconds: float
     start: Callable[[np.random.Generator], np.ndarray]
+    bodies: Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]] | None = None
 
 
 @dataclass(frozen=True)
@@ -88,6 +99,29 @@ def _bag(rng: np.random.Generator) -> np.ndarray:
     return lifted + rng.normal(0, 1e-4, vertices.shape)
 
 
+def _no_particles(_rng: np.random.Generator) -> np.ndarray:
+    return np.zeros((0, 3))
+
+
+def _boxes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """One above the other, in the bag and about to land on its bottom."""
+    poses = np.tile([0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (2, 1))
+    poses[:, :2] += rng.normal(0, 2e-3, (2, 2))
+    poses[:, 2] = 0.03 + 0.03 + np.array([0.0, 0.035])
+    return poses, np.zeros((2, 6))
+
+
+def _sliding(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    poses = np.array([[0.5, 0.0, 0.005 - BLOCK.lowest, 0.0, 0.0, 0.0, 1.0]])
+    return poses, rng.normal(0, 1, (1, 6)) * [0.3, 0.3, 0.0, 0.5, 0.5, 3.0]
+
+
+def _add_bag_and_boxes(builder: newton.ModelBuilder) -> None:
+    add_bag(builder, BAG)
+    for _ in range(2):
+        add_box(builder, BOX, (0.5, 0.4, -BOX.lowest))
+
+
 SCENES = {
     "cable": Scene(
         lambda b: add_cable(b, CABLE, cable_line(CABLE, (0.4, 0.0), (0.6, 0.0))),
@@ -101,6 +135,11 @@ SCENES = {
         lambda b: add_cloth(b, CLOTH, cloth_sheet(CLOTH, (0.5, 0.0))), CLOTH_SOLVER, 0.5, _sheet
     ),
     "bag": Scene(lambda b: add_bag(b, BAG), BAG_SOLVER, 0.25, _bag),
+    "bag-cube": Scene(_add_bag_and_boxes, BAG_SOLVER, 0.25, _bag, _boxes),
+    "block": Scene(
+        lambda b: add_box(b, BLOCK, (0.5, 0.0, -BLOCK.lowest)),
+        SolverConfig(table_friction=1.0, contact_friction=1.0), 1.0, _no_particles, _sliding,
+    ),
 }  # fmt: skip
 
 
@@ -123,7 +162,7 @@ def measure(name: str, repeats: int) -> list[Cost]:
             begin = time.process_time()
             ends = run.forward(worlds, [scene.seconds])
             middle = time.process_time()
-            run.backward(np.ones_like(ends))
+            run.backward(np.ones_like(ends), bodies=np.ones_like(run.body_poses))
             taped[storage].append(middle - begin)
             swept[storage].append(time.process_time() - middle)
     per = scene.seconds * LANES
@@ -159,8 +198,11 @@ def _start(solver: SolverFusedXPBD, scene: Scene, repeat: int) -> None:
     solver.data.reset()
     for world in range(LANES):
         rng = np.random.default_rng([repeat, world])
-        solver.data.lane("particles.x", world)[:] = scene.start(rng)
-        solver.data.lane("particles.v", world)[:] = 0.0
+        if solver.data.has_particles:
+            solver.data.lane("particles.x", world)[:] = scene.start(rng)
+            solver.data.lane("particles.v", world)[:] = 0.0
+        if scene.bodies is not None:
+            solver.data.set_bodies(world, *scene.bodies(rng))
 
 
 def main() -> None:

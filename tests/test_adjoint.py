@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cloth_scenes import two_sheets_and_a_cable
-from solver_scenes import LOOSE, G, add_particles, finalize, ideal, new_builder
+from solver_scenes import LOOSE, G, add_particles, box_solver, finalize, ideal, new_builder
 
 from warp_deform.differentiable import DifferentiableRollout, Gradients, substep_vjp
 from warp_deform.errors import InputError
-from warp_deform.objects import CableConfig, add_cable, cable_line
+from warp_deform.objects import BoxConfig, CableConfig, add_box, add_cable, cable_line
 from warp_deform.objects.push import Push
 from warp_deform.rollout import GripPath, rollout
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
@@ -335,6 +335,44 @@ def test_bits_depend_neither_on_storage_nor_on_lanes(precision: str) -> None:
     DifferentiableRollout(together).forward([2, 4], [0.1])
     for slot in (2, 4):
         assert np.array_equal(state(plain, slot), state(together, slot))
+
+
+def test_states_at_the_times_that_were_asked_for() -> None:
+    builder, box = new_builder(), BoxConfig(mass=0.05)
+    add_cable(builder, SHORT, cable_line(SHORT, (0.4, 0.0), (0.6, 0.0)))
+    add_box(builder, box, (0.5, 0.2, 0.03))
+    solver = SolverFusedXPBD(builder.finalize(device="cpu"), SolverConfig(limits=LOOSE), lanes=1)
+    run = DifferentiableRollout(solver)
+    start = [solver.particle_q(0)[None], solver.particle_qd(0)[None]]
+    bodies = [b[None] for b in solver.data.body_poses(0)]
+    x = run.forward([0], [0.05, 0.1])
+    for values, now in ((x, solver.particle_q(0)), (run.velocities, solver.particle_qd(0)),
+                        (run.body_poses, solver.body_q(0)),
+                        (run.body_velocities, solver.body_qd(0))):  # fmt: skip
+        assert values.shape == (1, 2, *now.shape)
+        assert np.array_equal(values[0, 1], now)
+    early, poses, twists = run.velocities[0, 0], run.body_poses[0, 0], run.body_velocities[0, 0]
+    run.forward(
+        [0], [0.05], positions=start[0], velocities=start[1], body_poses=bodies[0],
+        body_velocities=bodies[1],
+    )  # fmt: skip
+    assert np.array_equal(solver.particle_qd(0), early)
+    assert np.array_equal(solver.body_q(0), poses) and np.array_equal(solver.body_qd(0), twists)
+
+
+def test_what_sleeps_on_passes_its_pose_through() -> None:
+    solver = box_solver((BoxConfig(mass=0.05), (0, 0, 0.02)), config=SolverConfig(limits=LOOSE))
+    rollout(solver, [0], least=0.5, most=0.5)
+    run = DifferentiableRollout(solver)
+    run.forward([0], [0.1])
+    slope = np.array([[[[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0]]]])
+    asleep = run.backward(bodies=slope)
+    assert asleep.counts() == {"body_sleep": 120}
+    assert np.array_equal(asleep.body_poses, slope[:, 0])
+    assert not asleep.body_velocities.any()
+    # its last velocity is that of the contacts that its sleep undid: these count
+    awake = run.backward(bodies=slope, body_velocities=np.ones((1, 1, 1, 6)))
+    assert awake.counts().get("body_table", 0) > 0
 
 
 def test_memory_is_bounded() -> None:

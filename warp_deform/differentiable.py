@@ -83,7 +83,9 @@ class DifferentiableRollout:
         self.recorder = Recorder(solver, storage=storage, memory=memory, sleep=sleep)
         self.watch: list[WatchValues] = []
         self._worlds: list[int] = []
+        self.velocities = np.zeros((0, 0, 0, 3))
         self.body_poses = np.zeros((0, 0, 0, 7))
+        self.body_velocities = np.zeros((0, 0, 0, 6))
 
     def forward(
         self,
@@ -103,8 +105,9 @@ class DifferentiableRollout:
     ) -> np.ndarray:
         """Positions (W, T, P, 3) [m] at `times` [s] from the start, ascending.
 
-        Poses of the bodies' frames at these times are then in `body_poses` (W, T, B, 7), position
-        and quat_xyzw.
+        At these times `velocities` (W, T, P, 3) [m/s] are then those of the particles, `body_poses`
+        (W, T, B, 7) the poses of the bodies' frames, position and quat_xyzw, and `body_velocities`
+        (W, T, B, 6) their twists.
 
         positions (W, P, 3) [m], velocities (W, P, 3) [m/s]: the start; None: as the worlds are
         body_poses (W, B, 7), body_velocities (W, B, 6: linear at the centre of mass, angular):
@@ -136,21 +139,35 @@ class DifferentiableRollout:
                     w, poses if body_poses is None else np.asarray(body_poses)[k],
                     twists if body_velocities is None else np.asarray(body_velocities)[k],
                 )  # fmt: skip
-        self._turns = [data.views["bodies.q"][data.body_rows(w)].copy() for w in self._worlds]
+        turns = data.arrays["bodies.q"].view
+        self._turns = [turns[data.body_rows(w)].copy() for w in self._worlds]
         end = marks[-1] * dt if marks else 0.0
         prepare(
             self.solver, self._worlds, paths=paths, pushes=pushes, most=2 * end,
             least=0.0 if until_rest else 2 * end, calm=calm, calm_after=calm_after,
         )  # fmt: skip
+        knot, end_knot = (data.arrays[f"grips.{n}"].view for n in ("knot", "knot_end"))
         self._knots = {
-            w: slice(int(data.views["grips.knot"][s]), int(data.views["grips.knot_end"][s]))
+            w: slice(int(knot[s]), int(end_knot[s]))
             for w, s in ((w, data.slot[w]) for w in self._worlds)
             if w in (paths or {})
         }
+        self._flips = {w: self._flipped(paths[w], rows) for w, rows in self._knots.items() if paths}
         self.watch = self.recorder.forward(marks)
         self.body_poses = np.stack([self._poses(m) for m in marks], axis=1)
-        states = [self._worldwise(self.recorder.states[m]["particles.x"]) for m in marks]
-        return np.stack(states, axis=1)
+        self.body_velocities = np.stack([self._twists(m) for m in marks], axis=1)
+        at, speed = (
+            np.stack([self._worldwise(self.recorder.states[m][name]) for m in marks], axis=1)
+            for name in ("particles.x", "particles.v")
+        )
+        self.velocities = speed
+        return at
+
+    def _flipped(self, path: GripPath, rows: slice) -> np.ndarray:
+        """-1 for knots (K, 1) whose quaternion was flipped to interpolate the short way round."""
+        used = self.solver.data.arrays["grips.rotation"].view[rows]
+        given = used if path.rotations is None else np.asarray(path.rotations)
+        return np.where((used * given).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
 
     def _set(self, name: str, values: np.ndarray) -> None:
         data = self.solver.data
@@ -198,19 +215,14 @@ class DifferentiableRollout:
             velocities=self._worldwise(out["v"]),
             inverse_masses=self._worldwise(out["mass"]),
             **{name: self._of_groups(out[name]) for name in WORLD_PARAMETERS},
-            body_poses=np.stack(
-                [
-                    self._by_frame(w, turn, out["body.x"], out["body.q"])
-                    for w, turn in zip(self._worlds, self._turns, strict=True)
-                ]
-            ),
+            body_poses=self._by_frames(out["body.x"], out["body.q"]),
             body_velocities=np.concatenate(
                 [self._of_bodies(out["body.v"]), self._of_bodies(out["body.omega"])], axis=-1
             ),
             body_inverse_masses=self._of_bodies(out["body.w"]),
             way_points=knots["position"],
             knot_times=knots["time"],
-            knot_rotations=knots["rotation"],
+            knot_rotations={w: g * self._flips[w] for w, g in knots["rotation"].items()},
             fired=self._of_groups(out["fired"]),
         )
 
@@ -218,8 +230,17 @@ class DifferentiableRollout:
         """Poses (W, B, 7) of the bodies' frames at a mark."""
         data, state = self.solver.data, self.recorder.states[mark]
         x, q = self._of_bodies(state["bodies.x"]), self._of_bodies(state["bodies.q"])
+        if x.shape[1] == 0:
+            return np.concatenate([x, q], axis=-1)
         com = data.topologies[data.world_topology[self._worlds[0]]].body_com
         return np.stack([data.frame_poses(xw, qw, com) for xw, qw in zip(x, q, strict=True)])
+
+    def _twists(self, mark: int) -> np.ndarray:
+        """Twists (W, B, 6) of the bodies at a mark."""
+        state = self.recorder.states[mark]
+        return np.concatenate(
+            [self._of_bodies(state["bodies.v"]), self._of_bodies(state["bodies.omega"])], axis=-1
+        )
 
     def _of_bodies(self, rows: np.ndarray) -> np.ndarray:
         """An array by row of bodies -> (W, B, ...)."""
@@ -236,12 +257,14 @@ class DifferentiableRollout:
         """Add derivatives by poses of frames and twists as those by centres of mass."""
         data, state = self.solver.data, self.recorder.states[mark]
         com = data.topologies[data.world_topology[self._worlds[0]]].body_com
+        if not len(com):
+            return
         for names, given in ((("x", "q"), bodies), (("v", "omega"), twists)):
             if given is None:
                 continue
             for name in names:
                 key = f"bodies.{name}"
-                cotangent[key] = np.zeros_like(data.views[key])
+                cotangent[key] = np.zeros_like(data.arrays[key].view)
             for k, w in enumerate(self._worlds):
                 rows, g = data.body_rows(w), np.asarray(given, dtype=float)[k, t]
                 cotangent[f"bodies.{names[0]}"][rows] = g[:, :3]
@@ -251,13 +274,15 @@ class DifferentiableRollout:
                     rest = _on_sphere(turn, rest - _turned_by(com, turn, g[:, :3]))
                 cotangent[f"bodies.{names[1]}"][rows] = rest
 
-    def _by_frame(self, world: int, turn: np.ndarray, x: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Derivatives (B, 7) by the frames of one world's bodies at the start."""
+    def _by_frames(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Derivatives (W, B, 7) by the frames of the bodies at the start."""
         data = self.solver.data
-        rows = data.body_rows(world)
-        com = data.topologies[data.world_topology[world]].body_com
-        by_turn = _on_sphere(turn, q[rows] + _turned_by(com, turn, x[rows]))
-        return np.concatenate([x[rows], by_turn], axis=-1)
+        com = data.topologies[data.world_topology[self._worlds[0]]].body_com
+        by_x, by_q = self._of_bodies(x), self._of_bodies(q)
+        if by_x.shape[1]:
+            turned = zip(self._turns, by_x, by_q, strict=True)
+            by_q = np.stack([_on_sphere(t, gq + _turned_by(com, t, gx)) for t, gx, gq in turned])
+        return np.concatenate([by_x, by_q], axis=-1)
 
     def _worldwise(self, lanes: np.ndarray) -> np.ndarray:
         """An array of particles in lanes (P..., 3, L) or (P..., L) -> (W, P, 3) or (W, P)."""
@@ -270,7 +295,7 @@ class DifferentiableRollout:
 
     def _lanewise(self, name: str, values: np.ndarray) -> np.ndarray:
         data = self.solver.data
-        out = np.zeros_like(data.views[name])
+        out = np.zeros_like(data.arrays[name].view)
         for k, w in enumerate(self._worlds):
             group, lane = divmod(int(data.slot[w]), data.lanes)
             first, last = data.group_particle[group : group + 2]

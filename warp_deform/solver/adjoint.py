@@ -64,7 +64,14 @@ def adjoint_kernel(
     sweep_predict_body = rigid_.sweep_predict_body
     solid_ = body_adjoint(scalar, lanes, with_sheets)
     sweep_body_pairs, sweep_body_contacts = solid_.sweep_body_pairs, solid_.sweep_body_contacts
-    R3, Shapes, Bodies, Contacts, BodyAdjoint = t.R3, t.Shapes, t.Bodies, t.Contacts, t.BodyAdjoint
+    R3, Q, Shapes, Bodies, Contacts, BodyAdjoint = (
+        t.R3,
+        t.Q,
+        t.Shapes,
+        t.Bodies,
+        t.Contacts,
+        t.BodyAdjoint,
+    )
     Settings, Topology, Springs, Pairs = t.Settings, t.Topology, t.Springs, t.Pairs
     Group, Grips, Tape, Adjoint = t.Group, t.Grips, t.Tape, t.Adjoint
     Particles, Sheets = t.Particles, t.Sheets
@@ -75,6 +82,11 @@ def adjoint_kernel(
     @wp.func
     def count(kind: int, on: V, amount: int, adj: Adjoint):
         adj.fired[kind] = adj.fired[kind] + on * S(amount)
+
+    @wp.func
+    def nonzero(x: R3, q: Q):
+        far = wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
+        return far + wp.abs(q[0]) + wp.abs(q[1]) + wp.abs(q[2]) + wp.abs(q[3]) > S(0.0)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=dict(KERNEL_OPTIONS))
     def sweep(
@@ -117,6 +129,12 @@ def adjoint_kernel(
                 stretches += 1
             if springs.limit[s] > S(0.0):
                 damped += 1
+        longest_push = int(0)
+        for p in range(wp.static(L * MOST_PUSHES)):
+            if grips.push[w0 * wp.static(MOST_PUSHES) + p] >= 0:
+                longest_push = wp.max(
+                    longest_push, grips.push_steps[w0 * wp.static(MOST_PUSHES) + p]
+                )
         tops = tape.top[g]
         tx = int(tops[0])
         tv = int(tops[1])
@@ -131,15 +149,15 @@ def adjoint_kernel(
         last = int(tx)
         for back in range(tape.steps[g]):
             substep = tape.until[g] - 1 - back
-            # two substeps ahead, as long as the last one
-            used = last - tx
-            fetch_ahead(tape.x, tx - 3 * used, used * wp.static(BYTES))
+            # what the sweep will pop two substeps on, were they as long as the last one
+            ahead = 2 * (last - tx)
             last = int(tx)
             tv -= 4
             on = tape.v[tv]
             fastest = tape.v[tv + 1]
             count(counts + wp.static(int(Kind.STRETCH)), on, stretches, adj)
             count(counts + wp.static(int(Kind.BEND)), on, bends, adj)
+            matters = zero
             if wp.static(with_bodies):
                 for r in range(wp.static(L)):
                     lane = wp.static(L) - 1 - r
@@ -152,6 +170,8 @@ def adjoint_kernel(
                             sweep_finish_body(
                                 b, lane, tape.k[tk], dt, fastest[lane], counts, bodies, ba, adj
                             )  # fmt: skip
+                            if tape.k[tk] == 0 or nonzero(ba.x[b], ba.q[b]):
+                                matters[lane] = S(1.0)
             # velocities, table
             if wp.static(with_sheets):
                 if st.viscous > S(0.0):
@@ -173,11 +193,13 @@ def adjoint_kernel(
                 z = zero
                 sleep = zero
                 if wp.static(with_sheets):
+                    fetch_ahead(tape.x, tx + 3 * i - ahead, wp.static(3 * BYTES))
                     x = tape.x[tx + 3 * i]
                     d = x - tape.x[tx + 3 * i + 1]
                     z = x.z
                     sleep = tape.v[tv + 3]
                 else:
+                    fetch_ahead(tape.x, tx + i - ahead, wp.static(BYTES))
                     d = tape.x[tx + i]
                     z = tape.v[tv + i]
                 by_mu, by_share = sweep_finish(
@@ -194,16 +216,19 @@ def adjoint_kernel(
                     lane = wp.static(L) - 1 - r
                     if on[lane] > S(0.0):
                         ts -= 7 * body_count
-                        by_floor, by_mu_pairs = sweep_body_pairs(
-                            g, lane, k, ts, push, counts, top, shapes, group, bodies, contacts,
-                            tape, ba, adj,
-                        )  # fmt: skip
+                        # where all bodies sleep on, nothing depends on what contacts would do
+                        if matters[lane] > S(0.0):
+                            by_floor, by_pairs = sweep_body_pairs(
+                                g, lane, k, ts, push, counts, top, shapes, group, bodies, contacts,
+                                tape, ba, adj,
+                            )  # fmt: skip
+                            by_table[lane] = by_table[lane] + by_floor
+                            by_contact[lane] = by_contact[lane] + by_pairs
                         tk, ts, by_mu_solid = sweep_body_contacts(
                             g, lane, k, tk, ts, finished, push, counts, top, shapes, group, bodies,
                             sheets, tape, ba, adj,
                         )  # fmt: skip
-                        by_table[lane] = by_table[lane] + by_floor
-                        by_contact[lane] = by_contact[lane] + by_mu_pairs + by_mu_solid
+                        by_contact[lane] = by_contact[lane] + by_mu_solid
             # contacts of fabrics
             if wp.static(with_sheets):
                 if sheets.first[k + 1] > sheets.first[k]:
@@ -232,6 +257,7 @@ def adjoint_kernel(
                 tk -= 1
                 tv -= 1
                 tx -= 2
+                fetch_ahead(tape.x, tx - ahead, wp.static(2 * BYTES))
                 by_contact = by_contact + sweep_contact(
                     tape.k[tk], p0, tape.x[tx], tape.x[tx + 1], tape.v[tv], contact_mu, push,
                     pairs, counts, on, adj,
@@ -277,6 +303,7 @@ def adjoint_kernel(
                             left -= 1
                     if acted:
                         tx -= 1
+                        fetch_ahead(tape.x, tx - ahead, wp.static(BYTES))
                         by_inverse_dt2 = by_inverse_dt2 + sweep_distance(
                             s, p0, tape.x[tx], inverse_dt2, springs, counts, on, adj
                         )
@@ -286,7 +313,7 @@ def adjoint_kernel(
                 tk -= wp.static(GRIP_WORDS)
                 sweep_grip(tk, w0, p0, b0, body_count, dt, counts, grips, tape, adj, ba)
             # pushes
-            for k_push in range(wp.static(L * MOST_PUSHES)):
+            for k_push in range(wp.where(substep < longest_push, wp.static(L * MOST_PUSHES), 0)):
                 lane = k_push // wp.static(MOST_PUSHES)
                 at_push = w0 * wp.static(MOST_PUSHES) + k_push
                 i = grips.push[at_push]

@@ -171,14 +171,14 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
         b = gj * wj - gi * wi
         di = dot(d, gi)
         dj = dot(d, gj)
-        gs = (dj * wj - di * wi) * acts
+        gs = dj * wj - di * wi
         # at length 0 the spring has no direction, and none to turn to
         along = inverse * below
-        gl = gs * target * less(tiny, l) * inverse * along * along
-        gd = b * s + d * gl
+        by_length = target * (less(tiny, l) * acts) * inverse * (along * along)
+        gd = b * s + d * (gs * by_length)
         adj.x[i] = gi + gd
         adj.x[j] = gj - gd
-        gw = zero - gs * s * inverse * safe
+        gw = gs * (zero - acts * s * inverse * safe)
         adj.mass[i] = adj.mass[i] + select(wi, gw - s * di, zero)
         adj.mass[j] = adj.mass[j] + select(wj, gw + s * dj, zero)
         return gw * soft

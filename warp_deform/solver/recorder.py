@@ -16,17 +16,8 @@ from .checkpoint import Checkpoints
 from .data import KERNEL_ARGUMENTS
 from .forward import forward_kernel
 from .mirrored import Mirrored
-from .tape import (
-    BODY_SCALARS,
-    BODY_WORDS,
-    BOX_TRIANGLE_SCALARS,
-    COUNTERS,
-    GRIP_WORDS,
-    STATE,
-    TRIANGLE_SCALARS,
-    TRIANGLE_WORDS,
-    Kind,
-)
+from .tape import COUNTERS, STATE, Kind
+from .tape_room import Stacks, TapeRoom, new_stacks
 
 if TYPE_CHECKING:
     from .guards import WatchValues
@@ -35,22 +26,11 @@ if TYPE_CHECKING:
 __all__ = ["Recorder"]
 
 _NEAR = 4 * 2**20  # bytes of a tape that is replayed, where memory allows
-_MOST = 2**31 - 1  # elements of one stack: whole numbers of 32 bits count them
-_ORDER = KERNEL_ARGUMENTS
 _SWEPT = ("topology", "springs", "pairs", "shapes", "group", "particles", "bodies", "contacts",
           "grips", "sheets")  # fmt: skip
 _BODY = ("x", "q", "v", "omega")
+_READ = ("particles.x", "particles.v", *(f"bodies.{n}" for n in _BODY))
 _ADJOINT_OF = {"particles.x": "x", "particles.v": "v"} | {f"bodies.{n}": f"body.{n}" for n in _BODY}
-
-
-@dataclass(frozen=True, eq=False)
-class _Tape:
-    """Stacks of one segment of the rollout: room (groups, 4) elements of x, v, k and s."""
-
-    struct: Any
-    room: np.ndarray
-    arrays: dict[str, Any]
-    nbytes: int
 
 
 @dataclass(eq=False)
@@ -59,8 +39,8 @@ class _Segment:
 
     begin: int
     end: int
-    checkpoint: dict[str, Any] | None
-    tape: _Tape
+    checkpoint: dict[str, Any]
+    tape: Stacks
 
 
 class Recorder:
@@ -76,6 +56,9 @@ class Recorder:
 
     Branches (contact or not, side, clamp, stick, release, rest) are those of the forward pass, as
     functions of the state there: the derivative is that of the smooth piece the rollout ran on.
+
+    Sweeping needs nothing of the solver's present state and leaves it as it is: worlds may be
+    changed, and other rollouts run, between `forward` and `backward`.
     """
 
     def __init__(
@@ -93,29 +76,57 @@ class Recorder:
         variant = (
             data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets, data.has_edges
         )  # fmt: skip
-        self._forward = forward_kernel(*variant, taped=True)
-        self._sweep = adjoint_kernel(*variant)
+        self._kernels = forward_kernel(*variant, taped=True), adjoint_kernel(*variant)
+        self._settings = self._new_settings()
         self._segments: list[_Segment] = []
         self._final: dict[str, Any] = {}
+        self._inputs: dict[str, Any] = {}
         self._control = {
             "state": self._mirrored(data.group_count * STATE, data.types.V, (data.lanes,)),
             "counters": Mirrored(data.group_count * COUNTERS, wp.int32, data.device, np.int32, ()),
         }
-        self._checkpoints = Checkpoints(data, self._control)
-        self._adjoint = self._new_adjoint()
         contacts = len(data.arrays["contacts.mu"].view)
         self._notes = {
             "code": wp.zeros(contacts, dtype=wp.vec4i, device=data.device),
             "log": wp.zeros(contacts * PASSES * VISIT, dtype=data.scalar, device=data.device),
         }
-        self._tape: _Tape | None = None
-        self._spent: list[_Tape] = []
-        self._use: np.ndarray | None = None
-        self._spare = 2.0 * self._least_room() + self._solid_room()
+        self._room = TapeRoom(data, self._control)
+        self._tape: Stacks | None = None
+        self._spent: list[Stacks] = []
+        self._bound: list[Mirrored] = []
+        self._bind()
         self.nbytes = 0
         """Bytes of the tapes and checkpoints of the last rollout."""
 
     # -- arrays
+
+    def _bind(self) -> None:
+        """Aim the launches at the solver's arrays, some of which a longer path replaces."""
+        data = self.solver.data
+        bound = list(data.arrays.values())
+        if bound == self._bound:
+            return
+        self._bound = bound
+        self._checkpoints = Checkpoints(data, self._control)
+        self._adjoint = self._new_adjoint()
+        self._forward = self._recorded(
+            self._kernels[0], [self._settings, *data.structs()[:-1], data.types.Tape()]
+        )
+        self._by_state, by_bodies = self._adjoint_structs()
+        swept = [data.struct(name) for name in _SWEPT]
+        for name, array in self._notes.items():
+            setattr(swept[_SWEPT.index("contacts")], name, array)
+        self._sweep = self._recorded(
+            self._kernels[1],
+            [self._settings, *swept, data.types.Tape(), self._by_state, by_bodies],
+        )
+
+    def _recorded(self, kernel: Any, inputs: list[Any]) -> Any:
+        """A launch that is cheap to repeat."""
+        return wp.launch(
+            kernel, dim=self.solver.data.group_count, inputs=inputs,
+            device=self.solver.model.device, record_cmd=True,
+        )  # fmt: skip
 
     def _mirrored(self, count: int, dtype: Any, shape: tuple[int, ...]) -> Mirrored:
         data = self.solver.data
@@ -147,60 +158,6 @@ class Recorder:
         arrays["body.mu"] = self._mirrored(contacts, t.S, ())
         return arrays
 
-    def _new_tape(self, room: np.ndarray) -> _Tape:
-        """Stacks with room (groups, 4) for so many elements."""
-        data = self.solver.data
-        t, device = data.types, data.device
-        struct = t.Tape()
-        end = np.cumsum(room, axis=0)
-        arrays: dict[str, Any] = {}
-        for column, (name, dtype) in enumerate(
-            (("x", t.V3), ("v", t.V), ("k", wp.int32), ("s", t.S))
-        ):
-            arrays[name] = wp.empty(max(int(end[-1, column]), 1), dtype=dtype, device=device)
-        arrays["first"] = wp.array((end - room).astype(np.int32), dtype=wp.vec4i, device=device)
-        arrays["end"] = wp.array(end.astype(np.int32), dtype=wp.vec4i, device=device)
-        arrays["top"] = wp.zeros(data.group_count, dtype=wp.vec4i, device=device)
-        for name in ("steps", "until", "full"):
-            arrays[name] = wp.zeros(data.group_count, dtype=wp.int32, device=device)
-        for name, mirrored in self._control.items():
-            arrays[name] = mirrored.array
-        flat = wp.array(
-            ptr=arrays["x"].ptr, dtype=data.scalar,
-            shape=(arrays["x"].capacity // np.dtype(data.number).itemsize,), device=device,
-        )  # fmt: skip
-        for name, array in (*arrays.items(), ("x_flat", flat)):
-            setattr(struct, name, array)
-        return _Tape(struct, room, arrays, int((room @ self._sizes()).sum()))
-
-    def _sizes(self) -> np.ndarray:
-        """Bytes of an element of each stack."""
-        data = self.solver.data
-        scalar = np.dtype(data.number).itemsize
-        return np.array([3 * data.lanes * scalar, data.lanes * scalar, 4, scalar])
-
-    def _least_room(self) -> np.ndarray:
-        """Room (groups, 4) that any substep needs; contacts come on top."""
-        data, rows = self.solver.data, []
-        for k in data.group_topology:
-            top = data.topologies[k]
-            springs, particles = len(top.spring_ij), top.particle_count
-            words = springs + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
-            bodies = top.body_count * data.lanes
-            words += BODY_WORDS * bodies
-            rows.append((2 * springs + 4 * particles, particles + 8, words, BODY_SCALARS * bodies))
-        return np.array(rows)
-
-    def _solid_room(self) -> np.ndarray:
-        """Room (groups, 4) that contacts of boxes with particles and triangles may need."""
-        data, rows = self.solver.data, []
-        for k in data.group_topology:
-            top = data.topologies[k]
-            solid = len(top.shape_body) * (top.particle_count + len(top.sheet_triangle))
-            solid *= data.lanes
-            rows.append((0, 0, BODY_WORDS * solid, BOX_TRIANGLE_SCALARS * solid))
-        return np.array(rows)
-
     # -- running
 
     def forward(self, marks: Sequence[int]) -> list[WatchValues]:
@@ -220,9 +177,9 @@ class Recorder:
             data.arrays[f"watch.{name}"].view[...] = 0
         for mirrored in data.arrays.values():
             mirrored.to_device()
-        self._structs = data.structs()[:-1]
-        if len(self._adjoint["time"].view) != max(data.knot_room, 1):
-            self._adjoint = self._new_adjoint()
+        self._bind()
+        self._settings = self._new_settings()
+        self._inputs = self._checkpoints.save_inputs()
         # tapes of the last rollout are used again: fresh memory is dear
         self._spent = [segment.tape for segment in self._segments]
         self._segments, self.states = [], {}
@@ -244,16 +201,14 @@ class Recorder:
         while True:
             tape = self._tape_for(end - begin)
             self._launch(tape, begin, end, end == last)
-            full = tape.arrays["full"].numpy() > 0
+            full = tape.full()
             if not full.any():
                 break
             steps = int(tape.arrays["steps"].numpy()[full].min())
-            self._spare = np.maximum(self._spare, self._worst())
+            self._room.grow(double=steps == 0 and end == begin + 1)
             self._checkpoints.restore(checkpoint)
-            if steps == 0 and end == begin + 1:
-                self._spare = 2 * self._spare
             end = begin + max(steps, 1)
-        self._learn(tape, end - begin)
+        self._room.learn(tape, end - begin)
         self._kept += _nbytes(checkpoint) + (tape.nbytes if self.storage == "full" else 0)
         self._segments.append(_Segment(begin, end, checkpoint, tape))
         self._on_tape = len(self._segments) - 1
@@ -261,13 +216,13 @@ class Recorder:
 
     def _length(self, last: int) -> int:
         """Substeps of the next segment: few until it is known how much a substep needs."""
-        if self._use is None:
+        if self._room.use is None:
             return 16
         if self.storage == "full":
             return last
         if not self._segments:
             return 16
-        per_substep = float((self._use * self._sizes()).sum())
+        per_substep = self._room.per_substep()
         least = round(np.sqrt(last * self._kept / len(self._segments) / per_substep))
         # every segment costs a launch and a checkpoint: a tape that the processor's cache holds is
         # no dearer when it is long
@@ -275,15 +230,13 @@ class Recorder:
             8, min(max(least, round(_NEAR / per_substep)), round(self.memory / 4 / per_substep))
         )
 
-    def _tape_for(self, length: int) -> _Tape:
-        """A tape with room for `length` substeps: the one in use where it suffices.
+    def _tape_for(self, length: int) -> Stacks:
+        """A tape with room for `length` substeps: one that is in use already where it suffices.
 
         Raises:
             InputError: it would need more memory than allowed.
         """
-        use = self._least_room() if self._use is None else 1.1 * self._use
-        room = np.ceil(use * length + self._spare).astype(int)
-        largest = int((room.sum(axis=0) * (self._sizes() > 0)).max())
+        room = self._room.room(length)
         replay = self.storage == "replay"
         for spent in () if replay else self._spent:
             if (spent.room >= room).all() and (spent.room <= 4 * room + 64).all():
@@ -293,66 +246,30 @@ class Recorder:
             room = np.maximum(room, self._tape.room)
             if (room == self._tape.room).all():
                 return self._tape
-        self.nbytes = self._kept + int((room * self._sizes()).sum())
-        if self.nbytes > self.memory or largest > _MOST:
-            raise InputError(
-                f"the tape would need {self.nbytes} bytes of {self.memory}: allow more memory, use "
-                'storage="replay", or record fewer worlds at once'
-            )
-        tape = self._new_tape(room)
+        self.nbytes = self._room.check(room, self._kept, self.memory)
+        tape = new_stacks(self.solver.data, self._control, room)
         if replay:
             self._tape = tape
         return tape
 
-    def _learn(self, tape: _Tape, steps: int) -> None:
-        """How much of the tape a substep takes."""
-        used = (tape.arrays["top"].numpy() - tape.arrays["first"].numpy()) / steps
-        self._use = used if self._use is None else np.maximum(self._use, used)
-        self._spare = np.maximum(self._spare, self._worst())
-
-    def _worst(self) -> np.ndarray:
-        """How much of the tape (groups, 4) a substep takes at worst with the lists as they are."""
-        data = self.solver.data
-        counters = self._control["counters"]
-        counters.to_host()
-        near = counters.view.reshape(-1, COUNTERS)[: data.group_count, 1]
-        listed = np.zeros(data.group_count)
-        if data.has_sheets:
-            for name in ("cells.count", "cells.edge_count"):
-                data.arrays[name].to_host()
-                counts = data.arrays[name].view[: data.group_count * data.lanes]
-                if len(counts) == data.group_count * data.lanes:
-                    listed += counts.reshape(-1, data.lanes).sum(axis=1)
-        return (
-            self._least_room()
-            + self._solid_room()
-            + 1.5
-            * np.stack(
-                [2 * near, near, near + TRIANGLE_WORDS * listed, TRIANGLE_SCALARS * listed], axis=1
-            )
-        )
-
-    def _launch(self, tape: _Tape, begin: int, end: int, last: bool) -> None:
+    def _launch(self, tape: Stacks, begin: int, end: int, last: bool) -> None:
         tape.struct.resume, tape.struct.last = int(begin > 0), int(last)
-        wp.launch(
-            self._forward, dim=self.solver.data.group_count,
-            inputs=[self._settings(end), *self._structs, tape.struct],
-            device=self.solver.model.device,
-        )  # fmt: skip
+        self._settings.max_steps = end
+        self._forward.set_param_at_index(0, self._settings)
+        self._forward.set_param_at_index(len(KERNEL_ARGUMENTS), tape.struct)
+        self._forward.launch()
 
-    def _settings(self, steps: int) -> Any:
-        settings = self.solver._settings(steps, 0)
+    def _new_settings(self) -> Any:
+        settings = self.solver._settings(0, 0)
         if not self.sleep:
             settings.dry = settings.sleep = 0.0
         return settings
 
     def _read(self) -> dict[str, np.ndarray]:
-        data = self.solver.data
-        names = [f"particles.{n}" for n in ("x", "v")]
-        names += [f"bodies.{n}" for n in ("x", "q", "v", "omega")]
-        for name in names:
-            data.arrays[name].to_host()
-        return {name: data.arrays[name].view.copy() for name in names}
+        arrays = self.solver.data.arrays
+        for name in _READ:
+            arrays[name].to_host()
+        return {name: arrays[name].view.copy() for name in _READ}
 
     # -- sweeping
 
@@ -371,50 +288,56 @@ class Recorder:
         unknown = set(cotangents) - set(self._marks)
         if unknown:
             raise InputError(f"no marks {sorted(unknown)}: the rollout was marked at {self._marks}")
-        data, adjoint = self.solver.data, self._adjoint
+        checkpoints = self._checkpoints
+        now, inputs = checkpoints.save(), checkpoints.save_inputs()
+        checkpoints.restore_inputs(self._inputs)
+        checkpoints.restore(self._final)
+        self._sweep_segments(cotangents)
+        checkpoints.restore_inputs(inputs)
+        checkpoints.restore(now)
+        return self._derivatives()
+
+    def _sweep_segments(self, cotangents: Mapping[int, Mapping[str, np.ndarray]]) -> None:
+        adjoint, sweep = self._adjoint, self._sweep
         for mirrored in adjoint.values():
             mirrored.view[...] = 0
         adjoint["w"].view[...] = self._final["particles.w"]
-        struct, of_bodies = self._adjoint_struct()
-        inputs = [self._structs[_ORDER.index(n)] for n in _SWEPT]
-        for name, array in self._notes.items():
-            setattr(inputs[_SWEPT.index("contacts")], name, array)
         for mirrored in adjoint.values():
             mirrored.to_device()
+        struct = self._by_state
         for number in reversed(range(len(self._segments))):
             segment = self._segments[number]
             if segment.end in cotangents:
                 self._add(cotangents[segment.end])
-            tape = segment.tape
-            if self.storage == "replay":
-                tape = self._replay(number)
+            tape = self._replay(number) if self.storage == "replay" else segment.tape
             struct.leave = int(segment.begin > 0 and segment.begin not in self._marks)
-            wp.launch(
-                self._sweep, dim=data.group_count,
-                inputs=[self._settings(segment.end), *inputs, tape.struct, struct, of_bodies],
-                device=self.solver.model.device,
-            )  # fmt: skip
-        for mirrored in adjoint.values():
+            self._settings.max_steps = segment.end
+            for at, value in ((0, self._settings), (1 + len(_SWEPT), tape.struct),
+                              (2 + len(_SWEPT), struct)):  # fmt: skip
+                sweep.set_param_at_index(at, value)
+            sweep.launch()
+
+    def _derivatives(self) -> dict[str, np.ndarray]:
+        for mirrored in self._adjoint.values():
             mirrored.to_host()
-        self._checkpoints.restore(self._final)
-        out = {name: mirrored.view.copy() for name, mirrored in adjoint.items()}
-        views, dt = data.views, self.solver.config.dt
+        out = {name: mirrored.view.copy() for name, mirrored in self._adjoint.items()}
+        data, dt = self.solver.data, self.solver.config.dt
+        damping, stiffness = (self._inputs[f"group.{n}"] for n in ("damping", "stiffness"))
         # what is pinned has no mass to derive by
-        out["body.w"] *= data.views["bodies.w0"] > 0.0
-        out["damping"] *= np.where(views["group.damping"] * dt < 1.0, -dt, 0.0)
-        out["stiffness"] *= -1.0 / (views["group.stiffness"] * dt) ** 2
+        out["body.w"] *= self._inputs["bodies.w0"] > 0.0
+        out["damping"] *= np.where(damping * dt < 1.0, -dt, 0.0)
+        out["stiffness"] *= -1.0 / (stiffness * dt) ** 2
         out["fired"] = out["fired"].reshape(data.group_count, len(Kind), data.lanes)
         return out
 
-    def _replay(self, number: int) -> _Tape:
+    def _replay(self, number: int) -> Stacks:
         """The tape of a segment, made anew unless it is the one on the tape."""
         segment, tape = self._segments[number], self._tape
         assert tape is not None
         if self._on_tape != number:
             self._checkpoints.restore(segment.checkpoint)
-            last = number == len(self._segments) - 1
-            self._launch(tape, segment.begin, segment.end, last)
-            assert not tape.arrays["full"].numpy().any()
+            self._launch(tape, segment.begin, segment.end, number == len(self._segments) - 1)
+            assert not tape.full().any()
             self._on_tape = number
         return tape
 
@@ -425,7 +348,7 @@ class Recorder:
             mirrored.view[...] += values
             mirrored.to_device()
 
-    def _adjoint_struct(self) -> tuple[Any, Any]:
+    def _adjoint_structs(self) -> tuple[Any, Any]:
         data = self.solver.data
         struct, of_bodies = data.types.Adjoint(), data.types.BodyAdjoint()
         for name, mirrored in self._adjoint.items():
