@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from warp_deform.cli import CommandOptions, Outcome
+from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
 
 __all__ = ["RefineOptions", "refine"]
@@ -29,6 +30,14 @@ class RefineOptions(CommandOptions):
     """Actions to look ahead."""
     budget: Annotated[int, arg(metavar="N")] = 64
     """Simulated actions that the search for one action may spend."""
+    accept: Literal["score", "solved"] = "score"
+    """When an episode takes the place of the original: if it has no lower last score and no more
+    actions, or if it solves the task in fewer actions or in as many with a higher score."""
+    lifts: bool = False
+    """Let the search move the lift of an action too; policies lift as the task does."""
+    way_points: bool = False
+    """Bend the recorded actions' paths instead, by the gradient. No policy can act so: the folder
+    then holds paths, no demonstrations."""
     workers: Annotated[int | None, arg(metavar="W")] = None
     """Processes; left out, one per core. The result is the same."""
 
@@ -41,11 +50,17 @@ def refine(options: RefineOptions) -> Outcome:
     from .refinement import refine as refine_folder
 
     quiet_warp()
+    if options.way_points:
+        return _bend(options)
+    search = SearchConfig(
+        method=options.method, depth=options.depth, budget=options.budget, lifts=options.lifts
+    )
     report = refine_folder(
         RefineConfig(
             source=options.source,
             out=options.out,
-            search=SearchConfig(method=options.method, depth=options.depth, budget=options.budget),
+            search=search,
+            accept=options.accept,
             workers=options.workers,
         )
     )
@@ -54,4 +69,47 @@ def refine(options: RefineOptions) -> Outcome:
         f"{report.actions_before} -> {report.actions_after}, mean score {report.score_before:.3f} "
         f"-> {report.score_after:.3f}, in {report.seconds:.1f} s"
     )
+    if report.origins:
+        text += "; actions of the improved: "
+        text += ", ".join(f"{count} {name}" for name, count in report.origins.items())
+    return Outcome(data=asdict(report), text=text)
+
+
+def _bend(options: RefineOptions) -> Outcome:
+    """Bend the paths of a folder's actions."""
+    from warp_deform.planning.search import SLOPE_COST
+    from warp_deform.planning.way_points import WayPointConfig
+
+    from .way_points import BendConfig, bend
+
+    others = RefineOptions(
+        source=options.source,
+        out=options.out,
+        budget=options.budget,
+        workers=options.workers,
+        way_points=True,
+        json=options.json,
+    )
+    if options != others:
+        raise InputError("--way-points goes by the gradient and takes --budget and --workers alone")
+    steps = options.budget // (SLOPE_COST + 1)
+    if steps < 1:
+        raise InputError(f"a step of way-points costs {SLOPE_COST + 1}: give --budget that or more")
+    report = bend(
+        BendConfig(
+            source=options.source,
+            out=options.out,
+            bending=WayPointConfig(steps=steps),
+            workers=options.workers,
+        )
+    )
+    text = (
+        f"{options.out}: {report.bent} of {report.actions} paths bent (no demonstrations), in "
+        f"{report.seconds:.1f} s"
+    )
+    if report.actions:
+        text += (
+            f"; mean loss after an action {report.loss_before:.4f} -> {report.loss_after:.4f}, "
+            f"mean score {report.score_before:.3f} -> {report.score_after:.3f}"
+        )
     return Outcome(data=asdict(report), text=text)

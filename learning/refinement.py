@@ -4,13 +4,14 @@ An episode starts again from its seed. Before every action a search tries others
 among them as long as the episode is where the recording was, and the best is carried out exactly as
 a policy's action is. So a refined episode is an episode like any other: it replays from its seed.
 It takes the place of the original only if it is better by the task's own score, not by what the
-search went by: no lower score, no more actions, and one of them better.
+search went by: see `ACCEPT`.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -33,7 +34,6 @@ from warp_deform.episodes import (
 from warp_deform.errors import InputError
 from warp_deform.goals import CONSTRUCTED
 from warp_deform.planning import SearchConfig, lookahead_for, search
-from warp_deform.planning.slopes import slopes_for
 from warp_deform.recording import observe, record
 from warp_deform.replay import Recording
 from warp_deform.robots import robot as find_robot
@@ -42,7 +42,12 @@ from warp_deform.tasks.task import Action, Task
 from warp_deform.workers import Workers, worker_count
 from warp_deform.worlds import Worlds
 
-__all__ = ["RECORDED", "REFINED", "REFINEMENT", "RefineConfig", "RefineReport", "refine"]
+__all__ = ["ACCEPT", "RECORDED", "REFINED", "REFINEMENT", "RefineConfig", "RefineReport", "refine"]
+
+ACCEPT = ("score", "solved")
+"""When a new episode takes the place of the original. `score`: no lower last score, no more
+actions, and one of them better. `solved`: where both solve the task, fewer actions, or as many and
+a higher last score; where the original does not solve it, as `score`."""
 
 REFINEMENT = "refinement"
 """Where `EpisodeInfo.extra` says what became of an episode."""
@@ -61,14 +66,21 @@ class RefineConfig:
     """What to refine, and how.
 
     source: folder of simulated demonstrations, of any tasks; out: folder for the refined ones
-    search: how each action is searched; its budget is per action
+    search: how each action is searched; its budget is per action. What an action that solves the
+        task leaves of it goes into better ones, whatever `search.polish` says.
+    accept: when an episode takes the place of the original, see `ACCEPT`
     workers: processes; None takes one per core
     """
 
     source: Path
     out: Path
     search: SearchConfig = field(default_factory=SearchConfig)
+    accept: str = "score"
     workers: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.accept not in ACCEPT:
+            raise InputError(f"no rule {self.accept!r}; choose from {', '.join(ACCEPT)}")
 
 
 @dataclass(frozen=True)
@@ -77,6 +89,8 @@ class RefineReport:
 
     improved: episodes that took the place of the original
     score_before, score_after: means; actions_before, actions_after: sums over all episodes
+    origins: how many actions of the episodes that took the place of the original come from where,
+        see `planning.Outlook.origin`
     seconds: what this run took [s]
     state_hash: of the new folder's episodes in the order of their seeds
     """
@@ -87,6 +101,7 @@ class RefineReport:
     score_after: float
     actions_before: int
     actions_after: int
+    origins: dict[str, int]
     seconds: float
     state_hash: str
 
@@ -99,14 +114,15 @@ def refine(config: RefineConfig) -> RefineReport:
 
     Raises:
         InputError: there is nothing to refine, an episode cannot be simulated again here, the
-            search has no gradient in one of the tasks, or the new folder is the old one or holds
-            something else.
+            task has no loss to differentiate, or the new folder is the old one or holds something
+            else.
     """
     began = time.perf_counter()
     source, out = Path(config.source).resolve(), Path(config.out).resolve()
     if source == out:
         raise InputError(f"{config.out} is the folder to refine; give --out another folder")
-    config = replace(config, source=source, out=out)
+    search = replace(config.search, polish=True)
+    config = replace(config, source=source, out=out, search=search)
     reader = EpisodeReader(source)
     groups: dict[tuple[str, str], list[int]] = {}
     infos = reader.infos()
@@ -137,13 +153,10 @@ def refine(config: RefineConfig) -> RefineReport:
 
 
 def _check_search(task: str, robot: str, config: SearchConfig) -> None:
-    """Raise InputError unless task and robot are known and have the gradients to search by."""
+    """Raise InputError unless task and robot are known and have what the search goes by."""
     find_robot(robot)
     if type(find_task(task)).loss is Task.loss and config.method == "gradient":
         raise InputError(f"{task} has no loss to differentiate; choose another method")
-    if config.method == "gradient":
-        worlds = worlds_for(task, robot)  # those that act: their task's slopes are used again
-        slopes_for(worlds.task, robot, worlds.precision)
 
 
 @dataclass(frozen=True)
@@ -162,7 +175,7 @@ def _refine_chunk(chunk: _Chunk) -> Iterator[int]:
     for seed in chunk.seeds:
         # Alone, although lanes stay empty: nearly all time goes into the search, whose lanes are
         # full, and an interruption loses one episode a process.
-        episode = _refined(worlds, recording, seed, config.search)
+        episode = _refined(worlds, recording, seed, config)
         writer.write(episode)
         info = episode.info
         reason = REFINED if info.extra[REFINEMENT]["improved"] else "kept"
@@ -170,14 +183,14 @@ def _refine_chunk(chunk: _Chunk) -> Iterator[int]:
         yield seed
 
 
-def _refined(worlds: Worlds, recording: Recording, seed: int, config: SearchConfig) -> Episode:
+def _refined(worlds: Worlds, recording: Recording, seed: int, config: RefineConfig) -> Episode:
     """The better one of a recorded episode and of what a search makes of it."""
     goal = recording.goal(seed)
     original = recording.episodes.pop(seed)
-    searcher = _Searcher(original, config)
+    searcher = _Searcher(original, config.search)
     ((slot, run),) = play(worlds, [seed], act=searcher.act, look=observe, goals=lambda _: goal)
     _check_start(original, run)
-    before, improved = original.info, _better(run, original.info)
+    before, improved = original.info, _better(run, original.info, config.accept)
     origins = searcher.origins if improved else [RECORDED] * before.actions
     made = original
     if improved:
@@ -191,7 +204,8 @@ def _refined(worlds: Worlds, recording: Recording, seed: int, config: SearchConf
         "actions_before": before.actions,
         "actions_after": made.info.actions,
         "origins": origins,
-        "search": asdict(config),
+        "search": asdict(config.search),
+        "accept": config.accept,
         "tried": {
             "score": run.rows[-1].score,
             "actions": len(run.actions),
@@ -256,13 +270,15 @@ def _check_start(original: Episode, run: Run[Step]) -> None:
         )
 
 
-def _better(run: Run[Step], before: EpisodeInfo) -> bool:
-    """Whether an episode is nowhere worse than the original and somewhere better."""
+def _better(run: Run[Step], before: EpisodeInfo, accept: str) -> bool:
+    """Whether an episode takes the place of the original."""
     if len(run.rows) != len(run.actions) + 1:
         return False  # the physics failed
     score, actions = run.rows[-1].score, len(run.actions)
     if before.success and run.ended != SOLVED:
         return False
+    if before.success and accept == "solved":
+        return (-actions, score) > (-before.actions, before.score)
     return (
         score >= before.score
         and actions <= before.actions
@@ -276,6 +292,7 @@ def _description(config: RefineConfig, infos: Sequence[EpisodeInfo]) -> dict[str
         "refined": combine_hashes(info.state_hash for info in infos),
         "seeds": combine_hashes(f"{info.seed:x}" for info in infos),
         "search": asdict(config.search),
+        "accept": config.accept,
     }
 
 
@@ -288,6 +305,9 @@ def _report(infos: Sequence[EpisodeInfo], seconds: float) -> RefineReport:
         score_after=math.fsum(story["score_after"] for story in stories) / len(stories),
         actions_before=sum(story["actions_before"] for story in stories),
         actions_after=sum(story["actions_after"] for story in stories),
+        origins=dict(
+            sorted(Counter(o for s in stories if s["improved"] for o in s["origins"]).items())
+        ),
         seconds=seconds,
         state_hash=combine_hashes(info.state_hash for info in infos),
     )

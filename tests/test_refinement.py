@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from episode_samples import make_episode
 
-from learning import refinement
+from learning import refinement, way_points
 from learning.refinement import REFINED, REFINEMENT, RefineConfig, RefineReport, refine
+from learning.way_points import WAY_POINTS, BendConfig, bend, read_path
 from warp_deform.cli import main
 from warp_deform.collect import CollectConfig, collect
+from warp_deform.episode_loop import SOLVED, Run, worlds_for
 from warp_deform.episodes import Episode, EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
 from warp_deform.planning import SearchConfig
-from warp_deform.replay import verify
+from warp_deform.planning.way_points import WayPointConfig, WayPoints
+from warp_deform.replay import Recording, verify
+from warp_deform.tasks.registry import TASKS
+from warp_deform.tasks.task import Task
 
 SEARCH = SearchConfig(method="cem", depth=1, budget=24, candidates=8)
 
@@ -137,10 +145,6 @@ def _constructed(folder: Path) -> None:
     EpisodeWriter(folder).write(_sample(demonstrator="constructed"))
 
 
-def _boxes(folder: Path) -> None:
-    EpisodeWriter(folder).write(_sample(task="block-notarget"))
-
-
 def _sample(**changes: object) -> Episode:
     episode = make_episode()
     known: dict[str, object] = {
@@ -158,7 +162,6 @@ def _sample(**changes: object) -> Episode:
         (_no_folder, "cannot be read as a folder of episodes"),
         (lambda folder: None, "holds no episodes"),
         (_constructed, "goals that nobody acted for"),
-        (_boxes, "no derivatives"),
     ],
 )
 def test_what_cannot_be_refined_is_refused(
@@ -194,6 +197,144 @@ def test_the_command_reports_in_json(
     report = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert set(report) == {
         "episodes", "improved", "score_before", "score_after", "actions_before", "actions_after",
-        "seconds", "state_hash",
+        "origins", "seconds", "state_hash",
     }  # fmt: skip
     assert report["episodes"] == 1
+
+
+# -- which episode is better
+
+
+def _played(score: float, actions: int, ended: str = SOLVED) -> Run[Any]:
+    run: Run[Any] = Run(0, np.random.default_rng(0))
+    run.rows = [SimpleNamespace(score=score)] * (actions + 1)
+    run.actions, run.ended = [np.zeros(7)] * actions, ended
+    return run
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "by_score", "by_solved"),
+    [
+        ((True, 0.90, 3), (0.90, 2), True, True),
+        ((True, 0.90, 3), (0.86, 2), False, True),  # solved in less, though not as well
+        ((True, 0.90, 3), (0.95, 3), True, True),
+        ((True, 0.90, 3), (0.90, 3), False, False),
+        ((True, 0.90, 3), (0.86, 3), False, False),
+        ((True, 0.90, 3), (0.99, 4), False, False),
+        ((False, 0.70, 3), (0.60, 2), False, False),  # a failure may not fail sooner
+        ((False, 0.70, 3), (0.70, 2), True, True),
+    ],
+)
+def test_the_rules_of_what_is_better(
+    before: tuple[bool, float, int], after: tuple[float, int], by_score: bool, by_solved: bool
+) -> None:
+    info = make_episode().info
+    info = replace(info, success=before[0], score=before[1], actions=before[2])
+    for accept, expected in (("score", by_score), ("solved", by_solved)):
+        assert refinement._better(_played(*after), info, accept) is expected
+    if before[0]:
+        unsolved = _played(0.99, 1, "not solved in 1 actions")
+        assert not refinement._better(unsolved, info, "solved")
+    broken = _played(*after)
+    broken.rows.pop()
+    assert not refinement._better(broken, info, "solved"), "the physics failed"
+
+
+def test_a_rule_that_is_none_is_refused() -> None:
+    with pytest.raises(InputError, match="no rule 'luck'; choose from score, solved"):
+        RefineConfig(source=Path("a"), out=Path("b"), accept="luck")
+
+
+def test_the_report_counts_where_the_actions_of_improved_episodes_come_from(
+    refined: tuple[Path, RefineReport],
+) -> None:
+    out, report = refined
+    stories = [info.extra[REFINEMENT] for info in EpisodeReader(out).infos()]
+    better = [story for story in stories if story["improved"]]
+    assert sum(report.origins.values()) == sum(story["actions_after"] for story in better)
+    for name, count in report.origins.items():
+        assert count == sum(story["origins"].count(name) for story in better)
+    assert all(story["search"]["polish"] and story["accept"] == "score" for story in stories)
+
+
+def test_every_task_with_a_loss_can_be_searched_by_gradient() -> None:
+    able = [name for name, kind in TASKS.items() if kind.loss is not Task.loss]
+    assert {"block-notarget", "fabric-cover", "bag-items-2", "bag-color-goal"} <= set(able)
+    for name in able:
+        refinement._check_search(name, "ur5", SearchConfig(method="gradient"))
+
+
+# -- way-points
+
+
+@pytest.fixture(scope="module")
+def bent(demos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """One demonstration, and the folder of its bent paths."""
+    folder = tmp_path_factory.mktemp("bent")
+    EpisodeWriter(folder / "one").write(next(iter(EpisodeReader(demos))))
+    arguments = [str(folder / "one"), "--out", str(folder / "out"), "--way-points"]
+    assert main(["refine", *arguments, "--budget", "15", "--workers", "1", "--json"]) == 0
+    return folder / "one", folder / "out"
+
+
+def test_bent_paths_are_labelled_and_run_again_to_what_is_written(bent: tuple[Path, Path]) -> None:
+    demo, out = bent
+    label = json.loads((out / "way_points.json").read_text())
+    assert label["demonstrator"] == WAY_POINTS and label["bending"]["steps"] == 3
+    story = json.loads((out / "way_points_000000300.json").read_text())
+    episode = next(iter(EpisodeReader(demo)))
+    assert story["demonstrator"] == WAY_POINTS and story["task"] == episode.info.task
+    assert len(story["actions"]) == episode.info.actions
+    ran = [a for a in story["actions"] if a["before"] is not None]
+    assert all(a["after"]["loss"] <= a["before"]["loss"] for a in ran)
+    assert any(a["path"] is not None for a in ran)
+    assert story["actions"][0]["state_hash"] == episode.steps[0].state_hash
+    assert ran[0]["before"]["state_hash"] == episode.steps[1].state_hash, "the action as recorded"
+    number = next(n for n, a in enumerate(story["actions"]) if a["path"] is not None)
+    written = story["actions"][number]
+    recording = Recording(EpisodeReader(demo))
+    worlds = worlds_for(story["task"], story["robot"])
+    job = way_points._recorded(worlds, recording, 300)[number]
+    again = WayPoints(worlds.task, robot="ur5").run({0: job}, {0: read_path(written["path"])})
+    assert asdict(again[0]) == written["after"]
+    with pytest.raises(InputError, match="no path of way-points"):
+        read_path({"times": [0]})
+
+
+def test_bending_goes_on_and_says_the_same(
+    bent: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    demo, out = bent
+    config = BendConfig(source=demo, out=out, bending=WayPointConfig(steps=3), workers=1)
+    monkeypatch.setattr(way_points, "_bend_chunk", lambda chunk: pytest.fail("all is there"))
+    report = bend(config)
+    assert report.episodes == 1 and report.bent >= 1 and report.demonstrator == WAY_POINTS
+    assert report.loss_before is not None and report.loss_after is not None
+    assert report.loss_after < report.loss_before
+    with pytest.raises(InputError, match="other demonstrations or settings"):
+        bend(replace(config, bending=WayPointConfig(steps=4)))
+
+
+def test_nobody_takes_bent_paths_for_demonstrations(
+    bent: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    demo, out = bent
+    train = ["train", "cable-line-notarget", "--agent", "goal-split"]
+    for arguments in (
+        [*train, "--data", str(out), "--out", str(tmp_path / "run")],
+        ["refine", str(out), "--out", str(tmp_path / "new")],
+        ["replay", str(out), "--verify"],
+    ):
+        assert main(arguments) == 2
+        said = capsys.readouterr()
+        assert "holds no episodes" in said.err and said.err.count("\n") == 1
+    for given, expected in (
+        (["--out", str(demo)], "another folder"),
+        (["--out", str(demo.parent)], "holds something else"),
+        (["--out", str(tmp_path / "new"), "--depth", "1"], "--budget and --workers alone"),
+        (["--out", str(tmp_path / "new"), "--budget", "4"], "costs 5"),
+    ):
+        assert main(["refine", str(demo), "--way-points", *given]) == 2
+        said = capsys.readouterr()
+        assert expected in said.err and said.err.count("\n") == 1
+    assert not (tmp_path / "new").exists()

@@ -16,17 +16,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import InputError
-from ..rendering.pixels import BOUNDS
 from ..tasks.task import Action, Task
 from ..world_state import WorldState
+from .descent import Descent
+from .joint import JOINT_COST, Pair, move_both
 from .lookahead import Lookahead, Outlook
+from .places import MOST_GROWTH, Places
+
+__all__ = ["MOST_GROWTH"]  # `warp_deform.planning` is the import path of the rest
 
 METHODS = ("enumerate", "random", "cem", "gradient")
+JOINT_STEPS = 8
+"""Most steps that two actions go downhill together."""
 SLOPE_COST = 4
 """Rollouts that a slope counts as: a taped one, its repetition and the backward sweep."""
-MOST_GROWTH = 1e5
-"""A slope whose rollout is more chaotic than that is not used."""
-_LOW, _HIGH = np.array(BOUNDS[:2]).T
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +48,10 @@ class SearchConfig:
     """Standard deviation of drawn place points [m]; `cem` halves it every round."""
     turn_spread: float = 0.3
     """The same of the place yaw [rad], where the task has use for it."""
+    lifts: bool = False
+    """Whether the lift moves too, within its stage; policies lift as the task does."""
+    lift_spread: float = 0.02
+    """Standard deviation of drawn lifts [m]."""
     steps: int = 3
     """Steps of `gradient` down the slope."""
     rate: float = 0.015
@@ -53,6 +60,10 @@ class SearchConfig:
     """Actions ahead."""
     beam: int = 3
     """States after the first action that are searched on."""
+    joint: bool = False
+    """Whether `gradient` moves two actions together, with half of what the second may spend."""
+    polish: bool = False
+    """Whether a search goes on to better actions when it has one that solves the task."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -77,126 +88,153 @@ def search(
     farthest come first, in the order of what that one leads to.
     """
     deep = config.depth > 1
+    spent = lookahead.rollouts
     first = config.budget if not deep else max(1, config.budget // 2)
-    tried = _around(lookahead, task, state, rng, config, first, also, keep=deep)
+    around = _Around(lookahead, task, state, rng, config, keep=deep)
+    tried = around.tried(first, also)
     tried.sort(key=lambda o: o.rank, reverse=True)
-    if not deep or not tried or tried[0].solved:
+    if not deep or not tried:
+        return tried
+    if tried[0].solved:
+        if config.polish:
+            tried += around.improved(tried, config.budget - (lookahead.rollouts - spent))
+            tried.sort(key=lambda o: o.rank, reverse=True)
         return tried
     beam = [o for o in tried if o.after is not None and o.grade >= 2][: config.beam]
     if not beam:
         return tried
-    each = (config.budget - first) // len(beam)
-    led = []
+    rest = config.budget - first
+    jointly = rest // 2 if config.joint and config.method == "gradient" else 0
+    led: list[Pair] = []
     for outlook in beam:
         assert outlook.after is not None
-        seconds = _around(lookahead, task, outlook.after, rng, config, each, (), keep=False)
-        best = max((o.rank for o in seconds), default=(0, 0.0))
-        led.append((best if best > outlook.rank else outlook.rank, outlook))
-    led.sort(key=lambda pair: pair[0], reverse=True)
-    chosen = [outlook for _, outlook in led]
+        from_there = _Around(lookahead, task, outlook.after, rng, config, keep=False)
+        seconds = from_there.tried((rest - jointly) // len(beam))
+        led.append((outlook, max([outlook, *seconds], key=lambda o: o.rank)))
+    led.sort(key=lambda pair: pair[1].rank, reverse=True)
+    if jointly >= JOINT_COST:
+        steps = min(JOINT_STEPS, jointly // JOINT_COST)
+        pairs = [pair for pair in led if pair[0] is not pair[1]][: jointly // (steps * JOINT_COST)]
+        led += move_both(
+            lookahead, task, state, pairs, around.places, steps=steps, scale=_scale(config)
+        )
+        led.sort(key=lambda pair: pair[1].rank, reverse=True)
+    chosen = [outlook for outlook, _ in led]
     return chosen + [o for o in tried if o not in chosen]
 
 
-def _around(
-    lookahead: Lookahead,
-    task: Task,
-    state: WorldState,
-    rng: np.random.Generator,
-    config: SearchConfig,
-    budget: int,
-    also: Sequence[Action],
-    *,
-    keep: bool,
-) -> list[Outlook]:
-    """Try up to `budget` actions from one state."""
-    layout, snapshot = state.episode.layout, state.episode.snapshot
-    known: set[bytes] = set()
+def _scale(config: SearchConfig) -> np.ndarray:
+    """Lengths (4,) of the first steps downhill by place x, y [m], yaw [rad], lift [m]."""
+    return config.rate * np.array([1.0, 1.0, 10.0, 1.0])
 
-    def fresh(actions: Sequence[Action], most: int) -> list[Action]:
+
+class _Around:
+    """Actions from one state, tried and drawn around one another.
+
+    keep: whether outlooks hold the state afterwards
+    """
+
+    def __init__(
+        self,
+        lookahead: Lookahead,
+        task: Task,
+        state: WorldState,
+        rng: np.random.Generator,
+        config: SearchConfig,
+        *,
+        keep: bool,
+    ) -> None:
+        self._lookahead, self._task, self._state = lookahead, task, state
+        self._rng, self._config, self._keep = rng, config, keep
+        self._known: set[bytes] = set()
+        self.places = Places(
+            task=task,
+            spread=config.spread,
+            turn_spread=config.turn_spread,
+            lift_spread=config.lift_spread,
+            lifts=config.lifts,
+        )
+
+    def tried(self, budget: int, also: Sequence[Action] = ()) -> list[Outlook]:
+        """`also`, the task's candidates and what the method makes of them, up to `budget`."""
+        episode, spent = self._state.episode, self._lookahead.rollouts
+        proposed = self._task.candidates(
+            episode.layout, episode.snapshot, self._rng, self._config.candidates
+        )
+        tried = self._try(self._fresh([*also, *proposed], budget), "candidate")
+        if not tried or self._done(tried):
+            return tried
+        # what is not allowed costs nothing but counts, so that a budget always ends
+        spent = max(len(tried), self._lookahead.rollouts - spent)
+        return tried + self.improved(tried, budget - spent)
+
+    def improved(self, tried: Sequence[Outlook], budget: int) -> list[Outlook]:
+        """More outlooks, from those around which the method looks."""
+        if self._config.method == "gradient":
+            return self._downhill(tried, budget)
+        if self._config.method == "random":
+            around = [tried[i].action for i in self._rng.integers(len(tried), size=budget)]
+            return self._try([self.places.drawn(a, self._rng) for a in around], "drawn")
+        return self._closer(tried, budget) if self._config.method == "cem" else []
+
+    def _closer(self, tried: Sequence[Outlook], budget: int) -> list[Outlook]:
+        """Draws of the cross-entropy method."""
+        found, rounds = list(tried), self._config.rounds
+        for k in range(rounds):
+            if self._done(found):
+                break
+            count = budget // (rounds - k)
+            budget -= count
+            elites = sorted(found, key=lambda o: o.rank, reverse=True)[: self._config.elites]
+            around = [elites[i % len(elites)].action for i in range(count)]
+            drawn = [self.places.drawn(action, self._rng, 0.5**k) for action in around]
+            found += self._try(self._fresh(drawn, count), "drawn")
+        return found[len(tried) :]
+
+    def _downhill(self, tried: Sequence[Outlook], budget: int) -> list[Outlook]:
+        """Move the best of `tried` downhill, and try where they get; spends up to `budget`."""
+        config, rng = self._config, self._rng
+        each = SLOPE_COST * config.steps + config.steps
+        if budget < each:
+            return []
+        elites = sorted(tried, key=lambda o: o.rank, reverse=True)[: budget // each]
+        slopes, actions = self._lookahead.slopes(), [o.action for o in elites]
+        descent = Descent((len(elites), 4), _scale(config))
+        stuck = [False] * len(elites)
+        jobs: list[Action] = []
+        origins: list[str] = []
+        for k in range(1, config.steps + 1):
+            told = slopes.of([(self._state, action) for action in actions])
+            self._lookahead.rollouts += SLOPE_COST * len(told)
+            by_place = np.zeros((len(elites), 4))
+            for i, action in enumerate(actions):
+                slope = self.places.slope(told[i], action)
+                stuck[i] |= slope is None
+                if not stuck[i]:
+                    by_place[i] = slope
+            changes = descent.step(by_place)
+            for i, elite in enumerate(elites):
+                near = self.places.drawn(elite.action, rng, 1 / k)
+                if not stuck[i]:
+                    actions[i] = self.places.moved(actions[i], changes[i], elite.action)
+                jobs.append(near if stuck[i] else actions[i])
+                origins.append("drawn" if stuck[i] else "gradient")
+        outlooks = self._try(jobs, "")
+        return [replace(o, origin=origin) for o, origin in zip(outlooks, origins, strict=True)]
+
+    def _done(self, tried: Sequence[Outlook]) -> bool:
+        return not self._config.polish and any(o.solved for o in tried)
+
+    def _fresh(self, actions: Sequence[Action], most: int) -> list[Action]:
+        """Those that have not been tried from here, at most so many."""
         new: list[Action] = []
         for action in actions:
-            if len(new) < most and action.tobytes() not in known:
-                known.add(action.tobytes())
+            if len(new) < most and action.tobytes() not in self._known:
+                self._known.add(action.tobytes())
                 new.append(action)
         return new
 
-    def tries(actions: Sequence[Action], origin: str) -> list[Outlook]:
-        outlooks = lookahead.try_each([(state, action) for action in actions], keep=keep)
+    def _try(self, actions: Sequence[Action], origin: str) -> list[Outlook]:
+        jobs = [(self._state, action) for action in actions]
+        outlooks = self._lookahead.try_each(jobs, keep=self._keep)
         return [replace(outlook, origin=origin) for outlook in outlooks]
-
-    proposed = task.candidates(layout, snapshot, rng, config.candidates)
-    tried = tries(fresh([*also, *proposed], budget), "candidate")
-    if config.method == "enumerate" or not tried or any(o.solved for o in tried):
-        return tried
-    left = budget - len(tried)
-    if config.method == "gradient":
-        return tried + _downhill(lookahead, task, state, rng, config, tried, left, keep=keep)
-    if config.method == "random":
-        around = [tried[i].action for i in rng.integers(len(tried), size=left)]
-        drawn = [_drawn(a, rng, config.spread, config.turn_spread) for a in around]
-        return tried + tries(drawn, "drawn")
-    for k in range(config.rounds):
-        if any(o.solved for o in tried):
-            break
-        count = left // (config.rounds - k)
-        left -= count
-        elites = sorted(tried, key=lambda o: o.rank, reverse=True)[: config.elites]
-        around = [elites[i % len(elites)].action for i in range(count)]
-        scale = 0.5**k
-        drawn = [_drawn(a, rng, config.spread * scale, config.turn_spread * scale) for a in around]
-        tried += tries(fresh(drawn, count), "drawn")
-    return tried
-
-
-def _downhill(
-    lookahead: Lookahead,
-    task: Task,
-    state: WorldState,
-    rng: np.random.Generator,
-    config: SearchConfig,
-    tried: Sequence[Outlook],
-    budget: int,
-    *,
-    keep: bool,
-) -> list[Outlook]:
-    """Move the best of `tried` downhill, and try where they get; spends up to `budget`."""
-    slopes = lookahead.slopes()
-    each = SLOPE_COST * config.steps + config.steps
-    elites = sorted(tried, key=lambda o: o.rank, reverse=True)[: max(1, budget // each)]
-    if budget < each:
-        return []
-    places = np.array([o.action for o in elites])
-    first, second = np.zeros((len(elites), 3)), np.zeros((len(elites), 3))
-    scale = config.rate * np.array([1.0, 1.0, 10.0])
-    turns = places[:, 5] != 0.0
-    stuck = np.zeros(len(elites), dtype=bool)
-    jobs: list[tuple[WorldState, Action]] = []
-    origins: list[str] = []
-    for k in range(1, config.steps + 1):
-        told = slopes.of([(state, place) for place in places])
-        lookahead.rollouts += SLOPE_COST * len(told)
-        by_place = np.array([slope.by_place for slope in told])
-        stuck |= [not slope.usable or slope.growth > MOST_GROWTH for slope in told]
-        by_place[~turns, 2] = 0.0
-        norms = np.linalg.norm(by_place, axis=1, keepdims=True)
-        by_place = np.where(stuck[:, None], 0.0, by_place / np.maximum(norms, 1e-12))
-        first = 0.8 * first + 0.2 * by_place
-        second = 0.9 * second + 0.1 * by_place**2
-        mean, spread = first / (1 - 0.8**k), np.sqrt(second / (1 - 0.9**k))
-        places[:, 3:6] -= scale / np.sqrt(k) * mean / (spread + 1e-8)
-        places[:, 3:5] = np.clip(places[:, 3:5], _LOW, _HIGH)
-        for i in range(len(elites)):
-            near = _drawn(elites[i].action, rng, config.spread / k, config.turn_spread / k)
-            jobs.append((state, near if stuck[i] else places[i].copy()))
-            origins.append("drawn" if stuck[i] else "gradient")
-    outlooks = lookahead.try_each(jobs, keep=keep)
-    return [replace(o, origin=origin) for o, origin in zip(outlooks, origins, strict=True)]
-
-
-def _drawn(action: Action, rng: np.random.Generator, spread: float, turn: float) -> Action:
-    """The same pick, placed near by; on the table."""
-    near = action.copy()
-    near[3:5] = np.clip(near[3:5] + rng.normal(0.0, spread, 2), _LOW, _HIGH)
-    if near[5] != 0.0:
-        near[5] += rng.normal(0.0, turn)
-    return near

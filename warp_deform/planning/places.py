@@ -1,0 +1,78 @@
+"""Where an action may place: the numbers that a search moves, their limits, and draws of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..rendering.pixels import BOUNDS
+from ..spaces import LIFT
+from ..tasks.task import Action, Task
+from .slopes import PLACE, Slope
+
+__all__ = ["MOST_GROWTH", "Places"]
+
+MOST_GROWTH = 1e5
+"""A slope whose rollout is more chaotic than that is not used."""
+_LOW, _HIGH = np.array(BOUNDS[:2]).T
+_INSIDE = 1e-3
+"""A moved lift stays so far from that at which the next stage begins [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Places:
+    """Draws and limits of place x, y [m], yaw [rad] and lift [m].
+
+    spread, turn_spread, lift_spread: standard deviations of draws [m], [rad], [m]
+    lifts: whether the lift moves; else it is the action's
+    """
+
+    task: Task
+    spread: float
+    turn_spread: float
+    lift_spread: float
+    lifts: bool
+
+    def drawn(self, action: Action, rng: np.random.Generator, scale: float = 1.0) -> Action:
+        """The same pick, placed near by; on the table."""
+        near = action.copy()
+        near[3:5] += rng.normal(0.0, self.spread * scale, 2)
+        if near[5] != 0.0:
+            near[5] += rng.normal(0.0, self.turn_spread * scale)
+        if self.lifts:
+            near[6] += rng.normal(0.0, self.lift_spread * scale)
+        return self.limited(near, action)
+
+    def limited(self, action: Action, like: Action) -> Action:
+        """`action` with its place on the table and its lift within the stage of `like`."""
+        inside = action.copy()
+        inside[3:5] = np.clip(inside[3:5], _LOW, _HIGH)
+        if self.lifts:
+            inside[6] = np.clip(inside[6], *self._lifts(float(like[6])))
+        return inside
+
+    def slope(self, slope: Slope, action: Action) -> np.ndarray | None:
+        """The slope (4,) by what may move of an action; None: not to be used."""
+        if not slope.usable or slope.growth > MOST_GROWTH:
+            return None
+        by_place = slope.by_place.copy()
+        if action[5] == 0.0:
+            by_place[2] = 0.0  # a task that places without a turn has no use for one
+        if not self.lifts:
+            by_place[3] = 0.0
+        return by_place
+
+    def moved(self, action: Action, change: np.ndarray, like: Action) -> Action:
+        """`action` with its place (4,) changed."""
+        there = action.copy()
+        there[PLACE] += change
+        return self.limited(there, like)
+
+    def _lifts(self, lift: float) -> tuple[float, float]:
+        """Least and greatest lift of the stage that `lift` belongs to [m]."""
+        own = self.task.stage_of(lift).lift
+        middles = [(own + s.lift) / 2 for s in self.task.stages if s.lift != own]
+        low = max([LIFT[0], *(m + _INSIDE for m in middles if m < own)])
+        high = min([LIFT[1], *(m - _INSIDE for m in middles if m > own)])
+        return low, high
