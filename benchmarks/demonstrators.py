@@ -5,7 +5,8 @@
 
 Besides the demonstrators there are the searches of `warp_deform.planning`, which may simulate
 `--budget` actions a choice and look `--depth` actions ahead (`enumerate` one ahead is `mpc` with
-that budget), and `refined-`: the scripted demonstrator's successful episodes refined by a search.
+that budget), and `refined-`: successful episodes of the scripted demonstrator refined by a search,
+those with fewer actions accepted where both solve the task (`refine --accept solved`).
 Plays whole episodes in this process on the same seeds, eight side by side, with the images that a
 collection would render. One episode before each row, not timed, compiles or loads the kernels. With
 --out, rows already in that file are not measured again. Intervals of rates are Wilson's, others
@@ -212,7 +213,8 @@ def refined(
         for n, seed, by in ((1, WARM_UP, warm), (count, first, search)):
             began = time.process_time()
             collect(CollectConfig(task=task, episodes=n, seed=seed, out=demos / str(n), workers=1))
-            refine(RefineConfig(source=demos / str(n), out=out / str(n), search=by, workers=1))
+            refine(RefineConfig(source=demos / str(n), out=out / str(n), search=by,
+                                accept="solved", workers=1))  # fmt: skip
             cpu = time.process_time() - began
         infos = EpisodeReader(out / str(count)).infos()
     return (
