@@ -13,7 +13,8 @@ from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
 from warp_deform.tasks.registry import task as find_task
 
-__all__ = ["EvalOptions", "TrainOptions", "evaluate", "train"]
+__all__ = ["EvalOptions", "ReportOptions", "SweepOptions", "TrainOptions", "evaluate", "report",
+           "sweep", "train"]  # fmt: skip
 
 _Task = Annotated[Positional[str], arg(metavar="TASK")]
 _Folder = Annotated[Positional[Path], arg(metavar="RUN")]
@@ -54,6 +55,8 @@ class TrainOptions(CommandOptions):
     """Where the network computes; under `torchrun`, each process takes one GPU."""
     threads: Annotated[int, arg(metavar="N")] = 1
     """Threads of torch."""
+    untrained: bool = False
+    """Also keep the untrained network, as the snapshot of step 0: learning curves begin there."""
     tensorboard: bool = False
     """Write for TensorBoard too (needs the extra `train`)."""
 
@@ -78,6 +81,7 @@ def train(options: TrainOptions) -> Outcome:
         validate=options.validate,
         patience=options.patience,
         tensorboard=options.tensorboard,
+        untrained=options.untrained,
     )
     changes: dict[str, Any] = {
         name: value
@@ -94,7 +98,8 @@ def train(options: TrainOptions) -> Outcome:
 class EvalOptions(CommandOptions):
     """Choose a run's best snapshot on validation seeds and play the test seeds with it.
 
-    Goals are constructed from goal seeds. Results are kept: what was played is not played again.
+    Goals are constructed from goal seeds unless given. Results are kept: what was played is not
+    played again.
     """
 
     run: _Folder
@@ -111,6 +116,13 @@ class EvalOptions(CommandOptions):
     retry: bool = True
     """Agents over pictures pick elsewhere after an action that changed nothing that they see; the
     paper's do not."""
+    goals: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder of goals that the test episodes share in turn, see `warp-deform goals`."""
+    video: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for an MP4 of each of the first test episodes: observation, goal, heat maps of pick
+    and place, action, score."""
+    videos: Annotated[int, arg(metavar="N")] = 4
+    """Videos at most."""
     robot: Literal["ur5", "panda"] = "ur5"
     """The arm."""
     workers: Annotated[int | None, arg(metavar="W")] = None
@@ -123,6 +135,8 @@ def evaluate(options: EvalOptions) -> Outcome:
 
     if options.workers is not None and options.workers < 1:
         raise InputError(f"--workers is {options.workers}; it must be 1 or more")
+    if options.videos < 1:
+        raise InputError(f"--videos is {options.videos}; it must be 1 or more")
     quiet_warp()
     report = evaluate_run(
         options.run,
@@ -132,9 +146,73 @@ def evaluate(options: EvalOptions) -> Outcome:
         stage_rule=options.stage_rule,
         retry=options.retry,
         robot=options.robot,
+        goals=options.goals,
+        video=options.video,
+        videos=options.videos,
         workers=options.workers,
     )
     return Outcome(data=report, text=_describe(report))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions(CommandOptions):
+    """Tables and learning curves of evaluated runs, with the paper's numbers beside them.
+
+    Runs that differ in their seed alone are taken together.
+    """
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUNS")]
+    """Folders of training runs, or folders that hold some."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for report.md, report.csv, report.tex and the curves; left out, only the text is
+    shown."""
+
+
+def report(options: ReportOptions) -> Outcome:
+    """Report evaluated runs."""
+    if not options.runs:
+        raise InputError("no run is named; name folders that `warp-deform train` made with --out")
+    from .report import write_report
+
+    found = write_report(options.runs, options.out)
+    return Outcome(data=found.data, text=found.text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions(CommandOptions):
+    """Train and evaluate a grid of tasks, agents, numbers of demonstrations and seeds.
+
+    What is done is skipped, so the same command goes on where it was interrupted. Demonstrations
+    are collected where they are missing.
+    """
+
+    file: Annotated[Positional[Path], arg(metavar="FILE.toml")]
+    """The grid; see docs/learning.md."""
+    workers: Annotated[int | None, arg(metavar="W")] = None
+    """Processes; left out, one per core, or the cluster's cores. Each trains with one thread."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Address of a Ray cluster to work on (needs the extra `ray`)."""
+
+
+def sweep(options: SweepOptions) -> Outcome:
+    """Run a grid."""
+    from .sweep import read_sweep, run_sweep
+
+    config = read_sweep(options.file)
+    quiet_warp()
+    found = run_sweep(config, workers=options.workers, ray=options.ray)
+    failure = None
+    if found["failed"]:
+        first = found["failed"][0]
+        failure = (
+            f"{len(found['failed'])} of {found['runs']} runs failed; first {first['run']}: "
+            f"{first['error']}"
+        )
+    done = found["runs"] - len(found["failed"])
+    text = f"{done} of {found['runs']} runs are done, {found['skipped']} were before"
+    if found["report"] is not None:
+        text += f"; tables and curves: {found['report']}"
+    return Outcome(data=found, text=text, failure=failure)
 
 
 def _describe(report: dict[str, Any]) -> str:
@@ -151,12 +229,16 @@ def _describe(report: dict[str, Any]) -> str:
         "mean actions": f"{test['mean_actions']:.2f}",
         "paper's value": f"{test['paper_value']:.1f} %",
     }
+    if test["failures"]:
+        lines["failures"] = ", ".join(f"{name} {n}" for name, n in test["failures"].items())
     if report["paper"] is not None:
         paper = report["paper"]
         lines["paper's way"] = (
             f"{paper['paper_value']:.1f} %, best of {paper['n_snapshots']} snapshots on "
             f"{paper['n_episodes']} test episodes themselves (optimistic)"
         )
+    if "videos" in report:
+        lines["videos"] = ", ".join(report["videos"])
     return _lines(lines)
 
 

@@ -13,16 +13,17 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.stats import binomtest
 
 from warp_deform.episode_loop import SOLVED, Run, play, worlds_for
-from warp_deform.episodes import Goal, versions
+from warp_deform.episodes import EpisodeReader, Goal, combine_hashes, versions
 from warp_deform.errors import InputError
 from warp_deform.goals import GOAL_SEED, load_goals, make_goals
 from warp_deform.tasks.registry import task as find_task
@@ -31,6 +32,7 @@ from warp_deform.workers import Workers
 from warp_deform.worlds import Worlds
 from warp_deform.wrappers import stage_at
 
+from .failures import bag_opening, failure
 from .policy import (
     AgentDescription,
     ImagePolicy,
@@ -41,8 +43,9 @@ from .policy import (
 )
 from .snapshots import RunFolder, read_json, read_snapshot, write_json
 
-__all__ = ["PARTIAL_CREDIT", "Evaluation", "Played", "Protocol", "best", "evaluate_snapshot",
-           "known", "summarise"]  # fmt: skip
+__all__ = ["PARTIAL_CREDIT", "UNCLASSIFIED", "Evaluation", "Measured", "Played", "Protocol",
+           "best", "check_goals", "evaluate_snapshot", "goal_distance", "goals_for", "known",
+           "play_policy", "summarise"]  # fmt: skip
 
 FIRST_SEED = {"validation": 50_000, "test": 10_000}
 PARTIAL_CREDIT = frozenset(
@@ -52,6 +55,8 @@ PARTIAL_CREDIT = frozenset(
     }
 )  # fmt: skip
 """Tasks whose result in the paper's table is the mean score; that of the others is successes."""
+UNCLASSIFIED = "unclassified"
+"""Failures of results that an earlier release stored, which did not say why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +68,7 @@ class Protocol:
     goals: "constructed": for validation from the episode's own seed, for test from goal seeds;
         "demonstrated": ends of demonstrations on goal seeds, the paper's
     n_goals: goals that the test episodes share in turn
+    goal_folder: a folder of goals that the test episodes share in turn instead
     stage_rule: who chooses the lift, "action" (the policy) or "privileged" (the paper's hidden
         rule, which reads the simulator)
     retry: whether agents over pictures pick elsewhere after an action that changed nothing that
@@ -73,6 +79,7 @@ class Protocol:
     episodes: int
     goals: Literal["constructed", "demonstrated"] = "constructed"
     n_goals: int = 200
+    goal_folder: Path | None = None
     stage_rule: Literal["action", "privileged"] = "action"
     retry: bool = True
     robot: str = "ur5"
@@ -90,13 +97,27 @@ class Protocol:
 
 @dataclass(frozen=True)
 class Played:
-    """One episode. score: at its end, 0 if its physics cannot be trusted; reason: why it ended."""
+    """One episode. score: at its end, 0 if its physics cannot be trusted; reason: why it ended.
+
+    failure: which of `failures.FAILURES` it is; None if solved, or stored by an earlier release
+    goal_l2: for goal-conditioned tasks, `goal_distance` at the start and after every action
+    """
 
     seed: int
     success: bool
     score: float
     actions: int
     reason: str
+    failure: str | None = None
+    goal_l2: tuple[float, ...] | None = None
+
+
+class Measured(NamedTuple):
+    """What evaluation takes down of a state: score, distance to the goal, opening of a bag."""
+
+    score: float
+    goal_l2: float | None
+    opening: float | None
 
 
 @dataclass(frozen=True)
@@ -124,7 +145,7 @@ def evaluate_snapshot(
     done = {} if not path.exists() else {e["seed"]: e for e in read_json(path)["episodes"]}
     missing = [seed for seed in protocol.seeds if seed not in done]
     if missing:
-        goals = _goals(run, description.task, protocol)
+        goals = goals_for(run, description.task, protocol)
         crew = Workers(min(workers, len(missing)))
         size = math.ceil(len(missing) / crew.count)
         chunks = [
@@ -139,7 +160,7 @@ def evaluate_snapshot(
                 done[played.seed] = asdict(played)
                 record = _identity(run, step, protocol)
                 write_json(path, {**record, "episodes": [done[seed] for seed in sorted(done)]})
-    episodes = tuple(Played(**done[seed]) for seed in protocol.seeds)
+    episodes = tuple(_played(done[seed]) for seed in protocol.seeds)
     return Evaluation(step, episodes, summarise(episodes, task=description.task))
 
 
@@ -166,11 +187,15 @@ def summarise(episodes: Sequence[Played], *, task: str) -> dict[str, Any]:
     n_episodes, n_success, pc_success [%], pc_success_ci95: Wilson's interval [%], mean_score in
     [0, 1] with its standard_error, mean_actions, mean_actions_solved (of successes, None without),
     paper_value [%]: what the paper's table calls success, see `PARTIAL_CREDIT`
+    failures: how often each of `failures.FAILURES` happened, and `UNCLASSIFIED`
+    goal_l2: mean of the last states' `goal_distance`, None where there is no goal
     """
     n, solved = len(episodes), [e for e in episodes if e.success]
     interval = binomtest(len(solved), n).proportion_ci(method="wilson")
     scores = np.array([e.score for e in episodes])
     mean, rate = float(scores.mean()), 100 * len(solved) / n
+    failed = Counter(e.failure or UNCLASSIFIED for e in episodes if not e.success)
+    distances = [e.goal_l2[-1] for e in episodes if e.goal_l2]
     return {
         "n_episodes": n,
         "n_success": len(solved),
@@ -181,6 +206,8 @@ def summarise(episodes: Sequence[Played], *, task: str) -> dict[str, Any]:
         "mean_actions": float(np.mean([e.actions for e in episodes])),
         "mean_actions_solved": float(np.mean([e.actions for e in solved])) if solved else None,
         "paper_value": 100 * mean if task in PARTIAL_CREDIT else rate,
+        "failures": dict(sorted(failed.items())),
+        "goal_l2": float(np.mean(distances)) if distances else None,
     }
 
 
@@ -204,42 +231,85 @@ def _play_chunk(chunk: _Chunk) -> Iterator[Played]:
     policy = load_policy(chunk.snapshot)
     worlds = worlds_for(chunk.task, chunk.protocol.robot)
     goals = load_goals(chunk.goals) if chunk.goals is not None else []
-    first = FIRST_SEED[chunk.protocol.split]
+    for _, played, _ in play_policy(policy, worlds, chunk.protocol, chunk.seeds, goals):
+        yield played
+
+
+def play_policy(
+    policy: ImagePolicy | StatePolicy,
+    worlds: Worlds,
+    protocol: Protocol,
+    seeds: Sequence[int],
+    goals: Sequence[Goal] = (),
+    *,
+    watch: Callable[[int, Mapping[str, np.ndarray], np.ndarray], None] | None = None,
+) -> Iterator[tuple[int, Played, Run[Measured]]]:
+    """Play episodes of a protocol in `worlds`; each is yielded, after its slot, when it is over.
+
+    goals: shared by the split's seeds in turn; none: every seed constructs its own
+    watch: called with a slot, what is seen there, and the action chosen
+    """
+    first = FIRST_SEED[protocol.split]
     stages: dict[int, Stage | None] = {}
     players: dict[int, Policy] = {}
 
     def goal(seed: int) -> Goal | None:
         return goals[(seed - first) % len(goals)] if goals else None
 
-    def act(worlds: Worlds, runs: Mapping[int, Run[float]]) -> dict[int, np.ndarray | None]:
+    def act(worlds: Worlds, runs: Mapping[int, Run[Measured]]) -> dict[int, np.ndarray | None]:
         """What the policy does in every slot, one picture at a time: no neighbour changes a bit."""
         chosen: dict[int, np.ndarray | None] = {}
         for slot, run in runs.items():
             if not run.actions:
-                players[slot] = _player(policy, chunk.protocol)
+                players[slot] = _player(policy, protocol)
             seen = _observe(worlds, slot, state=isinstance(policy, StatePolicy))
             action = players[slot].act(seen, rng=run.rng)
-            if chunk.protocol.stage_rule == "privileged":
+            if protocol.stage_rule == "privileged":
                 before = stages.get(slot) if run.actions else None
                 stage = stages[slot] = stage_at(worlds, slot, action[:6], before)
                 action[6] = stage.lift
+            if watch is not None:
+                watch(slot, seen, action)
             chosen[slot] = action
         return chosen
 
-    def score(worlds: Worlds, slot: int) -> float:
-        return float(worlds.score(slot))
+    def measure(worlds: Worlds, slot: int) -> Measured:
+        episode, distance = worlds.episodes[slot], None
+        if episode.goal is not None:
+            distance = goal_distance(episode.snapshot.images.color, episode.goal.color)
+        return Measured(float(worlds.score(slot)), distance, bag_opening(worlds, slot))
 
-    for _, run in play(worlds, chunk.seeds, act=act, look=score, goals=goal):
+    for slot, run in play(worlds, seeds, act=act, look=measure, goals=goal):
         ended = run.ended or ""
         # an episode that ends for its physics has one row fewer and counts with nothing
         trusted = bool(run.rows) and len(run.rows) == len(run.actions) + 1
-        yield Played(
-            run.seed,
-            ended == SOLVED,
-            run.rows[-1] if trusted else 0.0,
-            len(run.actions),
-            ended,
+        distances = tuple(row.goal_l2 for row in run.rows if row.goal_l2 is not None)
+        played = Played(
+            seed=run.seed,
+            success=ended == SOLVED,
+            score=run.rows[-1].score if trusted else 0.0,
+            actions=len(run.actions),
+            reason=ended,
+            failure=failure(worlds, slot, run, [row.opening for row in run.rows]),
+            goal_l2=distances or None,
         )
+        yield slot, played, run
+
+
+def goal_distance(color: np.ndarray, goal: np.ndarray) -> float:
+    """Euclidean norm of the difference of two pictures (H, W, 3) uint8, over their H x W x 3.
+
+    Source: Seita et al., ICRA 2021, code of the evaluation; there the difference of bytes wraps
+    around at 256, here it has its sign.
+    """
+    difference = color.astype(np.int16) - goal.astype(np.int16)
+    return float(np.linalg.norm(difference.ravel().astype(float)) / difference.size)
+
+
+def _played(entry: Mapping[str, Any]) -> Played:
+    """An episode as a file has it, or as it was just played."""
+    distances = entry.get("goal_l2")
+    return Played(**{**entry, "goal_l2": None if distances is None else tuple(distances)})
 
 
 def _player(policy: ImagePolicy | StatePolicy, protocol: Protocol) -> Policy:
@@ -261,8 +331,14 @@ def _observe(worlds: Worlds, slot: int, *, state: bool) -> dict[str, np.ndarray]
     return seen
 
 
-def _goals(run: RunFolder, task: str, protocol: Protocol) -> Path | None:
-    """Folder of the goals to play for, made if need be; None: every seed constructs its own."""
+def goals_for(run: RunFolder, task: str, protocol: Protocol) -> Path | None:
+    """Folder of the goals to play for, made if need be; None: every seed constructs its own.
+
+    Raises:
+        InputError: the protocol's folder holds no goals of the task.
+    """
+    if protocol.goal_folder is not None and protocol.split == "test":
+        return check_goals(protocol.goal_folder, task)
     if not find_task(task).goal_conditioned:
         return None
     if protocol.split == "validation" and protocol.goals == "constructed":
@@ -276,11 +352,31 @@ def _goals(run: RunFolder, task: str, protocol: Protocol) -> Path | None:
     return folder
 
 
+def check_goals(folder: Path, task: str) -> Path:
+    """The folder, if it holds goals of the task.
+
+    Raises:
+        InputError: it does not, or the task has no goals.
+    """
+    if not find_task(task).goal_conditioned:
+        raise InputError(f"{task} has no goal image, so no goals can be given")
+    for info in EpisodeReader(folder).infos():
+        if info.task != task:
+            raise InputError(f"{folder} holds goals of {info.task}, not of {task}")
+    load_goals(folder)
+    return folder
+
+
 def _identity(run: RunFolder, step: int, protocol: Protocol) -> dict[str, Any]:
     """What the results of a protocol depend on; not on how many of its episodes were played."""
     weights = hashlib.blake2b(run.snapshot(step).read_bytes(), digest_size=8).hexdigest()
     goals = min(protocol.n_goals, protocol.episodes) if protocol.split == "test" else None
     described = {**asdict(protocol), "episodes": None, "n_goals": goals}
+    folder = described.pop("goal_folder")
+    if folder is not None and protocol.split == "test":
+        # goals count by what they are, not by where they lie
+        shown = (info.state_hash for info in EpisodeReader(folder).infos())
+        described |= {"goals": combine_hashes(shown), "n_goals": None}
     return {"step": step, "weights": weights, "protocol": described, "versions": versions()}
 
 

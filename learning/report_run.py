@@ -11,9 +11,10 @@ import joblib
 from rich.console import Console
 from rich.progress import track
 
+from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
 
-from .evaluation import Evaluation, Protocol, best, evaluate_snapshot
+from .evaluation import Evaluation, Protocol, best, check_goals, evaluate_snapshot
 from .snapshots import RunFolder, write_json
 
 __all__ = ["evaluate_run"]
@@ -32,15 +33,24 @@ def evaluate_run(
     stage_rule: Literal["action", "privileged"] = "action",
     retry: bool = True,
     robot: str = "ur5",
+    goals: Path | None = None,
+    video: Path | None = None,
+    videos: int = 4,
     workers: int | None = None,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Choose the best snapshot on validation seeds, and play the test seeds with it.
 
+    goals: folder of goals for the test episodes; None: constructed from goal seeds
+    video: folder for videos of the first `videos` test episodes
+    progress: show bars on a terminal
+
     Writes `eval_info.json` into the run's folder and returns what it says: task, agent, preset,
-    demos, seed, stage_rule, retry, robot, seconds [s]; `snapshots`: by step, results on validation
-    seeds; `selected`: the step chosen; `test`: its results on test seeds; `paper`: None, or the
-    best of the snapshots' results by the paper's protocol. See `evaluation.summarise` for a
-    result's keys.
+    steps, demos, seed, stage_rule, retry, robot, goals, seconds [s]; `snapshots`: by step, results
+    on validation seeds; `selected`: the step chosen; `test`: its results on test seeds; `paper`:
+    None, or the best of the snapshots' results by the paper's protocol, and in its `snapshots` all
+    of them by step. Step 0, the untrained network, is played for the learning curve and never
+    chosen; `videos`: paths, where asked for. See `evaluation.summarise` for a result's keys.
 
     Raises:
         InputError: this is no finished run.
@@ -48,7 +58,7 @@ def evaluate_run(
     began = time.perf_counter()
     run = RunFolder(path)
     settings, steps = run.read_settings(), run.steps()
-    if not steps:
+    if not any(steps):
         raise InputError(f"{run.path} has no snapshot yet; run `warp-deform train` to its end")
     task = settings["agent"]["task"]
 
@@ -63,19 +73,23 @@ def evaluate_run(
         retry=retry,
         robot=robot,
     )
-    test = replace(validation, split="test", episodes=episodes)
-    validated = [play(step, validation) for step in _progress(steps, "validation")]
-    chosen = best(validated, task=task)
+    test = replace(validation, split="test", episodes=episodes, goal_folder=goals)
+    if goals is not None:  # a wrong folder is told of before anything is played
+        check_goals(goals, task)
+    validated = [play(step, validation) for step in _bar(steps, "validation", shown=progress)]
+    chosen = best([each for each in validated if each.step], task=task)
     result = play(chosen.step, test)
     report: dict[str, Any] = {
         "task": task,
         "agent": settings["agent"]["agent"],
         "preset": settings["preset"],
+        "steps": settings["schedule"]["steps"],
         "demos": len(settings["demonstrations"]),
         "seed": settings["seed"],
         "stage_rule": stage_rule,
         "retry": retry,
         "robot": robot,
+        "goals": _named(goals),
         "snapshots": {str(e.step): {"split": "validation", **e.summary} for e in validated},
         "selected": chosen.step,
         "test": result.summary,
@@ -87,22 +101,38 @@ def evaluate_run(
             episodes=_PAPER_EPISODES,
             goals="demonstrated",
             n_goals=_PAPER_EPISODES,
+            goal_folder=None,
             retry=False,
         )
-        played = [play(step, theirs) for step in _progress(steps, "paper's protocol")]
-        top = best(played, task=task)
+        bar = _bar(steps, "paper's protocol", shown=progress)
+        played = [play(step, theirs) for step in bar]
+        top = best([each for each in played if each.step], task=task)
         report["paper"] = {
             "protocol": "best of the snapshots on the test seeds themselves (optimistic)",
-            "n_snapshots": len(steps),
+            "n_snapshots": sum(step > 0 for step in steps),
             "snapshot": top.step,
             **top.summary,
+            "snapshots": {str(e.step): {"split": "test", **e.summary} for e in played},
         }
+    if video is not None:
+        from .film import film_episodes
+
+        count = min(videos, episodes)
+        report["videos"] = [str(p) for p in film_episodes(run, result, test, video, count=count)]
     report["seconds"] = time.perf_counter() - began
     write_json(run.report, report)
     return report
 
 
-def _progress(steps: list[int], name: str) -> Any:
+def _named(goals: Path | None) -> str:
+    """Whose goals the test episodes had."""
+    if goals is None:
+        return "constructed"
+    return f"given, {combine_hashes(info.state_hash for info in EpisodeReader(goals).infos())[:12]}"
+
+
+def _bar(steps: list[int], name: str, *, shown: bool) -> Any:
     """The steps, with a bar on stderr while somebody looks at it."""
     console = Console(stderr=True)
-    return track(steps, name, console=console, transient=True, disable=not console.is_terminal)
+    hidden = not (shown and console.is_terminal)
+    return track(steps, name, console=console, transient=True, disable=hidden)

@@ -89,6 +89,8 @@ class TrainConfig:
     threads: of torch, a process; another number may change the last bits
     validate: validation episodes that every snapshot plays; 0 plays none
     patience: stop when so many snapshots in a row brought no better validation; None never stops
+    untrained: also a snapshot of the initial weights, step 0, where a learning curve begins
+    progress: show a bar on a terminal
     """
 
     task: str
@@ -105,6 +107,8 @@ class TrainConfig:
     validate: int = 0
     patience: int | None = None
     tensorboard: bool = False
+    untrained: bool = False
+    progress: bool = True
 
     def __post_init__(self) -> None:
         find_task(self.task)
@@ -182,7 +186,8 @@ def train(config: TrainConfig) -> TrainReport:
         store = min(every, max(every // 10, 100))
         stopped = _stopped(run, config)
 
-        with _progress(config.task, first, plan.steps, enabled=rank == 0) as advance:
+        shown = config.progress and rank == 0
+        with _progress(config.task, first, plan.steps, enabled=shown) as advance:
             for step in range(first + 1, plan.steps + 1):
                 if stopped:
                     break
@@ -215,6 +220,9 @@ def train(config: TrainConfig) -> TrainReport:
                     stopped = _stopped(run, config)
                 advance()
         log.close()
+        if config.untrained and rank == 0:
+            initial = dict(make_agent(description, seed=config.seed).named_parameters())
+            run.write_snapshot(0, _detached(initial), {"agent": asdict(description)})
         here.wait()
         steps = run.steps()
         return TrainReport(
@@ -372,7 +380,7 @@ def _stopped(run: RunFolder, config: TrainConfig) -> bool:
     scores = [
         evaluate_snapshot(run, step, protocol).summary["mean_score"]
         for step in run.steps()
-        if known(run, step, protocol)
+        if step and known(run, step, protocol)
     ]
     return len(scores) - 1 - int(np.argmax(scores or [0])) >= config.patience
 

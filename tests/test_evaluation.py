@@ -6,6 +6,8 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,14 +20,21 @@ from learning.evaluation import (
     Protocol,
     best,
     evaluate_snapshot,
+    goal_distance,
     known,
     summarise,
 )
+from learning.failures import FAILURES, bag_opening, closed, failure, puts_back
 from learning.report_run import evaluate_run
 from learning.snapshots import RunFolder
 from learning.training import Schedule, TrainConfig, train
 from warp_deform.cli import main
+from warp_deform.episode_loop import Run
+from warp_deform.episodes import EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
+from warp_deform.goals import load_goals, make_goals
+from warp_deform.tasks.bag_items import BagItems1
+from warp_deform.tasks.cable_line import CableLineNotarget
 
 TASK = "cable-line-notarget"
 SCHEDULE = Schedule(steps=2, batch=4, lr=1e-3, snapshots=2)
@@ -166,3 +175,163 @@ def test_training_stops_when_validation_brings_nothing_better(
     assert report.stopped_early and report.snapshots == (1, 2, 3)
     again = train(config)
     assert again.snapshots == report.snapshots and again.weights_hash == report.weights_hash
+
+
+def test_the_untrained_network_is_played_and_never_chosen(tmp_path: Path) -> None:
+    data = write_demonstrations(tmp_path / "demos", 2, task="block-notarget")
+    plain = TrainConfig(
+        task="block-notarget", agent="gt-mlp", data=data, out=tmp_path / "plain", preset="fast",
+        schedule=SCHEDULE,
+    )  # fmt: skip
+    first = train(plain)
+    with_it = train(replace(plain, out=tmp_path / "both", untrained=True))
+    assert with_it.weights_hash == first.weights_hash
+    assert with_it.snapshots == (0, 1, 2) and first.snapshots == (1, 2)
+    assert train(replace(plain, untrained=True)).snapshots == (0, 1, 2), "also afterwards"
+    zero, one = (RunFolder(tmp_path / "both").snapshot(step) for step in (0, 1))
+    assert RunFolder(tmp_path / "plain").snapshot(0).read_bytes() == zero.read_bytes()
+    assert zero.read_bytes() != one.read_bytes()
+    report = evaluate_run(tmp_path / "both", episodes=1, validation_episodes=1, paper=False)
+    assert report["snapshots"].keys() == {"0", "1", "2"} and report["selected"] == 2
+
+
+def test_a_folder_of_goals(run: RunFolder, tmp_path: Path) -> None:
+    make_goals("block-notarget", tmp_path / "goals", count=2, kind="constructed", seed=100_007)
+    protocol = Protocol(split="test", episodes=3, goal_folder=tmp_path / "goals")
+    found = evaluate_snapshot(run, 1, protocol)
+    own = evaluate_snapshot(run, 1, replace(protocol, goal_folder=None))
+    distances = [each.goal_l2 for each in found.episodes]
+    assert all(each and len(each) == 3 for each in distances), "a start and two actions"
+    assert distances[0] != own.episodes[0].goal_l2
+    copy = tmp_path / "copy"
+    (tmp_path / "goals").rename(copy)
+    assert known(run, 1, replace(protocol, goal_folder=copy)), "goals count, not where they lie"
+    with pytest.raises(InputError):
+        evaluate_snapshot(run, 1, protocol)
+
+
+def test_goals_that_do_not_fit_are_told_of_in_one_line(
+    run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_goals("block-notarget", tmp_path / "goals", count=1, kind="constructed")
+    episode = EpisodeReader(tmp_path / "goals").read(100_000)
+    for name, info in {
+        "imported": replace(episode.info, extra={}),
+        "garbled": replace(episode.info, extra={"goal_targets": ["a"]}),
+        "others": replace(episode.info, task=TASK),
+    }.items():
+        EpisodeWriter(tmp_path / name).write(replace(episode, info=info))
+        assert main(["eval", str(run.path), "--goals", str(tmp_path / name)]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and ("goals of" in said or "stands for as a goal" in said)
+    with pytest.raises(InputError, match="stands for"):
+        load_goals(tmp_path / "imported")
+
+
+def test_distance_to_the_goal() -> None:
+    """As in the original but for bytes that wrap around: 1 - 2 is -1, not 255."""
+    color = np.full((4, 2, 3), 2, np.uint8)
+    assert goal_distance(color, color) == 0.0
+    assert goal_distance(color - 1, color) == goal_distance(color + 1, color)
+    assert goal_distance(color + 3, color) == pytest.approx(3 * math.sqrt(24) / 24)
+
+
+def action(pick: tuple[float, float], place: tuple[float, float], lift: float = 0.05) -> np.ndarray:
+    return np.array([*pick, 0.0, *place, 0.0, lift])
+
+
+THERE = action((0.5, 0.0), (0.6, 0.2))
+BACK = action((0.61, 0.21), (0.5, 0.02))
+ELSEWHERE = action((0.3, -0.3), (0.4, 0.4))
+
+
+@pytest.mark.parametrize(
+    ("actions", "expected"),
+    [
+        ([THERE, BACK, THERE], True),
+        ([THERE, BACK], False),
+        ([THERE, THERE, THERE], False),
+        ([THERE, BACK, ELSEWHERE, BACK], False),
+        ([THERE, ELSEWHERE] * 3, False),
+        ([], False),
+    ],
+)
+def test_actions_that_put_back(actions: list[np.ndarray], expected: bool) -> None:
+    assert puts_back(actions) is expected
+
+
+def test_an_opening_that_was_closed_for_good() -> None:
+    assert closed([0.6, 0.3, 0.3], [True, True])
+    assert not closed([0.6, 0.3, 0.5], [True, True]), "it was opened again"
+    assert not closed([0.6, 0.3], [False]), "a carry closes any bag"
+    assert closed([0.6, 0.3, 0.1], [True, False])
+    assert not closed([0.6], [])
+
+
+class _Bag(BagItems1):
+    covered, inside = False, False
+
+    def hidden(self, *_: Any) -> bool:
+        return self.covered
+
+    def inside_bag(self, *_: Any) -> bool:
+        return self.inside
+
+
+@pytest.mark.parametrize(
+    ("expected", "lifts", "outcomes", "openings", "covered", "inside"),
+    [
+        ("missed grasp", [0.05, 0.05], ["missed", "placed"], [0.4] * 3, True, False),
+        ("missed grasp", [0.05, 0.05], ["unreachable", "missed"], [0.4] * 3, True, False),
+        ("destructive bag action", [0.05, 0.3], ["placed"] * 2, [0.6, 0.3, 0.3], True, False),
+        ("item not enclosed", [0.3, 0.4], ["placed"] * 2, [0.6, 0.6, 0.1], True, False),
+        ("opening covered", [0.05, 0.05], ["placed"] * 2, [0.3] * 3, True, False),
+        ("opening covered", [0.3, 0.4], ["placed"] * 2, [0.6, 0.6, 0.1], True, True),
+        ("other", [0.3, 0.4], ["placed"] * 2, [0.6, 0.6, 0.1], False, True),
+    ],
+)
+def test_failures_of_bags(
+    expected: str,
+    lifts: list[float],
+    outcomes: list[str],
+    openings: list[float],
+    covered: bool,
+    inside: bool,
+) -> None:
+    task = _Bag()
+    task.covered, task.inside = covered, inside
+    snapshot = SimpleNamespace(body_q=np.zeros((1, 7)))
+    episode = SimpleNamespace(physics_ok=True, snapshot=snapshot, layout=None)
+    worlds: Any = SimpleNamespace(task=task, episodes={0: episode})
+    run: Run[Any] = Run(0, np.random.default_rng(0))
+    run.actions = [action((0.3, 0.1 * n), (0.6, 0.0), lift) for n, lift in enumerate(lifts)]
+    run.outcomes, run.ended = outcomes, "not solved"
+    assert failure(worlds, 0, run, openings) == expected and expected in FAILURES
+    run.ended = "solved"
+    assert failure(worlds, 0, run, openings) is None
+    run.ended, episode.physics_ok = "physics: stretch", False
+    assert failure(worlds, 0, run, openings) == "physics"
+
+
+def test_failures_without_a_bag() -> None:
+    episode = SimpleNamespace(physics_ok=True, snapshot=None, layout=None)
+    worlds: Any = SimpleNamespace(task=CableLineNotarget(), episodes={0: episode})
+    assert bag_opening(worlds, 0) is None
+    run: Run[Any] = Run(0, np.random.default_rng(0))
+    run.actions, run.outcomes = [THERE, BACK, THERE], ["placed"] * 3
+    run.ended = "not solved in 3 actions"
+    assert failure(worlds, 0, run, [None] * 4) == "back and forth"
+    run.actions = [ELSEWHERE] * 3
+    assert failure(worlds, 0, run, [None] * 4) == "other"
+
+
+def test_failures_are_counted(run: RunFolder) -> None:
+    found = evaluate_snapshot(run, 1, Protocol(split="validation", episodes=3))
+    failed = [each for each in found.episodes if not each.success]
+    assert all(each.failure in FAILURES for each in failed)
+    assert sum(found.summary["failures"].values()) == len(failed) > 0
+    assert found.summary["goal_l2"] == pytest.approx(
+        np.mean([each.goal_l2[-1] for each in found.episodes if each.goal_l2])
+    )
+    old = [replace(each, failure=None, goal_l2=None) for each in found.episodes]
+    assert summarise(old, task="block-notarget")["failures"] == {"unclassified": len(failed)}

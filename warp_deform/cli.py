@@ -47,6 +47,8 @@ VERBS: dict[str, Verb] = {
     "convert": Verb("learning.convert_cli:convert", "datasets to and from other formats"),
     "train": Verb("learning.cli:train", "train an agent on demonstrations"),
     "eval": Verb("learning.cli:evaluate", "choose a run's best snapshot and test it"),
+    "report": Verb("learning.cli:report", "tables and learning curves beside the paper's"),
+    "sweep": Verb("learning.cli:sweep", "train and evaluate a grid, as long as it takes"),
     "refine": Verb("learning.refine_cli:refine", "improve demonstrations by search"),
     "bench": Verb("warp_deform.commands:bench", "time the simulator, alone or beside a peer"),
     "gradcheck": Verb(

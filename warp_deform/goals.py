@@ -195,6 +195,13 @@ def _goal(reader: EpisodeReader, seed: int) -> Goal:
         raise InputError(f"{path} is an episode of {info.task}, which has no goal image")
     if not info.success:
         raise InputError(f"{path} did not reach its goal, so its last state is none")
+    try:
+        targets = np.array(info.extra[GOAL_TARGETS], dtype=float)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} does not say what its last state stands for as a goal, as recordings from "
+            "elsewhere may not; `warp-deform goals` makes goals"
+        ) from error
     row = reader.read_step(seed, info.actions)
     kind = CONSTRUCTED if info.demonstrator == CONSTRUCTED else _DEMONSTRATED
-    return Goal(row.color, row.height, np.array(info.extra[GOAL_TARGETS]), kind, seed)
+    return Goal(row.color, row.height, targets, kind, seed)

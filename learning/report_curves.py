@@ -1,0 +1,90 @@
+"""Learning curves as PNG: against steps of training, and against numbers of demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from .report import Cell, PaperResults, Point
+
+__all__ = ["draw_curves"]
+
+_SIZE, _DPI = (6.4, 4.2), 130
+
+
+def draw_curves(cells: Sequence[Cell], paper: PaperResults, folder: Path) -> list[Path]:
+    """Write two PNGs a task, `steps_TASK.png` and `demonstrations_TASK.png`; returns their paths.
+
+    Bands and bars are one standard error. Step 0 is the untrained network, where a run kept it.
+    """
+    paths = []
+    for task in dict.fromkeys(cell.task for cell in cells):
+        mine = [cell for cell in cells if cell.task == task]
+        for name, draw in (("steps", _draw_steps), ("demonstrations", _draw_demonstrations)):
+            figure = Figure(_SIZE, dpi=_DPI, layout="constrained")
+            FigureCanvasAgg(figure)
+            axes = figure.add_subplot()
+            draw(axes, mine, paper)
+            axes.set_title(task)
+            axes.set_ylabel(f"{mine[0].measure} [%]")
+            axes.set_ylim(-3, 103)
+            axes.grid(alpha=0.3)
+            axes.legend(fontsize="x-small", loc="best")
+            path = folder / f"{name}_{task}.png"
+            figure.savefig(path, metadata={"Software": None})
+            paths.append(path)
+    return paths
+
+
+def _draw_steps(axes: Axes, cells: Sequence[Cell], paper: PaperResults) -> None:
+    axes.set_xlabel("steps of training")
+    for number, cell in enumerate(cells):
+        color, name = f"C{number % 10}", f"{_name(cell, cells)}, {cell.demos} demos"
+        _band(axes, cell.validation, color=color, label=f"{name}: validation", style="-")
+        if len(cell.test) > 1:
+            _band(axes, cell.test, color=color, label=f"{name}: paper's protocol", style="--")
+
+
+def _band(axes: Axes, points: Sequence[Point], *, color: str, label: str, style: str) -> None:
+    steps = [p.step for p in points]
+    values = np.array([p.value for p in points])
+    errors = np.array([0.0 if p.error is None else p.error for p in points])
+    axes.plot(steps, values, style, marker="o", ms=3, color=color, label=label)
+    axes.fill_between(steps, values - errors, values + errors, color=color, alpha=0.15, lw=0)
+
+
+def _draw_demonstrations(axes: Axes, cells: Sequence[Cell], paper: PaperResults) -> None:
+    axes.set_xlabel("demonstrations")
+    axes.set_xscale("log")
+    agents = list(dict.fromkeys(cell.agent for cell in cells))
+    variants = list(dict.fromkeys(cell.variant for cell in cells))
+    for color, agent in enumerate(agents):
+        for marker, variant in zip("os^Dv<>", variants, strict=False):
+            mine = [cell for cell in cells if (cell.agent, cell.variant) == (agent, variant)]
+            if mine:
+                axes.errorbar(
+                    [cell.demos for cell in mine],
+                    [cell.value for cell in mine],
+                    yerr=[cell.value_error or 0.0 for cell in mine],
+                    marker=marker,
+                    ms=4,
+                    capsize=3,
+                    color=f"C{color}",
+                    label=f"{_name(mine[0], cells)}: test",
+                )
+        keys = [(cells[0].task, agent, n) for n in paper.demos]
+        theirs = [(key[2], paper.values[key]) for key in keys if key in paper.values]
+        if theirs:
+            style = {"marker": "x", "ms": 5, "lw": 1, "color": f"C{color}"}
+            axes.plot(*zip(*theirs, strict=True), ":", label=f"{agent}: paper", **style)
+
+
+def _name(cell: Cell, cells: Sequence[Cell]) -> str:
+    """The agent, with the variant where there are several."""
+    several = len({each.variant for each in cells}) > 1
+    return f"{cell.agent} ({cell.variant})" if several else cell.agent

@@ -1,0 +1,351 @@
+"""A grid of tasks, agents, numbers of demonstrations and seeds, trained and evaluated.
+
+Every cell of the grid is a training run in a folder of its own, so nothing but the folders is
+needed to go on after an interruption: demonstrations, training and evaluation each resume by
+themselves, and a run that is done says so in `sweep.json`. Runs are spread over processes of one
+thread each, by joblib on one machine or Ray on a cluster whose machines share the folder.
+
+    OUT/demos/TASK                    demonstrations
+    OUT/runs/TASK-AGENT-DEMOS-sSEED   training runs
+    OUT/report                        tables and curves of those that are done
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import fcntl
+import json
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal
+
+import joblib
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from warp_deform.collect import CollectConfig, collect
+from warp_deform.demonstrators import demonstrator
+from warp_deform.episodes import EpisodeReader
+from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.robots import robot as find_robot
+from warp_deform.tasks.registry import task as find_task
+from warp_deform.workers import Workers, worker_count
+
+from .policy import AGENTS, AgentDescription
+from .report import write_report
+from .report_run import evaluate_run
+from .snapshots import read_json, write_json
+from .training import TrainConfig, train
+
+__all__ = ["Collecting", "Evaluating", "SweepConfig", "read_sweep", "run_sweep"]
+
+_DONE = "sweep.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collecting:
+    """Where demonstrations come from. The section `demonstrations` of the file.
+
+    folder: holds a folder of demonstrations a task; None: OUT/demos
+    count: to collect where a task has fewer; None: as many as the largest run needs
+    seed: first one of the collection; demonstrator: who acts
+    """
+
+    folder: Path | None = None
+    count: int | None = None
+    seed: int = 0
+    demonstrator: str = "scripted"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluating:
+    """How runs are evaluated, see `report_run.evaluate_run`. The section `evaluation`."""
+
+    episodes: int = 200
+    validation_episodes: int = 20
+    paper: bool = False
+    stage_rule: Literal["action", "privileged"] = "action"
+    retry: bool = True
+    robot: str = "ur5"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepConfig:
+    """A grid. The fields are the keys of the file; those without a default have to be there.
+
+    steps, batch, lr, snapshots: None takes the preset's; untrained: evaluate step 0 too
+    Agents are combined with the tasks that they fit: those that see a goal, with tasks that have
+    one.
+    """
+
+    out: Path
+    tasks: tuple[str, ...]
+    agents: tuple[str, ...]
+    demos: tuple[int, ...]
+    seeds: tuple[int, ...] = (0,)
+    preset: str = "fast"
+    steps: int | None = None
+    batch: int | None = None
+    lr: float | None = None
+    snapshots: int | None = None
+    untrained: bool = False
+    demonstrations: Collecting = field(default_factory=Collecting)
+    evaluation: Evaluating = field(default_factory=Evaluating)
+
+    def __post_init__(self) -> None:
+        for name in ("tasks", "agents", "demos", "seeds"):
+            values = getattr(self, name)
+            if not values or len(set(values)) < len(values):
+                raise InputError(f"{name} must name at least one, and none twice")
+        for task in self.tasks:
+            find_task(task)
+        for agent in self.agents:
+            if agent not in AGENTS:
+                raise InputError(f"there is no agent {agent!r}; there are: {', '.join(AGENTS)}")
+        if min(self.demos) < 1 or min(self.seeds) < 0:
+            raise InputError("demos must be 1 or more, seeds 0 or more")
+        rule = self.evaluation.stage_rule
+        if rule not in ("action", "privileged"):
+            raise InputError(f"stage_rule is {rule!r}; it must be 'action' or 'privileged'")
+        if self.evaluation.episodes < 1 or self.evaluation.validation_episodes < 1:
+            raise InputError("episodes and validation_episodes must be 1 or more")
+        find_robot(self.evaluation.robot)
+        demonstrator(self.demonstrations.demonstrator)
+        for task in self.tasks:
+            if not any(_fits(task, agent) for agent in self.agents):
+                raise InputError(f"none of the agents {', '.join(self.agents)} fits {task}")
+        self.cells()
+
+    def cells(self) -> list[TrainConfig]:
+        """The training runs, those with few demonstrations first."""
+        grid = product(self.demos, self.tasks, self.agents, self.seeds)
+        return [self._cell(*each) for each in grid if _fits(each[1], each[2])]
+
+    def data(self, task: str) -> Path:
+        """Folder of a task's demonstrations."""
+        return (self.demonstrations.folder or self.out / "demos") / task
+
+    def _cell(self, demos: int, task: str, agent: str, seed: int) -> TrainConfig:
+        config = TrainConfig(
+            task=task,
+            agent=agent,
+            data=self.data(task),
+            out=self.out / "runs" / f"{task}-{agent}-{demos}-s{seed}",
+            demos=demos,
+            seed=seed,
+            preset=self.preset,
+            untrained=self.untrained,
+            progress=False,
+        )
+        changes: dict[str, Any] = {
+            name: value
+            for name in ("steps", "batch", "lr", "snapshots")
+            if (value := getattr(self, name)) is not None
+        }
+        return replace(config, schedule=replace(config.plan, **changes))
+
+
+def read_sweep(path: Path) -> SweepConfig:
+    """The grid that a TOML file describes; paths in it are relative to the working directory.
+
+    Raises:
+        InputError: there is no such file, or something in it is wrong.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    except ValueError as error:  # not TOML, or not UTF-8
+        raise InputError(f"{path} is no TOML file: {error}") from error
+    try:
+        sections = {
+            name: _section(kind, data.pop(name, {}), f"{name}.")
+            for name, kind in (("demonstrations", Collecting), ("evaluation", Evaluating))
+        }
+        config: SweepConfig = _section(SweepConfig, data, "", **sections)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return config
+
+
+def run_sweep(
+    config: SweepConfig, *, workers: int | None = None, ray: str | None = None
+) -> dict[str, Any]:
+    """Do what is left of a grid, then report all of it that is done.
+
+    Returns `out`, `runs` (of the grid), `skipped` (done before), `failed` (each `run`, `error`),
+    `seconds` [s] and `report` (path of the tables, None if nothing is done).
+
+    Raises:
+        InputError: bad options, or another sweep is at work in the folder.
+        WarpDeformError: a worker process was killed; what had been finished is kept.
+    """
+    began = time.perf_counter()
+    cells = config.cells()
+    todo = [cell for cell in cells if not _done(cell, config)]
+    count = None
+    if ray is None or workers is not None:
+        most = joblib.cpu_count() if workers is None else worker_count(workers, len(todo))
+        count = min(most, max(len(todo), 1))
+    crew = Workers(count, ray=ray)
+    failed: list[dict[str, str]] = []
+    with _owned(config.out):
+        for task in dict.fromkeys(cell.task for cell in todo):
+            _collect(config, task, workers=workers, ray=ray)
+        with crew, _progress(len(cells), len(cells) - len(todo)) as tell:
+            for name, said, error in crew.run(_run, [(cell, config) for cell in todo]):
+                tell(f"{name}: {error or said}")
+                if error:
+                    failed.append({"run": name, "error": error})
+        done = [cell.out for cell in cells if _done(cell, config)]
+        report = config.out / "report"
+        if done:
+            write_report(done, report)
+    return {
+        "out": str(config.out),
+        "runs": len(cells),
+        "skipped": len(cells) - len(todo),
+        "failed": sorted(failed, key=lambda each: each["run"]),
+        "seconds": time.perf_counter() - began,
+        "report": str(report / "report.md") if done else None,
+    }
+
+
+def _fits(task: str, agent: str) -> bool:
+    """Whether an agent can be trained on a task."""
+    try:
+        AgentDescription(task=task, agent=agent, config={})
+    except InputError:
+        return False
+    return True
+
+
+def _wanted(cell: TrainConfig, config: SweepConfig) -> dict[str, Any]:
+    """What a run was to be, for the file that says that it is done."""
+    settings = {**asdict(cell), "data": str(cell.data), "out": None, "progress": None}
+    wanted: dict[str, Any] = json.loads(
+        json.dumps({"training": settings, "evaluation": asdict(config.evaluation)})
+    )
+    return wanted
+
+
+def _done(cell: TrainConfig, config: SweepConfig) -> bool:
+    """Whether a run is trained and evaluated as the grid wants it."""
+    record = cell.out / _DONE
+    return record.is_file() and read_json(record) == _wanted(cell, config)
+
+
+def _collect(config: SweepConfig, task: str, *, workers: int | None, ray: str | None) -> None:
+    """Collect a task's demonstrations, unless there are enough."""
+    folder, wanted = config.data(task), config.demonstrations
+    count = wanted.count or max(config.demos)
+    there = len(EpisodeReader(folder)) if any(folder.glob("*.parquet")) else 0
+    if there < count:
+        collect(
+            CollectConfig(
+                task=task,
+                episodes=count,
+                out=folder,
+                seed=wanted.seed,
+                demonstrator=wanted.demonstrator,
+                robot=config.evaluation.robot,
+                workers=workers,
+                ray=ray,
+            )
+        )
+
+
+def _run(job: tuple[TrainConfig, SweepConfig]) -> Iterator[tuple[str, str, str | None]]:
+    """Train and evaluate one run: its name, its result, and what went wrong if anything did."""
+    cell, config = job
+    began = time.perf_counter()
+    try:
+        train(cell)
+        test = evaluate_run(cell.out, workers=1, progress=False, **asdict(config.evaluation))[
+            "test"
+        ]
+    except WarpDeformError as error:
+        yield cell.out.name, "", " ".join(str(error).split())
+        return
+    write_json(cell.out / _DONE, _wanted(cell, config))
+    minutes = (time.perf_counter() - began) / 60
+    said = f"{test['n_success']} of {test['n_episodes']} solved, score {test['mean_score']:.3f}"
+    yield cell.out.name, f"{said}, {minutes:.1f} min", None
+
+
+def _section(kind: type[Any], data: object, where: str, **given: Any) -> Any:
+    """A config from a table of the file; `where` is the table's name before its keys."""
+    if not isinstance(data, dict):
+        raise InputError(f"{where.rstrip('.')} must be a table")
+    known = {each.name: each for each in fields(kind) if each.name not in given}
+    values = dict(given)
+    for key, value in data.items():
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(known)}"
+            raise InputError(f"unknown key {where + key!r}; {hint}")
+        values[key] = _value(where + key, value, str(known[key].type).removesuffix(" | None"))
+    missing = [
+        name
+        for name, each in known.items()
+        if name not in values and each.default is MISSING and each.default_factory is MISSING
+    ]
+    if missing:
+        raise InputError(f"{where + missing[0]!r} is missing")
+    return kind(**values)
+
+
+_KINDS = {"int": int, "float": float, "bool": bool, "str": str, "Path": str}
+
+
+def _value(key: str, value: object, kind: str) -> Any:
+    """A value of the file as the field's type `kind`, as it is written in the class."""
+    inner = kind.removeprefix("tuple[").removesuffix(", ...]")
+    if inner != kind:
+        if not isinstance(value, list):
+            raise InputError(f"{key} is {value!r}; it must be a list, as in [{value!r}]")
+        return tuple(_value(key, each, inner) for each in value)
+    wanted = _KINDS.get(kind, str)
+    if wanted is float and type(value) is int:
+        value = float(value)
+    if type(value) is not wanted:  # in Python, a bool is an int
+        name = {int: "a whole number", float: "a number", bool: "true or false"}
+        raise InputError(f"{key} is {value!r}; it must be {name.get(wanted, 'a string')}")
+    return Path(str(value)) if kind == "Path" else value
+
+
+@contextlib.contextmanager
+def _owned(out: Path) -> Iterator[None]:
+    """Hold the folder against another sweep; the lock ends with the process, however it ends."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        lock = (out / "sweep.lock").open("a")
+    except OSError as error:
+        raise InputError(f"out {out} cannot be made: {error.strerror}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"another sweep is at work in {out}; wait for it to end") from error
+        yield
+
+
+@contextlib.contextmanager
+def _progress(total: int, done: int) -> Iterator[Callable[[str], None]]:
+    """Yields what tells of a run that is over: a line on stderr, under it a bar on a terminal."""
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    columns = TextColumn("sweep"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    hidden = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=hidden) as bars:
+        bar = bars.add_task("sweep", total=total, completed=done)
+
+        def tell(line: str) -> None:
+            console.print(line, markup=False)
+            bars.advance(bar)
+
+        yield tell

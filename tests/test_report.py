@@ -1,0 +1,231 @@
+"""The report: runs pooled as the textbook says, the paper's numbers, and what cannot be pooled."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from learning.evaluation import Played, summarise
+from learning.policy import AGENTS
+from learning.report import Point, pool, read_paper, read_runs, write_report
+from learning.report_tables import compared
+from warp_deform.cli import main
+from warp_deform.errors import InputError
+from warp_deform.tasks.registry import TASKS
+
+LINE, RING = "cable-line-notarget", "cable-ring"
+SCHEDULE = {"steps": 4000, "batch": 1, "lr": 1e-3, "snapshots": 2}
+
+
+def result(task: str, scores: list[float], *, failure: str = "other") -> dict[str, Any]:
+    """A summary of episodes with these scores; those of 1 are solved."""
+    played = [
+        Played(n, score == 1.0, score, 3, "", None if score == 1.0 else failure)
+        for n, score in enumerate(scores)
+    ]
+    return summarise(played, task=task)
+
+
+def write_run(
+    path: Path,
+    *,
+    task: str = LINE,
+    agent: str = "goal-stack",
+    demos: int = 10,
+    seed: int = 0,
+    scores: tuple[float, ...] = (1.0, 1.0, 0.5, 0.5),
+    schedule: dict[str, Any] | None = None,
+    **info: Any,
+) -> Path:
+    """A run's folder as training and evaluation leave it, without weights."""
+    path.mkdir(parents=True)
+    settings = {
+        "agent": {"task": task, "agent": agent},
+        "schedule": schedule or SCHEDULE,
+        "augment": True,
+        "processes": 1,
+    }
+    (path / "run.json").write_text(json.dumps(settings))
+    snapshots = {"0": [0.0] * 4, "2000": [0.5] * 4, "4000": [1.0, 1.0, 0.5, 0.5]}
+    found = {
+        "task": task,
+        "agent": agent,
+        "preset": "fast",
+        "demos": demos,
+        "seed": seed,
+        "stage_rule": "action",
+        "retry": True,
+        "robot": "ur5",
+        "snapshots": {step: result(task, values) for step, values in snapshots.items()},
+        "selected": 4000,
+        "test": result(task, list(scores)),
+        "paper": None,
+    }
+    (path / "eval_info.json").write_text(json.dumps(found | info))
+    return path
+
+
+def cells(*paths: Path) -> list[Any]:
+    return pool(read_runs(paths)[0], read_paper())
+
+
+def test_the_papers_table_is_whole() -> None:
+    paper = read_paper()
+    assert set(paper.measures) <= set(TASKS) and len(paper.measures) == 13
+    assert paper.demos == (1, 10, 100, 1000)
+    assert {agent for _, agent, _ in paper.values} == set(AGENTS)
+    # 8 tasks with 3 agents and 5 with 4, at 4 numbers of demonstrations
+    assert len(paper.values) == (8 * 3 + 5 * 4) * 4
+    assert all(0 <= value <= 100 for value in paper.values.values())
+    assert paper.values[LINE, "goal-stack", 10] == 99.7
+    assert paper.values["block-notarget", "gt-mlp-2step", 1000] == 90.0
+    assert paper.values["bag-color-goal", "goal-split", 100] == 0.0
+    assert paper.measures[LINE] == "mean partial score" and paper.measures[RING] == "success"
+
+
+def test_seeds_are_pooled(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", seed=0, scores=(1.0, 1.0, 1.0, 0.2))
+    write_run(tmp_path / "b", seed=1, scores=(1.0, 0.4, 0.4, 0.4))
+    (cell,) = cells(tmp_path)
+    assert cell.seeds == (0, 1) and (cell.n_success, cell.n_episodes) == (4, 8)
+    n, p, z = 8, 0.5, 1.959963984540054
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    assert cell.pc_success_ci95 == pytest.approx((100 * (centre - half), 100 * (centre + half)))
+    assert cell.mean_score == pytest.approx((0.8 + 0.55) / 2)
+    # between runs: the standard deviation of two means over the root of 2
+    assert cell.standard_error == pytest.approx(np.std([0.8, 0.55], ddof=1) / math.sqrt(2))
+    assert cell.value == pytest.approx(67.5) and cell.paper == 99.7
+    assert cell.failures == {"other": 4}
+
+
+def test_one_run_keeps_its_own_error_and_curve(tmp_path: Path) -> None:
+    (cell,) = cells(write_run(tmp_path / "a", task=RING, agent="transporter"))
+    assert cell.measure == "success" and cell.value == 50.0
+    assert cell.value_error == pytest.approx(100 * math.sqrt(0.25 / 3))
+    assert [point.step for point in cell.validation] == [0, 2000, 4000]
+    assert cell.validation[0] == Point(0, 0.0, 0.0)
+    assert cell.validation[2].value == 50.0 and cell.test == ()
+
+
+def test_the_papers_protocol_is_the_best_mean_over_runs(tmp_path: Path) -> None:
+    """Not the mean of every run's best, and never the untrained network."""
+    curves = {"0": [1.0, 1.0], "2000": [0.9, 0.1]}, {"0": [1.0, 1.0], "2000": [0.1, 0.3]}
+    later = [0.2, 0.4], [0.8, 0.6]
+    for seed, (curve, last) in enumerate(zip(curves, later, strict=True)):
+        snapshots = {k: result(LINE, v) for k, v in (curve | {"4000": last}).items()}
+        paper = {**snapshots["2000"], "snapshot": 2000, "snapshots": snapshots}
+        write_run(tmp_path / str(seed), seed=seed, paper=paper)
+    (cell,) = cells(tmp_path)
+    assert cell.paper_protocol == pytest.approx(50.0) and cell.paper_protocol_runs == 2
+    assert [point.value for point in cell.test] == pytest.approx([100.0, 35.0, 50.0])
+
+
+def test_results_of_an_earlier_release_are_read(tmp_path: Path) -> None:
+    old = result(LINE, [1.0, 0.5])
+    del old["failures"], old["goal_l2"]
+    (cell,) = cells(write_run(tmp_path / "a", test=old, paper={"snapshot": 4000, **old}))
+    assert cell.failures == {"unclassified": 1}
+    assert cell.paper_protocol == pytest.approx(75.0) and len(cell.test) == 1
+
+
+def test_what_differs_stays_apart(tmp_path: Path) -> None:
+    write_run(tmp_path / "a")
+    write_run(tmp_path / "b", stage_rule="privileged")
+    write_run(tmp_path / "c", schedule={**SCHEDULE, "steps": 100})
+    write_run(tmp_path / "d", retry=False, goals="given, 0123")
+    write_run(tmp_path / "e", robot="panda", demos=30)
+    found = cells(tmp_path)
+    assert {(cell.variant, cell.demos) for cell in found} == {
+        ("fast, 4000 steps", 10),
+        ("fast, 4000 steps, privileged lift", 10),
+        ("fast, 100 steps", 10),
+        ("fast, 4000 steps, no retries, goals given, 0123", 10),
+        ("fast, 4000 steps, panda", 30),
+    }
+    tables = compared(found, read_paper())
+    assert tables["fast, 4000 steps, panda"][0][3:] == ["1", "10", "30", "100", "1000"]
+    rows = {row[1]: row[3:] for row in tables["fast, 4000 steps"]}
+    assert rows["goal-stack"] == ["- (91.0)", "75.0 (99.7)", "- (100.0)", "- (100.0)"]
+    assert rows["gt-mlp"][0] == "- (9.4)"
+
+
+def test_runs_that_are_not_one_are_refused(tmp_path: Path) -> None:
+    write_run(tmp_path / "x" / "a")
+    write_run(tmp_path / "x" / "b")
+    with pytest.raises(InputError, match="both seed 0"):
+        cells(tmp_path / "x")
+    assert len(cells(tmp_path / "x" / "a", tmp_path / "x" / "a")) == 1, "named twice, counted once"
+    write_run(tmp_path / "y" / "a")
+    write_run(tmp_path / "y" / "b", seed=1, schedule={**SCHEDULE, "lr": 0.5})
+    with pytest.raises(InputError, match="differ in schedule"):
+        cells(tmp_path / "y")
+
+
+def test_folders_without_results(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no folder"):
+        read_runs([tmp_path / "none"])
+    with pytest.raises(InputError, match="holds no training run"):
+        read_runs([tmp_path])
+    run = write_run(tmp_path / "a")
+    (run / "eval_info.json").unlink()
+    with pytest.raises(InputError, match="no run is evaluated"):
+        read_runs([tmp_path])
+    write_run(tmp_path / "b")
+    runs, notes = read_runs([tmp_path])
+    assert [each.path.name for each in runs] == ["b"] and "not evaluated" in notes[0]
+    (run / "eval_info.json").write_text('{"task": "cable-ring"}')
+    with pytest.raises(InputError, match="evaluate again"):
+        read_runs([tmp_path])
+
+
+def test_the_command_writes_tables_and_curves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in (0, 1):
+        for demos in (1, 10):
+            write_run(tmp_path / f"runs/{demos}-{seed}", seed=seed, demos=demos)
+    write_run(tmp_path / "runs/ring", task=RING, agent="gt-mlp")
+    out = tmp_path / "out"
+    assert main(["report", str(tmp_path / "runs"), "--out", str(out), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["runs"] == 5 and len(found["cells"]) == 3
+    assert sorted(Path(name).name for name in found["files"]) == sorted(
+        path.name for path in out.iterdir()
+    )
+    text = (out / "report.md").read_text()
+    assert "75.0 (91.0)" in text and "optimistic" in text and f"steps_{LINE}.png" in text
+    rows = list(csv.DictReader((out / "report.csv").read_text().splitlines()))
+    assert [row["task"] for row in rows] == [RING, LINE, LINE]
+    assert rows[1]["paper_percent"] == "91.0" and rows[1]["table_percent"] == "75.0"
+    assert rows[1]["seeds"] == "0 1" and rows[1]["failures_other"] == "4"
+    tex = (out / "report.tex").read_text()
+    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 2
+    assert r"success \%" in tex
+    for path in out.glob("*.png"):
+        picture = cv2.imread(str(path))
+        assert picture.shape[0] > 300 and picture.std() > 5
+
+
+def test_the_same_runs_give_the_same_files(tmp_path: Path) -> None:
+    write_run(tmp_path / "a")
+    for name in ("x", "y"):
+        write_report([tmp_path / "a"], tmp_path / name)
+    for path in (tmp_path / "x").iterdir():
+        assert path.read_bytes() == (tmp_path / "y" / path.name).read_bytes()
+
+
+def test_bad_arguments_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    run = write_run(tmp_path / "a")
+    for arguments in ([], [str(tmp_path / "none")], [str(run), "--out", str(tmp_path / "file/x")]):
+        assert main(["report", *arguments]) == 2
+        said = capsys.readouterr()
+        assert said.err.count("\n") == 1 and not said.out
