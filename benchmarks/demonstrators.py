@@ -158,9 +158,8 @@ def measure(
     """Play every seed once; says on stderr how far it is."""
     search = None
     if budget is not None and depth is not None:
-        method, ahead = by.removeprefix("refined-"), budget if depth == 1 else budget // 2
-        candidates = ahead if method == "enumerate" else SearchConfig.candidates
-        search = SearchConfig(method=method, budget=budget, candidates=candidates, depth=depth)
+        method = by.removeprefix("refined-")
+        search = SearchConfig(method=method, budget=budget, depth=depth)
     with single_threaded():
         watch = Watch()
         if by in REFINED:

@@ -3,8 +3,8 @@
 All methods begin with the candidates of the task. `enumerate` takes the best of them; `random`
 tries others drawn around them; `cem`, the cross-entropy method over a mixture of picks, draws
 around the best so far, ever closer; `gradient` moves the best down the slope of the task's loss by
-Adam, and draws around those whose slope cannot be used. Every action that a search returns has been
-tried as it would run. Two actions ahead, each of the best states is searched again.
+Adam, and draws around those whose slope cannot be used or paid. Every action that a search returns
+has been tried as it would run. Two actions ahead, each of the best states is searched again.
 Sources: Rubinstein, Kroese, "The Cross-Entropy Method", 2004; Kingma, Ba, "Adam", 2015.
 """
 
@@ -158,9 +158,8 @@ class _Around:
     def tried(self, budget: int, also: Sequence[Action] = ()) -> list[Outlook]:
         """`also`, the task's candidates and what the method makes of them, up to `budget`."""
         episode, spent = self._state.episode, self._lookahead.rollouts
-        proposed = self._task.candidates(
-            episode.layout, episode.snapshot, self._rng, self._config.candidates
-        )
+        most = budget if self._config.method == "enumerate" else self._config.candidates
+        proposed = self._task.candidates(episode.layout, episode.snapshot, self._rng, most)
         tried = self._try(self._fresh([*also, *proposed], budget), "candidate")
         if not tried or self._done(tried):
             return tried
@@ -195,8 +194,8 @@ class _Around:
         """Move the best of `tried` downhill, and try where they get; spends up to `budget`."""
         config, rng = self._config, self._rng
         each = SLOPE_COST * config.steps + config.steps
-        if budget < each:
-            return []
+        if budget < each:  # too little for a slope
+            return self._closer(tried, budget)
         elites = sorted(tried, key=lambda o: o.rank, reverse=True)[: budget // each]
         slopes, actions = self._lookahead.slopes(), [o.action for o in elites]
         descent = Descent((len(elites), 4), _scale(config))
