@@ -18,7 +18,7 @@ __all__ = ["pack"]
 
 
 def pack(
-    folder: Path, *, seed: int, task: str = "cable-line-notarget",
+    folder: Path, *, seed: int, task: str = "cable-mask-goal",
     images: Literal["mask", "view"] = "mask",
 ) -> Episode:  # fmt: skip
     """Return the recording as an episode of the dataset format.
@@ -29,7 +29,7 @@ def pack(
     Args:
         folder: the recording
         seed: number of the episode in its dataset; names the file
-        task: the dataset's task
+        task: the dataset's task, which says where its pixels are
         images: what a policy is to see: the mask in three channels, as in the paper, or colours
 
     Raises:

@@ -19,8 +19,8 @@ from enum import StrEnum
 import numpy as np
 
 from warp_deform.errors import InputError
+from warp_deform.tasks.strand_grasp import wrap_half_turn
 
-from .grasp import wrap_half_turn
 from .robot import MotionError
 from .safety import SafeRobot
 from .table_plane import TablePlane
@@ -40,9 +40,10 @@ class PickPlaceConfig:
     """Before picking and after placing [m]."""
     grasp_m: float = 0.010
     """TCP when taking hold [m]: the fingertips, 9 mm lower, just above the foam."""
-    lift_m: float = 0.08
-    """While carrying [m]."""
-    short_lift_m: float = 0.06
+    lift_m: float = 0.05
+    """While carrying [m]: the higher, the more of the chain folds up under the hand when it is
+    lowered."""
+    short_lift_m: float = 0.04
     """While carrying not farther than `short_distance_m` [m]."""
     short_distance_m: float = 0.075
     """What counts as short [m]: 40 pixels of 1.9 mm."""

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from warp_deform.errors import InputError
-from warp_deform.rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world, world_to_pixel
+from warp_deform.rendering.pixels import SHAPE, TABLE_GRID, PixelGrid
 from warp_deform.tasks.ground_truth import YAW_SCALE
 from warp_deform.tasks.metrics import wrap_angle
 
@@ -45,6 +45,7 @@ _ROWS: dict[str, tuple[tuple[str, int], ...]] = {
     "bag-items-2": ((_POSE, 1), *_BAG, (_POSE, 2)),
     "bag-color-goal": (*_BAGS_AND_BLOCK, *_BAGS_AND_BLOCK),
     "block-notarget": ((_POSE, 2),),
+    "cable-mask-goal": ((_POSE, 180),),
 }
 """What the rows of three of a task's ground truth are: poses x, y, -yaw / 15; points x, y, z;
 displacements x, y, -yaw / 15; or something that does not move, as colours."""
@@ -52,14 +53,16 @@ displacements x, y, -yaw / 15; or something that does not move, as colours."""
 
 @dataclass(frozen=True)
 class RigidTransform:
-    """A turn about the middle of the table, then a shift.
+    """A turn about the middle of the picture, then a shift.
 
     turn: [rad], from x to y, which is from columns to rows in a picture too
     shift: along x (columns) and y (rows) [pixels]
+    grid: where on the table the pixels are
     """
 
     turn: float
     shift: tuple[float, float]
+    grid: PixelGrid = TABLE_GRID
 
     def matrix(self) -> np.ndarray:
         """(2, 3) float64, of column and row [pixels]."""
@@ -75,22 +78,33 @@ class RigidTransform:
     def of_world(self, xy: np.ndarray) -> np.ndarray:
         """Where world points (n, 2) [m] go."""
         matrix = self.matrix()
-        origin = pixel_to_world(np.zeros(2))
-        shift = matrix[:, 2] * PIXEL_SIZE
+        origin = self.grid.to_world(np.zeros(2))
+        shift = matrix[:, 2] * self.grid.pixel_size
         return np.asarray((xy - origin) @ matrix[:, :2].T + shift + origin)
 
 
-def draw_transform(action: np.ndarray, *, rng: np.random.Generator) -> RigidTransform:
+def draw_transform(
+    action: np.ndarray,
+    *,
+    rng: np.random.Generator,
+    grid: PixelGrid = TABLE_GRID,
+    copies: int | None = None,
+) -> RigidTransform:
     """A random transform that keeps pick and place of `action` (7,) within the picture.
+
+    copies: turn by one of so many even parts of a circle; None: by any angle, small ones more often
 
     Raises:
         InputError: pick and place lie too far apart for one picture.
     """
-    pixels = world_to_pixel(np.stack([action[:2], action[3:5]]))
+    pixels = grid.to_pixel(np.stack([action[:2], action[3:5]]))
     for _ in range(_MOST_DRAWS):
-        turn = float(rng.normal(0.0, _TURN))
+        if copies is None:
+            turn = float(rng.normal(0.0, _TURN))
+        else:
+            turn = 2 * math.pi * int(rng.integers(copies)) / copies
         x, y = rng.normal(0.0, _SHIFT, size=2)
-        drawn = RigidTransform(turn, (float(x), float(y)))
+        drawn = RigidTransform(turn, (float(x), float(y)), grid)
         moved = np.round(drawn.of_pixels(pixels))
         if ((moved >= 0) & (moved < SHAPE)).all():
             return drawn

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from warp_deform.errors import InputError
-from warp_deform.rendering.pixels import SHAPE, world_to_pixel
+from warp_deform.rendering.pixels import SHAPE
 from warp_deform.tasks.task import Task
 
 from .augmentation import draw_transform, move_action, move_picture, move_state
@@ -45,14 +45,15 @@ def image_batch(
         InputError: a pick or place is out of view.
     """
     images, picks, places, thetas, lifts = [], [], [], [], []
+    grid, copies = data.task.grid, data.task.rotated_copies
     for _ in range(count):
         moment = data.moment(*data.draw(rng))
         pictures = [(moment.color, moment.height)]
         if agent.pictures == 2:
             pictures.append((moment.goal_color, moment.goal_height))
-        pixels = world_to_pixel(np.stack([moment.action[:2], moment.action[3:5]]))
+        pixels = grid.to_pixel(np.stack([moment.action[:2], moment.action[3:5]]))
         if augment:
-            moved = draw_transform(moment.action, rng=rng)
+            moved = draw_transform(moment.action, rng=rng, grid=grid, copies=copies)
             pictures = [move_picture(*picture, moved) for picture in pictures]
             pixels = np.round(moved.of_pixels(pixels)).astype(np.int64)
         if not ((pixels >= 0) & (pixels < SHAPE)).all():
@@ -85,7 +86,8 @@ def state_batch(
     for _ in range(count):
         state, action = data.state(*data.draw(rng))
         if augment:
-            moved = draw_transform(action, rng=rng)
+            grid, copies = data.task.grid, data.task.rotated_copies
+            moved = draw_transform(action, rng=rng, grid=grid, copies=copies)
             state = move_state(data.task.name, state, moved)
             action = move_action(action, moved)
         states.append(state)

@@ -20,7 +20,8 @@ import numpy as np
 import torch
 
 from warp_deform.errors import InputError
-from warp_deform.rendering.pixels import SHAPE, pixel_to_world
+from warp_deform.rendering.pixels import SHAPE
+from warp_deform.tasks.metrics import wrap_angle
 from warp_deform.tasks.registry import task as find_task
 
 from .models.gt_state import GtState, GtState2Step, GtStateConfig
@@ -117,6 +118,7 @@ class ImagePolicy:
 
     def __init__(self, agent: Transporter, description: AgentDescription) -> None:
         self.agent, self.description = agent.eval(), description
+        self._task = find_task(description.task)
 
     def act(
         self,
@@ -140,15 +142,18 @@ class ImagePolicy:
         device = next(self.agent.parameters()).device
         image = self.agent.image(current, aim)[None].to(device)
         found = self.agent.act(image, avoid=self._near(avoid) if len(avoid) else None)
-        pick, place = pixel_to_world(found.pick[0]), pixel_to_world(found.place[0])
-        return np.array([*pick, 0.0, *place, found.place_yaw[0], found.lift[0]])
+        grid = self._task.grid
+        pick, place = grid.to_world(found.pick[0]), grid.to_world(found.place[0])
+        yaw = self._task.pick_yaw(current[0], pick)
+        place_yaw = found.place_yaw[0] if yaw == 0.0 else wrap_angle(yaw + found.place_yaw[0])
+        return np.array([*pick, yaw, *place, place_yaw, found.lift[0]])
 
     def _near(self, points: Sequence[np.ndarray]) -> torch.Tensor:
         """Network pixels (1, H, W) bool near any of the points."""
         config = self.agent.config
         rows, columns = config.shape
         grid = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1)
-        world = pixel_to_world(config.to_camera(grid))
+        world = self._task.grid.to_world(config.to_camera(grid))
         gaps = [np.linalg.norm(world - point, axis=-1) for point in points]
         return torch.from_numpy(np.min(gaps, axis=0) < _AVOIDED)[None]
 

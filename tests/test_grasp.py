@@ -10,10 +10,10 @@ from cable_drawings import coverage, curve, draw, lone
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware.grasp import find_grasp, map_direction, wrap_half_turn
 from hardware.segmentation import SegmentationConfig, SegmentationError, segment_cable
 from warp_deform.errors import InputError
 from warp_deform.tasks.metrics import mask_iou
+from warp_deform.tasks.strand_grasp import find_grasp, map_direction, wrap_half_turn
 
 
 def crossing(rng: np.random.Generator, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:

@@ -81,7 +81,7 @@ def test_the_hand_turns_the_cable_as_asked(pick: float, turn: float, x: float, y
 
 def test_a_short_move_is_lifted_less() -> None:
     near = PickPlaceAction((0.45, 0.0), 0.0, (0.45, 0.06), 0.0)
-    assert height(way_points(near, TABLE)["carry"]) == pytest.approx(0.06)
+    assert height(way_points(near, TABLE)["carry"]) == pytest.approx(PickPlaceConfig().short_lift_m)
 
 
 def test_placing() -> None:

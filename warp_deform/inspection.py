@@ -12,7 +12,9 @@ import numpy as np
 
 from .episodes import Episode, EpisodeReader, Step, combine_hashes
 from .errors import InputError
-from .rendering.pixels import BOUNDS
+from .rendering.pixels import SHAPE, TABLE_GRID, PixelGrid
+from .tasks.registry import FURTHER_TASKS, TASKS
+from .tasks.registry import task as find_task
 
 __all__ = ["contact_sheet", "statistics"]
 
@@ -116,7 +118,7 @@ def _draw_row(episode: Episode, t: int, *, top: float, scale: int) -> np.ndarray
     step = episode.steps[t]
     color = _enlarge(step.color, scale)
     if step.action is not None:
-        _draw_action(color, step.action)
+        _draw_action(color, step.action, _grid(episode.info.task))
     panels = [color, _false_color(_enlarge(step.height, scale), top)]
     if episode.goal is not None:
         panels += [
@@ -172,16 +174,20 @@ def _draw_header(episode: Episode, *, top: float, width: int) -> np.ndarray:
     return canvas
 
 
-def _draw_action(color: np.ndarray, action: np.ndarray) -> None:
+def _grid(task: str) -> PixelGrid:
+    """Where the pixels of a task's pictures are; of a task from elsewhere, the benchmark's."""
+    return find_task(task).grid if task in TASKS | FURTHER_TASKS else TABLE_GRID
+
+
+def _draw_action(color: np.ndarray, action: np.ndarray, grid: PixelGrid) -> None:
     """Draw pick, place and their yaws onto an image, (H, W, 3), that shows the workspace."""
     import cv2
 
     rows, columns = color.shape[:2]
-    (x_min, x_max), (y_min, y_max) = BOUNDS[:2]
-    pixels_per_metre = np.array([columns / (x_max - x_min), rows / (y_max - y_min)])
+    pixels_per_metre = np.array([columns / SHAPE[1], rows / SHAPE[0]]) / grid.pixel_size
 
     def to_pixel(xy: np.ndarray) -> tuple[int, int]:
-        fixed = (xy - (x_min, y_min)) * pixels_per_metre * 2**_SUBPIXEL_BITS
+        fixed = (xy - grid.origin) * pixels_per_metre * 2**_SUBPIXEL_BITS
         fixed = fixed.clip(-(2**20), 2**20)  # far outside of the picture; OpenCV takes 32 bits
         return round(fixed[0]), round(fixed[1])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .tasks.registry import TASKS
+from .tasks.registry import FURTHER_TASKS, TASKS
 
 __all__ = ["env_id", "register_environments"]
 
@@ -22,7 +22,7 @@ def register_environments() -> None:
     """
     from gymnasium.envs.registration import register, registry
 
-    for task in TASKS:
+    for task in TASKS | FURTHER_TASKS:
         if env_id(task) not in registry:
             register(
                 env_id(task),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from .solver.guards import Problem
 from .tasks.task import Layout, Snapshot, Task
 
 __all__ = ["DEMONSTRATOR_STREAM", "LAYOUT_STREAM", "Carry", "Plan", "RunningEpisode", "StepReport",
-           "episode_rng", "join_frames"]  # fmt: skip
+           "episode_rng", "join_frames", "objects_in"]  # fmt: skip
 
 LAYOUT_STREAM, DEMONSTRATOR_STREAM = 0, 1
 """Random streams of an episode: where things start, and what the demonstrator draws."""
@@ -27,6 +27,14 @@ LAYOUT_STREAM, DEMONSTRATOR_STREAM = 0, 1
 def episode_rng(seed: int, stream: int) -> np.random.Generator:
     """Random generator of one episode for one purpose; streams do not overlap."""
     return np.random.default_rng([int(seed), stream])
+
+
+def objects_in(layout: Layout, objects: tuple[SceneObject, ...]) -> tuple[SceneObject, ...]:
+    """A world's objects as an episode with this layout has them."""
+    return tuple(
+        replace(item, config=layout.configs[i]) if i in layout.configs else item  # type: ignore[arg-type]
+        for i, item in enumerate(objects)
+    )
 
 
 @dataclass(eq=False, kw_only=True)

@@ -7,7 +7,6 @@ episode's bits depend on its seed and its actions only, not on its neighbours or
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import newton
@@ -15,6 +14,7 @@ import numpy as np
 
 from .episodes import Goal, state_hash
 from .errors import InputError, WarpDeformError
+from .jaw_step import jaw_step
 from .objects.box import Box
 from .objects.scene_object import SceneObject
 from .rendering.drawables import Drawables
@@ -32,11 +32,12 @@ from .running import (
     StepReport,
     episode_rng,
     join_frames,
+    objects_in,
 )
 from .solver.solver import SolverFusedXPBD
 from .tasks.free_space import FreeSpace
 from .tasks.registry import task as find_task
-from .tasks.task import Layout, Snapshot, Task
+from .tasks.task import PHYSICS, Layout, Snapshot, Task
 from .world_state import WorldState
 
 __all__ = ["Worlds"]
@@ -104,8 +105,7 @@ class Worlds:
 
     def _waiting_tip(self) -> np.ndarray:
         """Above the middle of the table (4,) x, y, z [m], yaw [rad]."""
-        x, y = 0.5, 0.0
-        return np.array([x, y, self.robot.hover_height(x, y, self.task.primitive.hover), 0.0])
+        return np.array([0.5, 0.0, self.robot.hover_height(0.5, 0.0, self.task.primitive.hover), 0])
 
     # -- starting
 
@@ -151,9 +151,8 @@ class Worlds:
             )
 
     def _sample(self, rng: np.random.Generator, goal: Goal | None) -> Layout:
-        if goal is None:
-            return self.task.sample(rng, self._space)
-        return self.task.sample_for_goal(rng, self._space, goal.targets)
+        task, space = self.task, self._space
+        return task.sample_for_goal(rng, space, goal.targets) if goal else task.sample(rng, space)
 
     def _check_slot(self, slot: int) -> None:
         if not 0 <= slot < self.count:
@@ -165,10 +164,11 @@ class Worlds:
         """Place the objects, disturb them and let them settle."""
         data = self.solver.data
         for slot, layout in layouts.items():
+            self._set_physics(slot, layout)
             if len(layout.particle_q):
                 data.lane("particles.x", slot)[:] = layout.particle_q
                 data.lane("particles.v", slot)[:] = 0.0
-            objects = self._objects(layout)
+            objects = objects_in(layout, self.objects)
             if len(layout.body_q):
                 data.set_bodies(slot, layout.body_q)
                 self._shape_boxes(slot, layout, objects)
@@ -185,7 +185,7 @@ class Worlds:
             calm={s: l.settle_seconds if l.calm else 0.0 for s, l in layouts.items()},
         )
         for slot, layout in layouts.items():
-            objects = self._objects(layout)
+            objects = objects_in(layout, self.objects)
             drawables = Drawables.of(self.task.drawn(layout, objects))
             limits = self.solver.config.limits
             self.episodes[slot] = RunningEpisode(
@@ -203,19 +203,17 @@ class Worlds:
             )
             self._look(slot)
 
-    def _objects(self, layout: Layout) -> tuple[SceneObject, ...]:
-        """The objects as an episode has them."""
-        return tuple(
-            replace(item, config=layout.configs[i]) if i in layout.configs else item  # type: ignore[arg-type]
-            for i, item in enumerate(self.objects)
-        )
-
     def _shape_boxes(self, slot: int, layout: Layout, objects: tuple[SceneObject, ...]) -> None:
         """Give the boxes of a slot the sizes and masses that they have in its episode."""
         for item in (objects[i] for i in layout.configs):
             if isinstance(item, Box):
                 size, inertia = item.config.parts[0].size, item.config.inertia()[1]
                 self.solver.data.set_box(slot, item.body, np.array(size), item.config.mass, inertia)
+
+    def _set_physics(self, slot: int, layout: Layout) -> None:
+        """Give a slot the physics of its episode."""
+        usual, own = self.task.solver, layout.physics
+        self.solver.set_world(slot, **{n: own.get(n, getattr(usual, n)) for n in PHYSICS})
 
     def _construct_goals(
         self, layouts: Mapping[int, Layout], seeds: Mapping[int, int]
@@ -255,8 +253,11 @@ class Worlds:
         record: interval of recorded frames [s]; 0 records nothing.
         """
         plans = {slot: self._checked(slot, action) for slot, action in actions.items()}
-        self._approach(plans, record)
-        self._carry(plans, record)
+        if self.task.jaw is None:
+            self._approach(plans, record)
+            self._carry(plans, record)
+        else:
+            jaw_step(self, plans, record)
         limits = self.solver.config.limits
         reports = {}
         for slot, plan in plans.items():
@@ -294,7 +295,7 @@ class Worlds:
             hover = self.robot.hover_height(pick[0], pick[1], config.hover)
             height = grasp.height if grasp else 0.0
             motions[slot] = approach(self.episodes[slot].tip, pick, hover, height, config)
-        moving = self._reachable(plans, motions)
+        moving = self.reachable(plans, motions)
         waits = {slot: motions[slot].seconds for slot in moving}
         runs = rollout(self.solver, moving, least=1e3, most=waits, record=record)
         for slot in moving:
@@ -311,7 +312,7 @@ class Worlds:
         motions, paths = {}, {}
         for slot, carried in carries.items():
             motions[slot], paths[slot] = carried(plans[slot].action)
-        moving = self._reachable(plans, motions)
+        moving = self.reachable(plans, motions)
         if not moving:
             return
         runs = rollout(
@@ -348,7 +349,7 @@ class Worlds:
         self._approach(plans, 0.0)
         return self._carries(plans)
 
-    def _reachable(self, plans: Mapping[int, Plan], motions: Mapping[int, Motion]) -> list[int]:
+    def reachable(self, plans: Mapping[int, Plan], motions: Mapping[int, Motion]) -> list[int]:
         """Slots whose motion the arm can make; notes motions, joints and what is out of reach."""
         postures = [self.episodes[slot].posture for slot in motions]
         joints = solve_joints(self.robot, list(motions.values()), postures)
@@ -370,13 +371,13 @@ class Worlds:
         particle_qd = np.array(data.lane("particles.v", slot), np.float32)
         poses, twists = data.body_poses(slot)
         body_q, body_qd = poses.astype(np.float32), twists.astype(np.float32)
-        drawables, topdown = episode.drawables, self._topdown
+        drawables, layout, topdown = episode.drawables, episode.layout, self._topdown
         ok = np.isfinite(particle_q).all() and np.isfinite(body_q).all()
 
         def render() -> Images:
             if not ok:
                 raise WarpDeformError("a state that is not finite cannot be drawn")
-            return topdown.render(drawables, particle_q, body_q)
+            return self.task.draw(topdown, layout, drawables, particle_q, body_q)
 
         episode.snapshot = Snapshot(
             particle_q, particle_qd, body_q, body_qd, drawables.segments, render,
@@ -399,6 +400,7 @@ class Worlds:
         if state.episode.posture.shape != self.robot.home_q.shape:
             raise InputError("the state was saved with another robot")
         episode = self.episodes[slot] = state.put(self.solver.data, slot)
+        self._set_physics(slot, episode.layout)
         self._shape_boxes(slot, episode.layout, episode.objects)
         self._look(slot)
 

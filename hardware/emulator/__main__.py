@@ -9,7 +9,7 @@ from warp_deform.errors import InputError, WarpDeformError
 
 from .process import serve_emulator
 from .server import EmulatorConfig
-from .world import TableWorld
+from .world import TableWorld, World
 
 
 def main() -> int:
@@ -21,10 +21,17 @@ def main() -> int:
     parser.add_argument(
         "--object-width", type=float, default=0.0, help="of what every grasp finds [m]"
     )
+    parser.add_argument(
+        "--chain", type=int, metavar="SEED", help="a bead chain on foam, instead of table or object"
+    )
     options = parser.parse_args()
     try:
         config = EmulatorConfig(host=options.host, paced=options.paced)
-        world = TableWorld(table_z=options.table_z, object_width=options.object_width)
+        world: World = TableWorld(table_z=options.table_z, object_width=options.object_width)
+        if options.chain is not None:
+            from ..twin import CableTwin, TwinConfig  # loads the simulator
+
+            world = CableTwin(TwinConfig(seed=options.chain))
         pace = "1 kHz" if config.paced else "in lock-step"
         print(f"emulated Panda on {config.host}, {pace}; Ctrl-C ends it", file=sys.stderr)
         serve_emulator(config, world=world)

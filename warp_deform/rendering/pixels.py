@@ -8,9 +8,12 @@ Source: Seita et al., ICRA 2021 (workspace bounds, 3.125 mm pixels).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-__all__ = ["BOUNDS", "PIXEL_SIZE", "SHAPE", "pixel_to_world", "world_to_pixel"]
+__all__ = ["BOUNDS", "PIXEL_SIZE", "SHAPE", "TABLE_GRID", "PixelGrid", "pixel_to_world",
+           "world_to_pixel"]  # fmt: skip
 
 BOUNDS = ((0.25, 0.75), (-0.5, 0.5), (0.0, 0.28))
 """Workspace [m]: (min, max) along x, y, z, in the frame of the robot's base."""
@@ -20,27 +23,55 @@ SHAPE = (320, 160)
 """Rows (y) and columns (x) of a top-down picture."""
 
 
+@dataclass(frozen=True)
+class PixelGrid:
+    """Which point of the table every pixel of a picture of `SHAPE` is centred on.
+
+    origin: x, y [m] of pixel (0, 0); pixel_size: side of a pixel [m]
+    """
+
+    origin: tuple[float, float]
+    pixel_size: float
+
+    def to_world(self, pixel: np.ndarray) -> np.ndarray:
+        """World x, y [m] of pixels (..., 2), given as row u and column v: float64 (..., 2)."""
+        pixel = np.asarray(pixel, dtype=float)
+        x = self.origin[0] + pixel[..., 1] * self.pixel_size
+        y = self.origin[1] + pixel[..., 0] * self.pixel_size
+        return np.stack([x, y], axis=-1)
+
+    def fractional(self, xy: np.ndarray) -> np.ndarray:
+        """Row u and column v, not rounded, of world points (..., 2) [m]: float64 (..., 2)."""
+        xy = np.asarray(xy, dtype=float)
+        u = (xy[..., 1] - self.origin[1]) / self.pixel_size
+        v = (xy[..., 0] - self.origin[0]) / self.pixel_size
+        return np.stack([u, v], axis=-1)
+
+    def to_pixel(self, xy: np.ndarray) -> np.ndarray:
+        """Nearest pixel of world points (..., 2) [m]: int64 (..., 2).
+
+        A point outside of the picture gets a pixel outside of `SHAPE`; nothing is clamped.
+        """
+        return np.round(self.fractional(xy)).astype(np.int64)
+
+
+TABLE_GRID = PixelGrid((BOUNDS[0][0], BOUNDS[1][0]), PIXEL_SIZE)
+"""The grid of the benchmark's pictures."""
+
+
 def pixel_to_world(pixel: np.ndarray) -> np.ndarray:
-    """World x, y [m] of pixels (..., 2), given as row u and column v: float64 (..., 2).
+    """`TABLE_GRID.to_world`.
 
     >>> pixel_to_world(np.array([160, 80])).tolist()
     [0.5, 0.0]
     """
-    pixel = np.asarray(pixel, dtype=float)
-    x = BOUNDS[0][0] + pixel[..., 1] * PIXEL_SIZE
-    y = BOUNDS[1][0] + pixel[..., 0] * PIXEL_SIZE
-    return np.stack([x, y], axis=-1)
+    return TABLE_GRID.to_world(pixel)
 
 
 def world_to_pixel(xy: np.ndarray) -> np.ndarray:
-    """Nearest pixel (row u, column v) of world points (..., 2) [m]: int64 (..., 2).
-
-    A point outside of the picture gets a pixel outside of `SHAPE`; nothing is clamped.
+    """`TABLE_GRID.to_pixel`.
 
     >>> world_to_pixel(np.array([0.5, 0.0])).tolist()
     [160, 80]
     """
-    xy = np.asarray(xy, dtype=float)
-    u = np.round((xy[..., 1] - BOUNDS[1][0]) / PIXEL_SIZE)
-    v = np.round((xy[..., 0] - BOUNDS[0][0]) / PIXEL_SIZE)
-    return np.stack([u, v], axis=-1).astype(np.int64)
+    return TABLE_GRID.to_pixel(xy)

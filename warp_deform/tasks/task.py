@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from ..rendering.pixels import TABLE_GRID, PixelGrid
 from ..robots.primitive import PrimitiveConfig, Stage
 from ..solver.config import SolverConfig
 
@@ -26,10 +27,17 @@ if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     from ..objects.push import Push
     from ..objects.scene_object import SceneObject
     from ..objects.zone import Zone
+    from ..rendering.drawables import Drawables
     from ..rendering.images import Images
+    from ..rendering.strand_mask import MaskLook
+    from ..rendering.topdown import TopDown
+    from ..robots.jaw_primitive import JawActionConfig
     from .free_space import FreeSpace
 
-__all__ = ["Action", "Layout", "Snapshot", "Stage", "Task"]
+__all__ = ["PHYSICS", "Action", "Layout", "Snapshot", "Stage", "Task"]
+
+PHYSICS = ("damping", "table_friction", "contact_friction", "stiffness")
+"""What of the physics may differ between episodes, see `SolverFusedXPBD.set_world`."""
 
 Action = np.ndarray
 """(7,) float64: pick x, y [m], yaw [rad], place x, y [m], yaw [rad], lift [m]."""
@@ -48,6 +56,8 @@ class Layout:
     pushes: perturbations that follow the start, at most `MOST_PUSHES`
     calm: start by damping (speeds clamped for a moment) instead of falling freely; for layouts
         that are constructed at rest, such as goals
+    physics: those of `PHYSICS` that differ from the task's in this episode
+    look: how pictures of this episode depart from the truth, where the task draws masks
     """
 
     particle_q: np.ndarray
@@ -59,6 +69,8 @@ class Layout:
     calm: bool = False
     frame: np.ndarray | None = None
     configs: Mapping[int, BagConfig | BoxConfig] = field(default_factory=dict)
+    physics: Mapping[str, float] = field(default_factory=dict)
+    look: MaskLook | None = None
 
     def with_targets(self, targets: np.ndarray) -> Layout:
         """The same start with other targets (a goal from elsewhere)."""
@@ -109,6 +121,12 @@ class Task(abc.ABC):
     """Damping [1/s] of the rollouts that actions are differentiated by; None: that of `solver`."""
     primitive: ClassVar[PrimitiveConfig] = PrimitiveConfig()
     """Speeds and heights of the robot's motion."""
+    jaw: ClassVar[JawActionConfig | None] = None
+    """A parallel jaw and its motion, where things are not taken by suction."""
+    grid: ClassVar[PixelGrid] = TABLE_GRID
+    """Which point of the table every pixel of an observation is."""
+    rotated_copies: ClassVar[int | None] = None
+    """Into how many turns of a circle augmentation turns a picture; None: by any angle."""
 
     def stage_of(self, lift: float) -> Stage:
         """The stage whose lift is nearest to `lift` [m]; of equally near ones the first."""
@@ -143,6 +161,21 @@ class Task(abc.ABC):
     ) -> tuple[SceneObject | Zone, ...]:
         """What is drawn, in creation order: zones first, as in the original."""
         return (*layout.zones, *objects)
+
+    def draw(
+        self,
+        topdown: TopDown,
+        layout: Layout,
+        drawables: Drawables,
+        particle_q: np.ndarray,
+        body_q: np.ndarray,
+    ) -> Images:
+        """What an observation shows of a state: the pictures of a top-down camera over `grid`."""
+        return topdown.render(drawables, particle_q, body_q)
+
+    def pick_yaw(self, color: np.ndarray, xy: np.ndarray) -> float:
+        """Yaw [rad] at which to pick at `xy` (2,) [m], by the picture; for suction any will do."""
+        return 0.0
 
     @abc.abstractmethod
     def score(self, layout: Layout, snapshot: Snapshot) -> float:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from warp_deform.errors import InputError
+from ..errors import InputError
 
 __all__ = ["Grasp", "GraspConfig", "find_grasp", "map_direction", "wrap_half_turn"]
 
