@@ -271,7 +271,7 @@ class GradcheckOptions(CommandOptions):
     """Compare derivatives of the solver with finite differences, in states of real episodes."""
 
     task: Annotated[Positional[str | None], arg(metavar="[TASK]")] = None
-    """Name of a task; left out, all that have derivatives."""
+    """Name of a task; left out, all."""
     levels: tuple[Literal["substep", "window", "action"], ...] = ("substep", "window", "action")
     """One substep; 0.1 s; whole actions."""
     states: Annotated[int, arg(metavar="N")] = 200
@@ -282,6 +282,8 @@ class GradcheckOptions(CommandOptions):
     """Whole actions that are differentiated."""
     seed: int = 0
     """First episode, and the random directions."""
+    summary: bool = False
+    """One line per task and level instead of all rows."""
 
 
 def gradcheck(options: GradcheckOptions) -> Outcome:
@@ -290,7 +292,7 @@ def gradcheck(options: GradcheckOptions) -> Outcome:
         find_task(options.task)
     for flag in ("states", "windows", "actions"):
         _check_positive(f"--{flag}", getattr(options, flag))
-    from .gradcheck import GradcheckConfig, check
+    from .gradcheck import GradcheckConfig, check, summarise
 
     quiet_warp()
     rows, notes = check(
@@ -303,12 +305,18 @@ def gradcheck(options: GradcheckOptions) -> Outcome:
             seed=options.seed,
         ),
     )
-    found = [asdict(row) for row in rows]
-    head = tuple(key.replace("_", " ") for key in asdict(rows[0])) if rows else ()
-    cells = [tuple("-" if v is None else _number(v) for v in row.values()) for row in found]
+    found = [asdict(row) for row in (summarise(rows) if options.summary else rows)]
+    head = tuple(key.replace("_", " ") for key in found[0]) if found else ()
+    cells = [
+        tuple(
+            "-" if v is None else ", ".join(v) or "-" if isinstance(v, tuple) else _number(v)
+            for v in row.values()
+        )
+        for row in found
+    ]
     failure = None if rows else "nothing was checked, see the notes"
     return Outcome(
-        data={"rows": found, "notes": notes},
+        data={"summary" if options.summary else "rows": found, "notes": notes},
         text="\n".join([*([_table([head, *cells])] if rows else []), *notes]),
         failure=failure,
     )

@@ -1,128 +1,235 @@
 """Directional derivatives of short rollouts beside central differences, by the same worlds.
 
 World 0 of a launch runs as drawn; two others run for every direction, moved by plus and minus a
-small step. The adjoint of world 0 times the direction is compared with their difference.
+step. The adjoint of world 0 times the direction is compared with the limit of their difference over
+a ladder of steps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..differentiable import DifferentiableRollout
+from ..differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
 from ..rollout import GripPath
 from ..worlds import Worlds
+from .branches import alike, counted, taken
 from .draws import Draw
+from .limits import RATIO, central, kink
 
-__all__ = ["FLOORS", "PARAMETERS", "STEPS", "WORLDS", "Sample", "compare"]
+__all__ = ["PARAMETERS", "RUNGS", "STEPS", "WORLDS", "Sample", "compare", "fired"]
 
 STEPS = {
-    "positions": 1e-9,
-    "velocities": 1e-7,
-    "inverse_masses": 1e-5,
-    "way_points": 1e-8,
-    "knot_times": 1e-8,
-    "damping": 1e-3,
-    "table_friction": 1e-5,
-    "contact_friction": 1e-5,
-    "stiffness": 1e-4,
+    "positions": 1e-7,
+    "velocities": 2.5e-4,
+    "inverse_masses": 3e-2,
+    "body_poses": 1e-7,
+    "body_velocities": 2.5e-4,
+    "body_inverse_masses": 3e-2,
+    "way_points": 1e-7,
+    "knot_times": 1e-6,
+    "knot_rotations": 1e-6,
+    "damping": 10.0,
+    "table_friction": 3e-2,
+    "contact_friction": 3e-2,
+    "stiffness": 0.3,
 }
-"""Steps of the differences, in SI units (inverse masses: as a share of each): so small that few
-cross a branch, for contacts are a micrometre deep; so large that rounding stays below 1e-6."""
+"""Largest steps of the differences over a substep, in SI units (inverse masses: as a share of each;
+turns: as motion at `ARM`): far above rounding. Contacts are a micrometre deep, so the ladder leads
+down to where few directions cross a branch."""
 PARAMETERS = tuple(STEPS)
-ROUNDING = 2e-15
-"""What float64 leaves of a loss, whose terms are metres."""
-FLOORS = {name: 1e5 * ROUNDING / step for name, step in STEPS.items()}
-"""Errors of smaller gradients are relative to these: rounding alone would be 1e-5 of them."""
-DIRECTIONS = 2
-"""Random directions of arrays; numbers have one."""
-_ARRAYS = PARAMETERS[:5]
-_DIRECTIONS = [name for name in PARAMETERS for _ in range(DIRECTIONS if name in _ARRAYS else 1)]
-WORLDS = 1 + 2 * len(_DIRECTIONS)
+RUNGS = 5
+ARM = 0.05
+"""A turn moves a point so far from the centre by as much as a unit of position does [m]."""
+EPSILON = 2.2e-16
+"""Relative rounding of float64; positions are below 1 m."""
+KINK = 1e-6
+"""Slopes on both sides of a state that differ by more than this share: a branch begins there."""
+CHUNK = 14
+"""Directions of one launch."""
+WORLDS = 1 + 2 * CHUNK
 """Worlds that `compare` uses."""
+_GROWING = (
+    "velocities", "inverse_masses", "body_velocities", "body_inverse_masses", *WORLD_PARAMETERS
+)  # fmt: skip
+"""Their effect grows with the length of the rollout, so steps shrink with it."""
+_OF_PATH = ("way_points", "knot_times", "knot_rotations")
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One state: pairs of directional derivatives by parameter.
+    """One direction in one state.
 
-    ours, theirs: of the adjoint and of the differences; size: the gradient's length
-    smooth: whether constraints acted equally often in all of its worlds; else it is not compared
-    fired: how often constraints of each `Kind` acted
+    ours, theirs: directional derivatives, of the adjoint and of the differences
+    scale: the larger of the gradient's length and of the least one that is told from 0: so long
+    that half the bound is what rounding leaves of the differences with the middle step
+    doubt: how well the differences know the derivative, as a share of `scale`; None: no step is so
+    small that it crosses no branch, or the state lies on the edge of one
+    fired: how often constraints of each `Kind` acted in the state
     growth: the gradient by positions over that which the loss has at the end
     """
 
     parameter: str
     ours: float
     theirs: float
-    size: float
-    smooth: bool
+    scale: float
+    doubt: float | None
     fired: np.ndarray
     growth: float
 
     @property
     def error(self) -> float:
-        """Difference, relative to the larger of the gradient's length and the floor."""
-        return abs(self.ours - self.theirs) / max(self.size, FLOORS[self.parameter])
+        return abs(self.ours - self.theirs) / self.scale
+
+
+@dataclass(frozen=True, eq=False)
+class _Loss:
+    """A random linear loss of positions [m] and steps (velocities times dt) at the end."""
+
+    positions: np.ndarray
+    velocities: np.ndarray
+    bodies: np.ndarray
+    body_velocities: np.ndarray
+
+    @staticmethod
+    def draw(worlds: Worlds, rng: np.random.Generator) -> _Loss:
+        data, dt = worlds.solver.data, worlds.solver.config.dt
+        particles = data.lane("particles.x", 0).shape
+        rows = data.body_rows(0)
+        bodies = rows.stop - rows.start
+        turn = np.array([1.0, 1.0, 1.0, *[2 * ARM] * 4])
+        return _Loss(
+            positions=rng.normal(size=particles),
+            velocities=rng.normal(size=particles) * dt,
+            bodies=rng.normal(size=(bodies, 7)) * turn,
+            body_velocities=rng.normal(size=(bodies, 6)) * dt * np.array([1.0] * 3 + [ARM] * 3),
+        )
+
+    def size(self) -> float:
+        """Length of its derivative by positions."""
+        return float(np.sqrt((self.positions**2).sum() + (self.bodies**2).sum()))
+
+    def change(self, ends: dict[str, np.ndarray], i: int, j: int) -> float:
+        """Between worlds: the difference of the ends first, as less is lost to rounding."""
+        return sum(float((vars(self)[n] * (ends[n][i] - ends[n][j])).sum()) for n in ends)
+
+    def backward(self, run: DifferentiableRollout, count: int) -> Gradients:
+        each = np.ones((count, 1, 1, 1))
+        return run.backward(**{name: each * by for name, by in vars(self).items()})
 
 
 def compare(
     run: DifferentiableRollout,
     worlds: Worlds,
     draw: Draw,
-    seconds: float,
+    substeps: int,
     rng: np.random.Generator,
+    *,
+    bound: float,
+    directions: int = 1,
 ) -> list[Sample]:
-    """Roll on from `draw` for `seconds` and compare the derivatives of a random linear loss of
-    positions and velocities (per substep) at the end, along random directions.
+    """Roll on from `draw` for so many substeps and compare derivatives of a random loss along so
+    many random directions of every array, and along every number.
+
+    bound: error that is asked about; what cannot be told from 0 so well counts as that large, and
+    the ladders start the lower the larger it is
     """
-    data, dt = worlds.solver.data, worlds.solver.config.dt
     for world in range(WORLDS):
         worlds.restore(world, draw.state)
-    base = _base(worlds, draw.path)
-    names = [name for name in _DIRECTIONS if name in base]
-    moved = {name: np.repeat(base[name][None], WORLDS, axis=0) for name in set(names)}
-    along = []
-    for k, name in enumerate(names):
-        direction = rng.normal(size=base[name].shape) * _scale(name, base[name])
-        along.append(direction)
-        moved[name][2 * k + 1] += STEPS[name] * direction
-        moved[name][2 * k + 2] -= STEPS[name] * direction
+    base, loss = _base(worlds, draw.path), _Loss.draw(worlds, rng)
+    names = [
+        name
+        for name, value in base.items()
+        for _ in range(1 if name in WORLD_PARAMETERS else directions)
+        if value.size
+    ]
+    along = [_direction(name, base[name], rng) for name in names]
+    samples: list[Sample] = []
+    for first in range(0, len(names), CHUNK):
+        part = slice(first, first + CHUNK)
+        samples += _compare_some(
+            run, worlds, draw, substeps, base, loss, names[part], along[part], bound
+        )
+    return samples
+
+
+def fired(run: DifferentiableRollout, worlds: Worlds, draw: Draw) -> np.ndarray:
+    """How often constraints of each kind act in the next substep."""
+    worlds.restore(0, draw.state)
+    paths = {} if draw.path is None else {0: draw.path}
+    run.forward([0], [worlds.solver.config.dt], paths=paths)
+    return run.backward().fired[0]
+
+
+def _compare_some(
+    run: DifferentiableRollout,
+    worlds: Worlds,
+    draw: Draw,
+    substeps: int,
+    base: dict[str, np.ndarray],
+    loss: _Loss,
+    names: Sequence[str],
+    along: Sequence[np.ndarray],
+    bound: float,
+) -> list[Sample]:
     count = 1 + 2 * len(names)
-    paths = {}
-    if draw.path is not None:
-        for w in range(count):
-            positions, times = moved["way_points"][w], moved["knot_times"][w]
-            paths[w] = replace(draw.path, positions=positions, times=times)
-    parameters = {n: moved[n][:count] for n in (*PARAMETERS[5:], "inverse_masses")}
-    ends = run.forward(
-        range(count), [seconds], paths=paths, parameters=parameters,
-        positions=moved["positions"][:count], velocities=moved["velocities"][:count],
-    )[:, 0]  # fmt: skip
-    speeds = np.stack([data.lane("particles.v", w) for w in range(count)])
-    by_x = rng.normal(size=ends[0].shape)
-    by_v = rng.normal(size=ends[0].shape) * dt
-    each = np.ones((count, 1, 1, 1))
-    gradients = run.backward(each * by_x, each * by_v)
-    for world in range(WORLDS):
-        worlds.solver.set_world(world, **{n: float(base[n]) for n in PARAMETERS[5:]})
-        data.lane("particles.w0", world)[:] = base["inverse_masses"]
-        data.lane("particles.w", world)[:] = base["inverse_masses"]
-    growth = float(np.linalg.norm(gradients.positions[0]) / np.linalg.norm(by_x))
+    shorter = np.sqrt(1e-6 / bound)
+    steps = [STEPS[n] * shorter / (substeps if n in _GROWING else 1) for n in names]
+    changes, second = np.zeros((2, RUNGS, len(names)))
+    same = np.zeros((RUNGS, len(names)), dtype=bool)
+    knots = 0 if draw.path is None else len(draw.path.times)
+    data = worlds.solver.data
+    shapes = len(data.topologies[data.world_topology[0]].shape_body)
+    gradients: Gradients | None = None
+    for rung in range(RUNGS):
+        moved = {name: [base[name]] * count for name in base}
+        for k, (name, direction) in enumerate(zip(names, along, strict=True)):
+            step = steps[k] / RATIO**rung
+            moved[name][2 * k + 1] = _moved(name, base[name], step * direction)
+            moved[name][2 * k + 2] = _moved(name, base[name], -step * direction)
+        ends = _roll(run, worlds, draw.path, substeps, moved)
+        found = loss.backward(run, count)
+        gradients = gradients or found
+        words, counts = taken(run), counted(found.fired)
+        for k in range(len(names)):
+            pair = (2 * k + 1, 2 * k + 2)
+            changes[rung, k] = loss.change(ends, *pair)
+            second[rung, k] = loss.change(ends, pair[0], 0) + loss.change(ends, pair[1], 0)
+            same[rung, k] = all(
+                alike(words[i], words[0], (i * knots, i * shapes))
+                and (counts[i] == counts[0]).all()
+                for i in pair
+            )
+    _put_back(worlds, base)
+    assert gradients is not None
+    growth = float(np.linalg.norm(gradients.positions[0])) / loss.size()
+    # contacts magnify rounding: second differences at the smallest step show hardly anything else
+    noise = EPSILON * loss.size()
+    if same[-1].any():
+        noise = max(noise, float(np.median(np.abs(second[-1][same[-1]]))))
     samples = []
     for k, (name, direction) in enumerate(zip(names, along, strict=True)):
-        value = getattr(gradients, name)[0]
-        i, j = 2 * k + 1, 2 * k + 2
-        # the difference first: less is lost to rounding
-        change = (by_x * (ends[i] - ends[j])).sum() + (by_v * (speeds[i] - speeds[j])).sum()
+        value = _gradient(gradients, name, base)
+        ladder = steps[k] / RATIO ** np.arange(RUNGS)
+        # rungs above a crossing are no use, even where the branches happen to be the same
+        crossing = np.flatnonzero(~same[:, k])
+        smooth = slice(int(crossing[-1]) + 1 if len(crossing) else 0, RUNGS)
+        scale = max(float(np.linalg.norm(value)), 2 * noise / ladder[RUNGS // 2] / bound)
+        theirs, doubt = np.nan, None
+        if smooth.start < RUNGS:
+            theirs, unknown = central(changes[smooth, k], ladder[smooth], noise)
+            bent, by = kink(second[smooth, k], ladder[smooth], noise)
+            if abs(bent) < max(KINK * scale, 3 * by):
+                doubt = unknown / scale
         samples.append(
             Sample(
                 parameter=name,
                 ours=float((value * direction).sum()),
-                theirs=float(change / (2 * STEPS[name])),
-                size=float(np.linalg.norm(value * _scale(name, base[name]))),
-                smooth=bool((gradients.fired[[i, j]] == gradients.fired[0]).all()),
+                theirs=theirs,
+                scale=scale,
+                doubt=doubt,
                 fired=gradients.fired[0],
                 growth=growth,
             )
@@ -130,29 +237,120 @@ def compare(
     return samples
 
 
+def _roll(
+    run: DifferentiableRollout,
+    worlds: Worlds,
+    path: GripPath | None,
+    substeps: int,
+    moved: dict[str, list[np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """What the loss is of, in each world, from values of all parameters in each."""
+    data, dt = worlds.solver.data, worlds.solver.config.dt
+    count = len(moved["damping"])
+    paths = {}
+    if path is not None:
+        for w in range(count):
+            paths[w] = replace(
+                path, positions=moved["way_points"][w], times=moved["knot_times"][w],
+                rotations=moved["knot_rotations"][w] if "knot_rotations" in moved else None,
+            )  # fmt: skip
+    for w in range(count):
+        _set_body_masses(worlds, w, moved["body_inverse_masses"][w])
+    stacked = {name: np.stack(values) for name, values in moved.items() if name not in _OF_PATH}
+    ends = run.forward(
+        range(count), [substeps * dt], paths=paths,
+        positions=stacked["positions"], velocities=stacked["velocities"],
+        body_poses=stacked["body_poses"], body_velocities=stacked["body_velocities"],
+        parameters={n: stacked[n] for n in (*WORLD_PARAMETERS, "inverse_masses")},
+    )  # fmt: skip
+    return {
+        "positions": ends[:, 0],
+        "velocities": np.stack([data.lane("particles.v", w) for w in range(count)]),
+        "bodies": run.body_poses[:, 0],
+        "body_velocities": np.stack([data.body_poses(w)[1] for w in range(count)]),
+    }
+
+
+def _put_back(worlds: Worlds, base: dict[str, np.ndarray]) -> None:
+    """What `Worlds.restore` takes for granted."""
+    for w in range(WORLDS):
+        worlds.solver.set_world(w, **{n: float(base[n]) for n in WORLD_PARAMETERS})
+        for name in ("w0", "w"):
+            worlds.solver.data.lane(f"particles.{name}", w)[:] = base["inverse_masses"]
+        _set_body_masses(worlds, w, base["body_inverse_masses"])
+
+
+def _set_body_masses(worlds: Worlds, world: int, inverse: np.ndarray) -> None:
+    data = worlds.solver.data
+    for name in ("w0", "w"):
+        data.arrays[f"bodies.{name}"].view[data.body_rows(world)] = inverse
+
+
 def _base(worlds: Worlds, path: GripPath | None) -> dict[str, np.ndarray]:
     """Values of all parameters in world 0; those of a path where there is one."""
     data = worlds.solver.data
-    of_world = {
-        n: data.per_world(f"group.{n}", 0).astype(float).reshape(()) for n in PARAMETERS[5:]
-    }
-    of_path = {}
-    if path is not None:
-        of_path["way_points"] = np.asarray(path.positions, dtype=float)
-        of_path["knot_times"] = np.asarray(path.times, dtype=float)
-    return {
+    poses, twists = data.body_poses(0)
+    values = {
         "positions": data.lane("particles.x", 0).astype(float),
         "velocities": data.lane("particles.v", 0).astype(float),
         "inverse_masses": data.lane("particles.w0", 0).astype(float),
-        **of_path,
-        **of_world,
+        "body_poses": poses,
+        "body_velocities": twists,
+        "body_inverse_masses": data.arrays["bodies.w0"].view[data.body_rows(0)].copy(),
     }
+    if path is not None:
+        values["way_points"] = np.asarray(path.positions, dtype=float)
+        values["knot_times"] = np.asarray(path.times, dtype=float)
+        if path.rotations is not None:
+            values["knot_rotations"] = np.asarray(path.rotations, dtype=float)
+    for name in WORLD_PARAMETERS:
+        values[name] = data.per_world(f"group.{name}", 0).astype(float).reshape(())
+    return values
 
 
-def _scale(name: str, base: np.ndarray) -> np.ndarray | float:
-    """What one unit of a direction is: inverse masses change by shares, paths start at time 0."""
-    if name == "inverse_masses":
-        return base
+def _direction(name: str, base: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Random; of poses in the tangent space (B, 6), turns by rotation vectors times `ARM`."""
+    if name in WORLD_PARAMETERS:
+        return np.minimum(1.0, base / (2 * STEPS[name]))  # they stay positive
+    direction = rng.normal(size=(len(base), 6) if name == "body_poses" else base.shape)
     if name == "knot_times":
-        return (np.arange(len(base)) > 0).astype(float)
-    return 1.0
+        direction[0] = 0.0  # paths start at time 0
+    return direction
+
+
+def _moved(name: str, base: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """`base` after a step in the units of directions."""
+    if name in ("inverse_masses", "body_inverse_masses"):
+        return base * (1 + by)
+    if name == "body_velocities":
+        return base + by * _TWIST
+    if name == "body_poses":
+        turn = base[:, 3:] + np.einsum("bk,bkq->bq", by[:, 3:] / ARM, _turns(base))
+        turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+        return np.column_stack([base[:, :3] + by[:, :3], turn])
+    return base + by
+
+
+def _gradient(gradients: Gradients, name: str, base: dict[str, np.ndarray]) -> np.ndarray:
+    """Of world 0, in the units of directions."""
+    value = np.asarray(getattr(gradients, name)[0])
+    if name in ("inverse_masses", "body_inverse_masses"):
+        return value * base[name]
+    if name == "body_velocities":
+        return value * _TWIST
+    if name == "body_poses":
+        turn = np.einsum("bq,bkq->bk", value[:, 3:], _turns(base[name])) / ARM
+        return np.column_stack([value[:, :3], turn])
+    if name == "knot_times":
+        return value * (np.arange(len(value)) > 0)
+    return value
+
+
+_TWIST = np.array([1.0] * 3 + [1 / ARM] * 3)
+
+
+def _turns(poses: np.ndarray) -> np.ndarray:
+    """How quaternions change with a rotation vector (B, 3, 4): half its product with them."""
+    x, y, z, w = poses[:, 3:].T / 2
+    rows = [[w, -z, y, -x], [z, w, -x, -y], [-y, x, w, -z]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)

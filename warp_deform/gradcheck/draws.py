@@ -18,6 +18,8 @@ __all__ = ["Draw", "Start", "actions_of_episodes", "draw_states"]
 
 ACTIONS = 4
 """Actions of an episode that states are drawn from; then comes the next seed."""
+MOST_EACH = 10
+"""States of one action at most."""
 AFTER = 0.5
 """States are drawn until so long after a release [s]."""
 RELEASES = 0.3
@@ -69,30 +71,27 @@ def actions_of_episodes(worlds: Worlds, seed: int) -> Iterator[Start]:
 
 
 def draw_states(
-    worlds: Worlds, count: int, rng: np.random.Generator, *, seed: int
+    worlds: Worlds, rng: np.random.Generator, *, seed: int, each: int = MOST_EACH
 ) -> Iterator[Draw]:
-    """`count` states: most at any time of an action, others around landing and release.
+    """States without end, `each` of an action: most at any time of it, others around landing and
+    release.
 
     Between two of them the caller may use the worlds.
     """
-    each = min(worlds.count, 10, max(2, count // 10))
+    each = min(worlds.count, MOST_EACH, each)
     for start in actions_of_episodes(worlds, seed):
-        number = min(each, count)
-        times = [_time(start.path, rng, worlds.solver.config.dt) for _ in range(number)]
+        times = [_time(start.path, rng, worlds.solver.config.dt) for _ in range(each)]
         kept = worlds.state(0)
-        for slot in range(number):
+        for slot in range(each):
             worlds.restore(slot, start.taken)
         rollout(
-            worlds.solver, range(number), paths=dict.fromkeys(range(number), start.path),
+            worlds.solver, range(each), paths=dict.fromkeys(range(each), start.path),
             least=1e3, most=dict(enumerate(times)),
         )  # fmt: skip
-        states = [worlds.state(slot) for slot in range(number)]
+        states = [worlds.state(slot) for slot in range(each)]
         for state, time in zip(states, times, strict=True):
             yield Draw(state, _rest_of(start.path, time, state))
         worlds.restore(0, kept)
-        count -= number
-        if count == 0:
-            return
 
 
 def _time(path: GripPath, rng: np.random.Generator, dt: float) -> float:
@@ -108,8 +107,8 @@ def _time(path: GripPath, rng: np.random.Generator, dt: float) -> float:
 
 
 def _rest_of(path: GripPath, time: float, state: WorldState) -> GripPath | None:
-    """The path from `time` on, moved to where the held particle is: contact may have ended the
-    descent before.
+    """The path from `time` on, moved to where the held thing is: contact may have ended the descent
+    before.
     """
     later = path.times > time
     if not later.any():
@@ -121,9 +120,9 @@ def _rest_of(path: GripPath, time: float, state: WorldState) -> GripPath | None:
 
     positions = at(path.positions)
     rotations = None if path.rotations is None else at(np.asarray(path.rotations))
-    if path.particle is not None:
-        turn = Rotation.from_quat([0.0, 0.0, 0.0, 1.0] if rotations is None else rotations[0])
-        positions += state.particle_q[path.particle] - turn.apply(path.offset) - positions[0]
+    turn = Rotation.from_quat([0.0, 0.0, 0.0, 1.0] if rotations is None else rotations[0])
+    held = state.body_x[path.body] if path.particle is None else state.particle_q[path.particle]
+    positions += held - turn.apply(path.offset) - positions[0]
     lower = None
     if path.lower is not None and path.lower[1] > time:
         lower = (max(path.lower[0] - time, 0.0), path.lower[1] - time)

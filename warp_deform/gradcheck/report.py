@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,17 +16,25 @@ from ..tasks.registry import TASKS
 from ..tasks.registry import task as find_task
 from ..worlds import Worlds
 from .actions import ActionSample, compare_actions
-from .differences import PARAMETERS, WORLDS, Sample, compare
-from .draws import draw_states
+from .differences import PARAMETERS, WORLDS, Sample, compare, fired
+from .draws import Draw, draw_states
 
 __all__: list[str] = []  # `warp_deform.gradcheck` is the import path of what is here
 
 LEVELS = ("substep", "window", "action")
+BOUNDS = {"substep": 1e-6, "window": 1e-5}
+"""Errors that the adjoint is to stay below."""
 WINDOW = 0.1
 """Length of a window [s]."""
 ALL = "all"
+ENOUGH = 20
+"""States in which a kind of constraint acted that a figure rests on."""
+MOST_SEARCHED = 2
+"""States searched for rare kinds, as a multiple of those that are compared anyway."""
+PROGRESS = 5.0
+"""Between lines of progress [s]."""
 _DTYPE = "float64"
-_MEMORY = 2**29  # bytes
+_MEMORY = 3 * 2**29  # bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +43,7 @@ class GradcheckConfig:
 
     levels: tuple[str, ...] = LEVELS
     states: int = 200
-    """States whose next substep is differentiated."""
+    """States whose next substep is differentiated; more where a constraint acts in few of them."""
     windows: int = 30
     """States from which a window is differentiated."""
     actions: int = 16
@@ -47,14 +57,17 @@ class Row:
     """One line of the report; None where a level does not say.
 
     constraint: kind whose states are counted, see `Kind`, or "all"
-    parameter: what is differentiated by; of actions "place", by the rollout that counts, and
-    "place, as differentiated", by the one that slopes are taken of
-    relative_error: 99th percentile over directions; relative to the larger of the gradient's
-    length and `FLOORS`
+    parameter: what is differentiated by, or "all"; of actions "place", by the rollout that counts,
+    and "place, as differentiated", by the one that slopes are taken of
+    relative_error: 99th percentile over states, see `Sample.error`
     cosine: between all directional derivatives and their differences; of actions the mean
     share: of comparisons that cross no branch; of actions those that a search would use
     growth: median of the gradient's length at the start over that at the end
     n: comparisons, or actions
+    states: from so many states
+    within: share of the comparisons that count whose error is below the level's bound
+    doubtful: share of comparisons that do not count, as the differences themselves are not known to
+    the level's bound
     """
 
     task: str
@@ -67,93 +80,121 @@ class Row:
     growth: float | None
     dtype: str
     n: int
+    states: int
+    within: float | None
+    doubtful: float | None
 
 
 def check(name: str | None, config: GradcheckConfig) -> tuple[list[Row], list[str]]:
     """Rows of the task called `name`, or of every task, and notes on what was left out.
 
+    Progress goes to stderr.
+
     Raises:
-        InputError: no such task, or it moves what has no derivatives.
+        InputError: no such task.
         WarpDeformError: a task's episodes gave fewer states than were asked for.
     """
     rows: list[Row] = []
     notes: list[str] = []
     for each in TASKS if name is None else [name]:
-        try:
-            rows += _check_task(each, config, notes)
-        except InputError as error:
-            if name is not None:
-                raise
-            notes.append(str(error))
+        rows += _check_task(each, config, notes)
     return rows, notes
 
 
 def _check_task(name: str, config: GradcheckConfig, notes: list[str]) -> list[Row]:
     task, rows = find_task(name), []
-    worlds = Worlds(task, WORLDS, lanes=1, precision=_DTYPE)
-    try:
-        run = DifferentiableRollout(worlds.solver, memory=_MEMORY)
-    except InputError as error:
-        raise InputError(f"{name} has no derivatives to check: {error}") from error
-    if "substep" in config.levels:
-        samples = _samples(worlds, run, config.states, worlds.solver.config.dt, config.seed)
-        rows += _substep_rows(name, samples)
-    if "window" in config.levels:
-        samples = _samples(worlds, run, config.windows, WINDOW, config.seed)
-        rows += [_row(name, "window", ALL, p, part) for p, part in _by_parameter(samples).items()]
     if "action" in config.levels:
+        print(f"{name}: {config.actions} actions", file=sys.stderr)
         try:
             rows += _action_rows(name, compare_actions(task, config.actions, seed=config.seed))
         except InputError as error:
             notes.append(f"{name}: whole actions were left out: {error}")
+    for level, count in (("window", config.windows), ("substep", config.states)):
+        if level in config.levels:
+            worlds = Worlds(task, WORLDS, lanes=1, precision=_DTYPE)
+            states = _compare_states(worlds, level, count, config.seed)
+            rows = _rows(name, level, states, notes) + rows
     return rows
 
 
-def _samples(
-    worlds: Worlds, run: DifferentiableRollout, count: int, seconds: float, seed: int
-) -> list[Sample]:
+def _compare_states(worlds: Worlds, level: str, count: int, seed: int) -> list[list[Sample]]:
+    """Samples of `count` states; of substeps also of others in which rare kinds act."""
+    run = DifferentiableRollout(worlds.solver, storage="full", memory=_MEMORY)
     rng = np.random.default_rng(seed)
-    samples: list[Sample] = []
-    states = 0
-    for draw in draw_states(worlds, count, rng, seed=seed):
-        samples += compare(run, worlds, draw, seconds, rng)
-        states += 1
-    if states < count:
-        raise WarpDeformError(f"{worlds.task.name}: its episodes gave {states} states of {count}")
-    return samples
+    draws = draw_states(worlds, rng, seed=seed, each=max(2, count // 10))
+    label = f"{worlds.task.name}: {level}"
+    substeps = 1 if level == "substep" else round(WINDOW / worlds.solver.config.dt)
+    bound = BOUNDS[level]
+    states = []
+    for draw in _shown(draws, label, count):
+        states.append(compare(run, worlds, draw, substeps, rng, bound=bound))
+    if len(states) < count:
+        raise WarpDeformError(
+            f"{worlds.task.name}: its episodes gave {len(states)} states of {count}"
+        )
+    if level == "window":
+        return states
+    seen = (np.stack([samples[0].fired for samples in states]) > 0).sum(axis=0)
+    for draw in _shown(draws, f"{label}, for rare constraints", MOST_SEARCHED * count):
+        if (seen >= ENOUGH)[seen > 0].all():
+            break
+        acted = fired(run, worlds, draw) > 0
+        if (acted & (seen < ENOUGH)).any():
+            states.append(compare(run, worlds, draw, substeps, rng, bound=bound))
+            seen += acted
+    return states
 
 
-def _by_parameter(samples: Sequence[Sample]) -> dict[str, list[Sample]]:
-    """Samples of every parameter that has any."""
-    parts = {p: [s for s in samples if s.parameter == p] for p in PARAMETERS}
-    return {p: part for p, part in parts.items() if part}
+def _shown(draws: Iterator[Draw], label: str, count: int) -> Iterator[Draw]:
+    """The next `count` draws, with their number on stderr now and then."""
+    shown = time.monotonic()
+    for number, draw in zip(range(count), draws, strict=False):
+        if time.monotonic() - shown > PROGRESS or number == 0:
+            print(f"{label}: {number} of {count} states", file=sys.stderr, flush=True)
+            shown = time.monotonic()
+        yield draw
 
 
-def _substep_rows(task: str, samples: Sequence[Sample]) -> list[Row]:
-    """Over all states, then over those in which constraints of a kind acted."""
+def _rows(task: str, level: str, states: Sequence[Sequence[Sample]], notes: list[str]) -> list[Row]:
+    """Over all states, and of substeps over those in which constraints of a kind acted."""
     rows = []
-    for kind in (None, *Kind):
-        acted = [s for s in samples if kind is None or s.fired[kind] > 0]
+    for kind in (None, *Kind) if level == "substep" else (None,):
+        acted = [s for s in states if kind is None or s[0].fired[kind] > 0]
         constraint = ALL if kind is None else kind.name.lower()
-        for parameter, part in _by_parameter(acted).items():
-            rows.append(_row(task, "substep", constraint, parameter, part))
+        if kind is not None and 0 < len(acted) < ENOUGH:
+            notes.append(f"{task}: {constraint} acted in {len(acted)} states, fewer than {ENOUGH}")
+        for parameter in (*PARAMETERS, ALL):
+            part = [[s for s in samples if parameter in (s.parameter, ALL)] for samples in acted]
+            part = [samples for samples in part if samples]
+            if part:
+                rows.append(_row(task, level, constraint, parameter, part))
     return rows
 
 
-def _row(task: str, level: str, constraint: str, parameter: str, samples: Sequence[Sample]) -> Row:
-    smooth = [s for s in samples if s.smooth]
-    grown = parameter == "positions"
+def _row(
+    task: str, level: str, constraint: str, parameter: str, states: Sequence[Sequence[Sample]]
+) -> Row:
+    bound = BOUNDS[level]
+    samples = [sample for state in states for sample in state]
+    smooth = [s for s in samples if s.doubt is not None]
+    known = [s for s in smooth if s.doubt is not None and s.doubt < bound]
+    errors = [s.error for s in known]
     return Row(
         task=task,
         level=level,
         constraint=constraint,
         parameter=parameter,
-        relative_error=float(np.percentile([s.error for s in smooth], 99)) if smooth else None,
-        cosine=_cosine([s.ours for s in smooth], [s.theirs for s in smooth]),
+        relative_error=float(np.percentile(errors, 99)) if known else None,
+        cosine=_cosine([s.ours for s in known], [s.theirs for s in known]),
         share=len(smooth) / len(samples),
-        growth=float(np.median([s.growth for s in samples])) if grown else None,
+        growth=float(np.median([s[0].growth for s in states]))
+        if parameter == "positions"
+        else None,
         dtype=_DTYPE,
         n=len(samples),
+        states=len(states),
+        within=float(np.mean(np.less(errors, bound))) if known else None,
+        doubtful=(len(smooth) - len(known)) / len(samples),
     )
 
 
@@ -182,6 +223,9 @@ def _action_rows(task: str, samples: Sequence[ActionSample]) -> list[Row]:
             growth=float(np.median(growths)) if growths else None,
             dtype="float32",
             n=len(samples),
+            states=len(samples),
+            within=None,
+            doubtful=None,
         )
         for parameter, part in cosines.items()
     ]

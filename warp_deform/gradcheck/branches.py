@@ -1,0 +1,41 @@
+"""Which branches the worlds of a taped rollout took."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..differentiable import DifferentiableRollout
+from ..solver.tape import Kind
+
+__all__ = ["SMOOTH", "alike", "counted", "taken"]
+
+SMOOTH = (Kind.TABLE_SLIP, Kind.BODY_SLIP)
+"""Counted, but no branches: the edge between sticking and sliding."""
+
+
+def taken(run: DifferentiableRollout) -> list[np.ndarray]:
+    """Of each world: who touched whom in every substep, and where on its path the tip was.
+
+    That is all that whole numbers on the tape say. `run` keeps its tapes (storage "full") and has
+    one lane a group.
+    """
+    words: list[list[np.ndarray]] = []
+    for segment in run.recorder._segments:
+        arrays = segment.tape.arrays
+        whole, first, top = (arrays[name].numpy() for name in ("k", "first", "top"))
+        words.append([whole[a:b].copy() for a, b in zip(first[:, 2], top[:, 2], strict=True)])
+    return [np.concatenate(parts) for parts in zip(*words, strict=True)]
+
+
+def alike(words: np.ndarray, others: np.ndarray, offsets: Sequence[int]) -> bool:
+    """Whether two worlds took the same branches; `offsets`: how many knots of paths and how many
+    shapes lie between theirs, for these are numbered through all worlds on the tape.
+    """
+    return words.shape == others.shape and bool(np.isin(words - others, (0, *offsets)).all())
+
+
+def counted(fired: np.ndarray) -> np.ndarray:
+    """Counts (..., kinds) of what is a branch."""
+    return np.delete(fired, [int(kind) for kind in SMOOTH], axis=-1)
