@@ -38,8 +38,8 @@ class SearchConfig:
 
     method: str = "cem"
     budget: int = 64
-    candidates: int = 32
-    """First tries, from the task."""
+    candidates: int = 16
+    """First tries, from the task; `enumerate` spends the whole budget on them."""
     elites: int = 6
     """Best tries around which `cem` draws."""
     rounds: int = 2
