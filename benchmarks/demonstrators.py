@@ -125,6 +125,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--quick", action="store_true", help="a smoke run; not for publication")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    parser.add_argument("--compact", action="store_true", help="a table of mean actions by task")
     parser.add_argument("--out", type=Path, help="file of JSON lines to which rows are added")
     options = parser.parse_args()
     if options.quick:
@@ -132,7 +133,8 @@ def main() -> None:
     quiet_warp()
     done = _rows(options.out)
     rows = []
-    if not options.json:
+    in_lines = not (options.json or options.compact)
+    if in_lines:
         print("| task | by | successes / attempts | 95 % | mean actions | mean score "
               "| CPU s an attempt | pierced edges, mean / worst state |")  # fmt: skip
         print("|---|---|---|---|---|---|---|---|")
@@ -146,8 +148,10 @@ def main() -> None:
             if options.out and key not in done:
                 with options.out.open("a") as file:
                     file.write(json.dumps(asdict(row)) + "\n")
-            if not options.json:
+            if in_lines:
                 print(_line(row), flush=True)
+    if options.compact:
+        print(_compact(rows))
     if options.json:
         print(json.dumps({"rows": [asdict(row) for row in rows]}))
 
@@ -232,13 +236,32 @@ def _rows(path: Path | None) -> dict[tuple[str, str, int | None, int | None, int
     return {(r.task, r.by, r.budget, r.depth, r.first_seed, r.attempts): r for r in rows}
 
 
+def _name(row: Row) -> str:
+    return row.by if row.depth is None else f"{row.by}, {row.depth} ahead"
+
+
+def _compact(rows: list[Row]) -> str:
+    """Mean actions, a line a task; solved less than always: the share."""
+    names, tasks = (list(dict.fromkeys(of(row) for row in rows)) for of in (_name, _task))
+    cells = {}
+    for row in rows:
+        share = "" if row.successes == row.attempts else f" ({row.successes}/{row.attempts})"
+        cells[row.task, _name(row)] = f"{row.mean_actions:.2f} ± {row.actions_error:.2f}{share}"
+    lines = [["task", *names], ["---"] * (1 + len(names))]
+    lines += [[task, *(cells.get((task, name), "") for name in names)] for task in tasks]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _task(row: Row) -> str:
+    return row.task
+
+
 def _line(row: Row) -> str:
     low, high = row.interval
     shares = row.pierced
-    name = row.by if row.depth is None else f"{row.by}, {row.depth} ahead"
     edges = f"{100 * shares['mean']:.2f} / {100 * shares['worst']:.1f} %" if shares else "-"
     return (
-        f"| {row.task} | {name} | {row.successes} / {row.attempts} "
+        f"| {row.task} | {_name(row)} | {row.successes} / {row.attempts} "
         f"| {100 * low:.1f}-{100 * high:.1f} % | {row.mean_actions:.2f} ± {row.actions_error:.2f} "
         f"| {row.mean_score:.3f} ± {row.score_error:.3f} "
         f"| {row.cpu_s_per_attempt:.3f} | {edges} |"
