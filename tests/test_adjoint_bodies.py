@@ -212,6 +212,15 @@ def test_a_box_that_is_carried_and_released(release: bool) -> None:
     assert not release or counts["body_table"] > 0
 
 
+@pytest.mark.parametrize("last", [1.5, 3.5])
+def test_a_descent_that_contact_ends(last: float) -> None:
+    """In the only substep of it, or with others left to skip."""
+    _, path, _ = carried(False)
+    solver = box_solver((CUBE, (0, 0, 0.02005)), config=SOLID)
+    counts = Check(solver, 3, replace(path, lower=(0.0, last * DT))).assert_right(rounding=30.0)
+    assert counts["reached"] == 1
+
+
 @pytest.mark.parametrize("turn", [(0.02, 0.01, 0.5), (0.5, 0.6, 0.1)])
 def test_a_box_on_a_box(turn: tuple[float, float, float]) -> None:
     solver = box_solver((CUBE, (0, 0, 0.0199)), (CUBE, (0.012, 0.007, 0.06)), config=SOLID)

@@ -13,10 +13,12 @@ import pytest
 from warp_deform.cli import main
 from warp_deform.differentiable import DifferentiableRollout, Gradients
 from warp_deform.gradcheck import GradcheckConfig, Row, check
-from warp_deform.gradcheck.differences import WORLDS, Sample, compare
+from warp_deform.gradcheck.branches import taken
+from warp_deform.gradcheck.differences import DEEPEST, RUNGS, WORLDS, Sample, _depths, compare
 from warp_deform.gradcheck.draws import Draw, draw_states
 from warp_deform.gradcheck.limits import RATIO, central, kink
 from warp_deform.rollout import rollout
+from warp_deform.solver.tape import Kind
 from warp_deform.worlds import Worlds
 
 LINE = "cable-line-notarget"
@@ -92,6 +94,14 @@ def test_a_jump_between_the_steps_leaves_those_above_it_out() -> None:
     assert value == pytest.approx(1.0, abs=1e-9) and error < 1e-6
 
 
+def test_a_ladder_goes_on_while_contacts_cross_it_and_rounding_is_small() -> None:
+    same = np.ones((RUNGS, 3), dtype=bool)
+    same[-1, 1:] = False
+    values = [np.ones(2), np.ones(2), np.full(2, 1e-7)]
+    depths = _depths(np.ones(3), values, noise=1e-15, same=same, bound=1e-6)
+    assert depths.tolist() == [RUNGS, DEEPEST, RUNGS]
+
+
 def of_times(early: float) -> list[Sample]:
     """Samples by knot times over 4 substeps, with a knot so many substeps before the third ends."""
     worlds = Worlds(LINE, WORLDS, lanes=1, precision="float64")
@@ -104,7 +114,7 @@ def of_times(early: float) -> list[Sample]:
     times = np.array([0.0, 3.0 - early, 10.0]) * dt
     path = replace(path, times=times, positions=knots, rotations=None, lower=None)
     rng = np.random.default_rng(1)
-    samples = compare(run, worlds, Draw(draw.state, path), 4, rng, bound=1e-6, directions=3)
+    samples = compare(run, worlds, replace(draw, path=path), 4, rng, bound=1e-6, directions=3)
     return [sample for sample in samples if sample.parameter == "knot_times"]
 
 
@@ -112,6 +122,46 @@ def test_a_knot_at_the_end_of_a_substep_is_a_branch() -> None:
     """Its time has a derivative on either side, and no other."""
     assert all(sample.doubt is not None and sample.error < 1e-6 for sample in of_times(0.5))
     assert all(sample.doubt is None for sample in of_times(1e-9))
+
+
+def some_held(task: str, count: int) -> tuple[Worlds, DifferentiableRollout, Draw]:
+    """A state in which something is held, for a while yet."""
+    worlds = Worlds(task, count, lanes=1, precision="float64")
+    run = DifferentiableRollout(worlds.solver, storage="full")
+    draws = draw_states(worlds, np.random.default_rng(0), seed=0)
+    long = 20 * worlds.solver.config.dt
+    draw = next(draw for draw in draws if draw.path is not None and draw.path.times[-1] > long)
+    return worlds, run, draw
+
+
+@pytest.mark.parametrize("task", ["fabric-flat", "block-notarget"])
+def test_equal_worlds_take_the_same_branches(task: str) -> None:
+    """Who touched whom is numbered within each world."""
+    worlds, run, draw = some_held(task, 3)
+    for world in range(3):
+        worlds.restore(world, draw.state)
+    dt = worlds.solver.config.dt
+    # pulls tethers taut
+    path = replace(draw.path, positions=draw.path.positions + np.array([0, 0, 0.01]))
+    run.forward(range(3), [20 * dt], paths=dict.fromkeys(range(3), path))
+    first, *others = taken(run)
+    assert task == "block-notarget" or run.backward().counts()["tether"] > 0
+    assert all(np.array_equal(first, words) for words in others)
+
+
+def test_what_a_body_met_before_ends_its_descent_and_no_later_one() -> None:
+    worlds, run, draw = some_held("block-notarget", WORLDS)
+    for lift, touching in ((0.1, 1), (0.1, 0)):
+        state = replace(draw.state, body_x=draw.state.body_x + np.array([0, 0, lift]))
+        path = replace(
+            draw.path, positions=draw.path.positions + np.array([0, 0, lift]),
+            lower=(0.0, 0.5 * draw.path.times[-1]),
+        )  # fmt: skip
+        ends = Draw(state, path, np.full_like(draw.touching, touching))
+        samples = compare(run, worlds, ends, 1, np.random.default_rng(1), bound=1e-6)
+        assert (samples[0].fired[Kind.REACHED] > 0) == touching
+        known = [s for s in samples if s.doubt is not None and s.doubt < 1e-6]
+        assert len(known) > 6 and all(s.error < 1e-6 for s in known)
 
 
 def places(worlds: Worlds) -> np.ndarray:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ..differentiable import DifferentiableRollout
 from ..solver.tape import Kind
 
-__all__ = ["SMOOTH", "alike", "counted", "taken"]
+__all__ = ["SMOOTH", "counted", "taken"]
 
 SMOOTH = (Kind.TABLE_SLIP, Kind.BODY_SLIP)
 """Counted, but no branches: the edge between sticking and sliding."""
@@ -27,13 +25,6 @@ def taken(run: DifferentiableRollout) -> list[np.ndarray]:
         whole, first, top = (arrays[name].numpy() for name in ("k", "first", "top"))
         words.append([whole[a:b].copy() for a, b in zip(first[:, 2], top[:, 2], strict=True)])
     return [np.concatenate(parts) for parts in zip(*words, strict=True)]
-
-
-def alike(words: np.ndarray, others: np.ndarray, offsets: Sequence[int]) -> bool:
-    """Whether two worlds took the same branches; `offsets`: how many knots of paths and how many
-    shapes lie between theirs, for these are numbered through all worlds on the tape.
-    """
-    return words.shape == others.shape and bool(np.isin(words - others, (0, *offsets)).all())
 
 
 def counted(fired: np.ndarray) -> np.ndarray:

@@ -15,8 +15,8 @@ import numpy as np
 from ..differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
 from ..rollout import GripPath
 from ..worlds import Worlds
-from .branches import alike, counted, taken
-from .draws import Draw
+from .branches import counted, taken
+from .draws import Draw, touching_of
 from .limits import RATIO, central, kink
 
 __all__ = ["PARAMETERS", "RUNGS", "STEPS", "WORLDS", "Sample", "compare", "fired"]
@@ -41,6 +41,9 @@ turns: as motion at `ARM`): far above rounding. Contacts are a micrometre deep, 
 down to where few directions cross a branch."""
 PARAMETERS = tuple(STEPS)
 RUNGS = 5
+SMOOTH_RUNGS, DEEPEST = 3, 9
+"""Where fewer than so many of the lowest rungs cross no branch, a ladder goes on downwards while
+rounding is below the bound, to so many rungs at most."""
 ARM = 0.05
 """A turn moves a point so far from the centre by as much as a unit of position does [m]."""
 EPSILON = 2.2e-16
@@ -158,6 +161,7 @@ def compare(
 def fired(run: DifferentiableRollout, worlds: Worlds, draw: Draw) -> np.ndarray:
     """How often constraints of each kind act in the next substep."""
     worlds.restore(0, draw.state)
+    touching_of(worlds, 0)[:] = draw.touching
     paths = {} if draw.path is None else {0: draw.path}
     run.forward([0], [worlds.solver.config.dt], paths=paths)
     return run.backward().fired[0]
@@ -177,48 +181,49 @@ def _compare_some(
     count = 1 + 2 * len(names)
     shorter = np.sqrt(1e-6 / bound)
     steps = [STEPS[n] * shorter / (substeps if n in _GROWING else 1) for n in names]
-    changes, second = np.zeros((2, RUNGS, len(names)))
-    same = np.zeros((RUNGS, len(names)), dtype=bool)
-    knots = 0 if draw.path is None else len(draw.path.times)
-    data = worlds.solver.data
-    shapes = len(data.topologies[data.world_topology[0]].shape_body)
+    changes, second = np.zeros((2, DEEPEST, len(names)))
+    same = np.zeros((DEEPEST, len(names)), dtype=bool)
+    depths, noise, values = np.full(len(names), DEEPEST), 0.0, [np.zeros(0)]
     gradients: Gradients | None = None
-    for rung in range(RUNGS):
+    middle: tuple[np.ndarray, np.ndarray] | None = None
+    for rung in range(DEEPEST):
+        if rung == RUNGS:
+            assert gradients is not None
+            noise = _noise(loss, second[rung - 1][same[rung - 1]])
+            values = [_gradient(gradients, name, base) for name in names]
+            depths = _depths(np.array(steps), values, noise, same[:RUNGS], bound)
+        if rung == depths.max():
+            break
         moved = {name: [base[name]] * count for name in base}
         for k, (name, direction) in enumerate(zip(names, along, strict=True)):
             step = steps[k] / RATIO**rung
             moved[name][2 * k + 1] = _moved(name, base[name], step * direction)
             moved[name][2 * k + 2] = _moved(name, base[name], -step * direction)
-        ends = _roll(run, worlds, draw.path, substeps, moved)
+        ends = _roll(run, worlds, draw, substeps, moved)
         found = loss.backward(run, count)
         gradients = gradients or found
         words, counts = taken(run), counted(found.fired)
+        middle = middle or (words[0], counts[0])
         for k in range(len(names)):
             pair = (2 * k + 1, 2 * k + 2)
             changes[rung, k] = loss.change(ends, *pair)
             second[rung, k] = loss.change(ends, pair[0], 0) + loss.change(ends, pair[1], 0)
             same[rung, k] = all(
-                alike(words[i], words[0], (i * knots, i * shapes))
-                and (counts[i] == counts[0]).all()
-                for i in pair
+                np.array_equal(words[i], middle[0]) and (counts[i] == middle[1]).all()
+                for i in (0, *pair)
             )
     _put_back(worlds, base)
     assert gradients is not None
     growth = float(np.linalg.norm(gradients.positions[0])) / loss.size()
-    # contacts magnify rounding: second differences at the smallest step show hardly anything else
-    noise = EPSILON * loss.size()
-    if same[-1].any():
-        noise = max(noise, float(np.median(np.abs(second[-1][same[-1]]))))
     samples = []
-    for k, (name, direction) in enumerate(zip(names, along, strict=True)):
-        value = _gradient(gradients, name, base)
-        ladder = steps[k] / RATIO ** np.arange(RUNGS)
+    for k, (name, value, direction) in enumerate(zip(names, values, along, strict=True)):
+        ladder = steps[k] / RATIO ** np.arange(depths[k])
         # rungs above a crossing are no use, even where the branches happen to be the same
-        crossing = np.flatnonzero(~same[:, k])
-        smooth = slice(int(crossing[-1]) + 1 if len(crossing) else 0, RUNGS)
+        crossing = np.flatnonzero(~same[: depths[k], k])
+        smooth = slice(int(crossing[-1]) + 1 if len(crossing) else 0, depths[k])
         scale = max(float(np.linalg.norm(value)), 2 * noise / ladder[RUNGS // 2] / bound)
         theirs, doubt = np.nan, None
-        if smooth.start < RUNGS:
+        if smooth.start < depths[k]:
             theirs, unknown = central(changes[smooth, k], ladder[smooth], noise)
             bent, by = kink(second[smooth, k], ladder[smooth], noise)
             if abs(bent) < max(KINK * scale, 3 * by):
@@ -237,15 +242,33 @@ def _compare_some(
     return samples
 
 
+def _noise(loss: _Loss, second: np.ndarray) -> float:
+    """What rounding leaves of a loss, by second differences (n,) with the smallest steps: contacts
+    magnify it, and these show hardly anything else.
+    """
+    measured = float(np.median(np.abs(second))) if len(second) else 0.0
+    return max(EPSILON * loss.size(), measured)
+
+
+def _depths(
+    steps: np.ndarray, values: Sequence[np.ndarray], noise: float, same: np.ndarray, bound: float
+) -> np.ndarray:
+    """How many rungs each ladder has, by what the first of them (rungs, n) crossed."""
+    finest = noise / (bound * np.array([max(float(np.linalg.norm(v)), 1e-300) for v in values]))
+    most = np.floor(np.log(steps / finest) / np.log(RATIO)).astype(int) + 1
+    crossed = ~same[-SMOOTH_RUNGS:].all(axis=0)
+    return np.where(crossed, np.clip(most, RUNGS, DEEPEST), RUNGS)
+
+
 def _roll(
     run: DifferentiableRollout,
     worlds: Worlds,
-    path: GripPath | None,
+    draw: Draw,
     substeps: int,
     moved: dict[str, list[np.ndarray]],
 ) -> dict[str, np.ndarray]:
     """What the loss is of, in each world, from values of all parameters in each."""
-    data, dt = worlds.solver.data, worlds.solver.config.dt
+    data, dt, path = worlds.solver.data, worlds.solver.config.dt, draw.path
     count = len(moved["damping"])
     paths = {}
     if path is not None:
@@ -256,6 +279,7 @@ def _roll(
             )  # fmt: skip
     for w in range(count):
         _set_body_masses(worlds, w, moved["body_inverse_masses"][w])
+        touching_of(worlds, w)[:] = draw.touching
     stacked = {name: np.stack(values) for name, values in moved.items() if name not in _OF_PATH}
     ends = run.forward(
         range(count), [substeps * dt], paths=paths,

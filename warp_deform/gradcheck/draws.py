@@ -14,7 +14,7 @@ from ..tasks.task import Action
 from ..world_state import WorldState
 from ..worlds import Worlds
 
-__all__ = ["Draw", "Start", "actions_of_episodes", "draw_states"]
+__all__ = ["Draw", "Start", "actions_of_episodes", "draw_states", "touching_of"]
 
 ACTIONS = 4
 """Actions of an episode that states are drawn from; then comes the next seed."""
@@ -40,10 +40,14 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """A state in the middle of an action, and the path from there; None: let go already."""
+    """A state in the middle of an action, and the path from there; None: let go already.
+
+    touching (B,): how many things each body met in the substep before, which may end a descent
+    """
 
     state: WorldState
     path: GripPath | None
+    touching: np.ndarray
 
 
 def actions_of_episodes(worlds: Worlds, seed: int) -> Iterator[Start]:
@@ -89,9 +93,17 @@ def draw_states(
             least=1e3, most=dict(enumerate(times)),
         )  # fmt: skip
         states = [worlds.state(slot) for slot in range(each)]
-        for state, time in zip(states, times, strict=True):
-            yield Draw(state, _rest_of(start.path, time, state))
+        met = [touching_of(worlds, slot).copy() for slot in range(each)]
+        for state, time, touching in zip(states, times, met, strict=True):
+            yield Draw(state, _rest_of(start.path, time, state), touching)
         worlds.restore(0, kept)
+
+
+def touching_of(worlds: Worlds, slot: int) -> np.ndarray:
+    """`Draw.touching` as a slot has it; to be written to, for it outlasts a launch."""
+    data = worlds.solver.data
+    met: np.ndarray = data.views["bodies.touching"][data.body_rows(slot)]
+    return met
 
 
 def _time(path: GripPath, rng: np.random.Generator, dt: float) -> float:

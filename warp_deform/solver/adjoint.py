@@ -274,7 +274,7 @@ def adjoint_kernel(
                         tk -= 1
                         tx -= 1
                         by_held = by_held + sweep_tether(
-                            tape.k[tk], tape.x[tx], holding, counts, on, q, adj
+                            p0 + tape.k[tk], tape.x[tx], holding, counts, on, q, adj
                         )
                     for lane in range(wp.static(L)):
                         if tape.k[at + lane] >= 0:

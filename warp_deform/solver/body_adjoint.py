@@ -141,7 +141,7 @@ def body_adjoint(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
         for _ in range(tape.k[word - 1]):
             tk -= wp.static(BODY_WORDS)
             who = tape.k[tk]
-            shape = tape.k[tk + 1]
+            shape = group.shape_start[g] + lane * top.shape_count[k] + tape.k[tk + 1]
             b = b0 + shapes.body[shape]
             if who >= 0:
                 ts -= wp.static(BOX_PARTICLE_SCALARS)

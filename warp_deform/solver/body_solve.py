@@ -79,7 +79,7 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
                             tape,
                         ):  # fmt: skip
                             tape.k[tops[2]] = i
-                            tape.k[tops[2] + 1] = shape
+                            tape.k[tops[2] + 1] = shape - first
                             tops[2] += wp.static(BODY_WORDS)
                             tops[3] += wp.static(BOX_PARTICLE_SCALARS)
                     else:
@@ -88,8 +88,8 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
                         )
             if wp.static(with_sheets and taped):
                 found = record_box_triangles(
-                    tops[2], tops[3], lane, k, p0, radii, shape, b, far + thickest, mu, push, top,
-                    shapes, bodies, sheets, cells, tape,
+                    tops[2], tops[3], lane, k, p0, radii, shape, shape - first, b, far + thickest,
+                    mu, push, top, shapes, bodies, sheets, cells, tape,
                 )  # fmt: skip
                 tops[2] += wp.static(BODY_WORDS) * found
                 tops[3] += wp.static(BOX_TRIANGLE_SCALARS) * found

@@ -22,7 +22,7 @@ __all__ = ["box_triangle_adjoint"]
 def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     """`record_box_triangles` solves the triangles of one lane against one box, leaves those that
     met it on the tape, and returns their number; `sweep_box_triangle` takes one back and returns
-    the derivative by friction.
+    the derivative by friction. `number`: of the shape in its world.
 
     Branches: the axis that separates best; beside each other or overlapping; inside, edge or corner
     of the triangle; depth limited by the overlap or by `recovery`; corners that the table carries.
@@ -47,8 +47,8 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def record_box_triangles(
-        word: int, at: int, lane: int, k: int, p0: int, radii: int, shape: int, b: int, wide: S,
-        mu: S, push: S, top: Topology, shapes: Shapes, bodies: Bodies, sheets: Sheets,
+        word: int, at: int, lane: int, k: int, p0: int, radii: int, shape: int, number: int, b: int,
+        wide: S, mu: S, push: S, top: Topology, shapes: Shapes, bodies: Bodies, sheets: Sheets,
         cells: Cells, tape: Tape,
     ):  # fmt: skip
         found = int(0)
@@ -69,7 +69,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             ):
                 center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
                 tape.k[word + found * wp.static(BODY_WORDS)] = -1 - f
-                tape.k[word + found * wp.static(BODY_WORDS) + 1] = shape
+                tape.k[word + found * wp.static(BODY_WORDS) + 1] = number
                 found += 1
             f = next_near(sheets.triangle, cells.x, f + 1, end, p0, lane, center, wide)
         return found

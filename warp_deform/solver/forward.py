@@ -218,13 +218,16 @@ def forward_kernel(
                         if wp.static(taped):
                             tick = grips.tick[w]
                             knot = grips.knot[w]
+                            shift = grips.shift[w]
                         goes_on = follow_path(
                             met, w, lane, p0, bl, shape, shape + top.shape_count[k], near_start,
                             near_count, radius, dt, q, pairs, shapes, near, bodies, grips,
                         )  # fmt: skip
                         if wp.static(taped):
                             released = wp.where(goes_on, 0, 1)
-                            record_grip(tops[2], w, lane, tick, knot, released, grips, tape)
+                            record_grip(
+                                tops[2], w, lane, tick, knot, shift, released, grips, tape
+                            )  # fmt: skip
                             tops[2] += wp.static(GRIP_WORDS)
                         if not goes_on:
                             let_go(w, lane, p0, bl, q, bodies, grips)

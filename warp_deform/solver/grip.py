@@ -184,19 +184,25 @@ def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
 
     @wp.func
     def record_grip(
-        at: int, w: int, lane: int, tick: int, knot: int, released: int, grips: Grips, tape: Tape
-    ):
-        """`tick`, `knot`: before the substep."""
+        at: int, w: int, lane: int, tick: int, knot: int, shift: R3, released: int, grips: Grips,
+        tape: Tape,
+    ):  # fmt: skip
+        """`tick`, `knot`, `shift`: before the substep. Knots count from the path's end."""
+        # a descent that ends in its last substep skips none
+        reached = int(0)
+        if grips.tick[w] != tick + 1 or wp.length_sq(grips.shift[w] - shift) > S(0.0):
+            reached = 1
         held = grips.particle[w]
         if held < 0:
             held = -1 - grips.body[w]
         tape.k[at] = lane
         tape.k[at + 1] = held
         tape.k[at + 2] = grips.tick[w]
-        tape.k[at + 3] = grips.knot[w]
+        tape.k[at + 3] = grips.knot_end[w] - grips.knot[w]
         tape.k[at + 4] = released
         tape.k[at + 5] = tick
-        tape.k[at + 6] = knot
+        tape.k[at + 6] = grips.knot_end[w] - knot
+        tape.k[at + 7] = reached
 
     @wp.func
     def turned_by(o: R3, q: Q, g: R3):
@@ -260,8 +266,8 @@ def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
         lane = tape.k[at]
         held = tape.k[at + 1]
         tick = tape.k[at + 2]
-        knot = tape.k[at + 3]
         w = w0 + lane
+        knot = grips.knot_end[w] - tape.k[at + 3]
         clock = S(tick) * dt
         g = R3()
         still = Q(S(0.0), S(0.0), S(0.0), S(0.0))
@@ -312,11 +318,11 @@ def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
         to_knots(knot, clock, g, turn, grips, adj)
         shift = adj.shift[w] + g
         before = tape.k[at + 5]
-        if tick != before + 1:
+        if tape.k[at + 7] > 0:
             kind = counts + wp.static(int(Kind.REACHED))
             to_knots(knot, clock, -shift, still, grips, adj)
             here = S(before + 1) * dt - dt
-            k = int(tape.k[at + 6])
+            k = int(grips.knot_end[w] - tape.k[at + 6])
             while k + 2 < grips.knot_end[w] and grips.time[k + 1] <= here:
                 k += 1
             to_knots(k, here, shift, still, grips, adj)

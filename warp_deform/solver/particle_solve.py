@@ -96,7 +96,7 @@ def particle_solve(
                 for i in range(n):
                     if wp.static(taped):
                         if record_tether(p0 + i, tx, holding, held, q, tape):
-                            tape.k[tk] = p0 + i
+                            tape.k[tk] = i
                             tx += 1
                             tk += 1
                     else:

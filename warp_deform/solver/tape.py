@@ -3,9 +3,9 @@
 A taped launch pushes what the derivative of each constraint needs (its inputs, as differences where
 those suffice) onto one of four stacks of its group: V3, V, whole numbers, and scalars of one lane.
 Constraints that always act push no more; those that act now and then push who they were as well,
-and every phase of a substep ends with their number. The backward sweep pops in reverse, so it finds
-the very inputs, and takes the very branches, of the forward pass. Nothing else of the state is
-needed: the sweep restores none.
+numbered within their world, and every phase of a substep ends with their number. The backward sweep
+pops in reverse, so it finds the very inputs, and takes the very branches, of the forward pass.
+Nothing else of the state is needed: the sweep restores none.
 """
 
 import functools
@@ -25,7 +25,7 @@ STATE = 14
 """Lane vectors of the kernel's own state per group."""
 COUNTERS = 3
 """Whole numbers of the kernel's own state per group."""
-GRIP_WORDS = 7
+GRIP_WORDS = 8
 """Whole numbers on the tape for a lane that holds something."""
 TRIANGLE_WORDS = 2
 """The same for a particle that touches a triangle, or an edge that touches another one."""
