@@ -83,3 +83,15 @@ def test_maps_of_a_grid_are_its_symmetries():
     assert square.shape == (8, 9) and oblong.shape == (4, 6)
     assert len({tuple(way) for way in square}) == 8 and len({tuple(way) for way in oblong}) == 4
     assert (np.sort(square, axis=1) == np.arange(9)).all()
+
+
+def test_a_block_in_place_has_a_loss_however_its_quaternion_was_rounded():
+    task = find_task("block-notarget")
+    worlds = Worlds(task, 1)
+    worlds.reset({0: 7})
+    episode = worlds.episodes[0]
+    done = task.goal_layout(episode.layout).body_q
+    for length in (1.0, 1 + 1e-6, 1 - 1e-6):
+        pose = torch.tensor(done)
+        pose[:, 3:] *= length
+        assert task.loss(episode.layout, episode.snapshot, torch.zeros(0, 3), pose) < 2e-4

@@ -246,10 +246,7 @@ def loss_and_slopes(
         torch.tensor(np.asarray(array), dtype=torch.float64, requires_grad=True)
         for array in (particle_q, body_q)
     ]
-    # rounded to float32 a quaternion is longer than 1, for which a loss may not be a number
-    unit = torch.nn.functional.normalize(ends[1][:, 3:], dim=1)
-    poses = torch.cat([ends[1][:, :3], unit], dim=1)
-    value = task.loss(episode.layout, episode.snapshot, ends[0], poses)
+    value = task.loss(episode.layout, episode.snapshot, *ends)
     slopes = torch.autograd.grad(value, ends, allow_unused=True, materialize_grads=True)
     return value.item(), slopes[0].numpy(), slopes[1].numpy()
 

@@ -97,9 +97,10 @@ class BlockNotarget(Task):
         x, y, yaw = layout.targets
         away = (body_q[0, :2] - body_q.new_tensor([x, y])).square().sum()
         qx, qy, qz, qw = body_q[0, 3:]
-        across, along = 2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)
-        cosine = along * np.cos(yaw) + across * np.sin(yaw)
-        return (away + 1e-8).sqrt() + 0.05 * (2 * (1 - cosine) + 1e-8).sqrt()
+        across, along = 2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
+        length = (across.square() + along.square()).sqrt()
+        turn = (along / length - np.cos(yaw)).square() + (across / length - np.sin(yaw)).square()
+        return (away + 1e-8).sqrt() + 0.05 * (turn + 1e-8).sqrt()
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(6,): x, y, -yaw / 15 of the block, then of the goal."""
