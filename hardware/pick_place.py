@@ -112,6 +112,8 @@ class PickPlaceOutcome(StrEnum):
     """The fingers held nothing, after closing or after the lift."""
     OBSTRUCTED = "obstructed"
     """A descent met something well above the table; the hand went up again."""
+    ABORTED = "aborted"
+    """The robot stopped itself on the way, was recovered, and let go of what it held."""
 
 
 @dataclass(frozen=True)

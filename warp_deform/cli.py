@@ -54,6 +54,7 @@ VERBS: dict[str, Verb] = {
     "gradcheck": Verb(
         "warp_deform.commands:gradcheck", "compare derivatives with finite differences"
     ),
+    "franka": Verb("hardware.cli:franka", "the cable task on a Franka arm or its twin"),
     "doctor": Verb("warp_deform.commands:doctor", "versions, devices, caches and what is missing"),
 }
 

@@ -50,6 +50,11 @@ T = TypeVar("T")
 QUICK_TIMEOUT = 5.0  # [s]
 # The vendor's planner gives up after 30 s.
 PLANNING_TIMEOUT = 35.0  # [s]
+# A reading while the vendor plans keeps a motion from starting: for so long the last one is given
+# instead [s], and where planning takes longer the motion is tried again.
+STARTING = 0.3
+STARTS = 5
+BUSY = "another control or read operation is running"
 # A grasp tolerance as wide as the hand: outside it the real hand reopens, so held or not is decided
 # from the measured width instead.
 WIDE = GRIPPER_MAX_WIDTH
@@ -114,6 +119,7 @@ class PandaRobot(Closing):
         logging.getLogger("motion").addHandler(logging.NullHandler())
         self._closed = False
         self._following = False
+        self._begun = 0.0
         self._reading = threading.Lock()
         self._thresholds_set = False
         self._panda = self._connect(lambda: panda_py.Panda(self.config.host))
@@ -274,7 +280,9 @@ class PandaRobot(Closing):
             if not self._following:
                 # The first may have waited in a buffer since nobody read; the second is fresh.
                 self._quick(lambda: self._robot.read_once())
-                return self._quick(lambda: self._robot.read_once())
+                self._latest = self._quick(lambda: self._robot.read_once())
+            if not self._following or time.monotonic() - self._begun < STARTING:
+                return self._latest
         return self._quick(lambda: self._panda.get_state())
 
     @staticmethod
@@ -305,7 +313,13 @@ class PandaRobot(Closing):
         start = np.array(self._ready().q)
         target = self.pose(points[-1]) if target is None else target
         for begin, piece in path_pieces(start, points):
-            self._follow(begin, piece, factor)
+            for left in reversed(range(STARTS)):
+                try:
+                    self._follow(begin, piece, factor)
+                    break
+                except MotionError as error:
+                    if BUSY not in str(error) or not left:
+                        raise
         reached = np.array(self._read().O_T_EE).reshape(4, 4).T
         off, turned = distance(reached, target)
         tolerance = self.config.arrival_tolerance_m, self.config.arrival_tolerance_rad
@@ -323,7 +337,7 @@ class PandaRobot(Closing):
         clock = time.monotonic()
         self._forget_error()
         with self._reading:  # a reading in another thread would make the vendor refuse the motion
-            self._following = True
+            self._following, self._begun = True, time.monotonic()
         try:
             ok = run_bounded(
                 lambda: self._panda.move_to_joint_position(columns, speed_factor=factor),

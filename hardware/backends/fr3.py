@@ -1,0 +1,284 @@
+"""The Franka Research 3 through franky: server version 10, system 5.9 or later, no ROS.
+
+Straight lines are the robot's own: franky's Cartesian motions with limited jerk, ended by its
+reaction to force in the 1 kHz loop. So the elbow goes where the robot lets it.
+
+Never run on a physical robot by the authors, nor on a simulated one in the tests: those use a
+stand-in for franky that has its names. Stopping by software is no safety function.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from warp_deform.errors import InputError
+
+from ..closing import Closing
+from ..panda_arm import DQ_MAX, GRIPPER_MAX_WIDTH
+from ..robot import (
+    BackendMissing,
+    ConnectionFailed,
+    ConnectionLost,
+    GraspError,
+    IncompatibleVersion,
+    MotionError,
+    MoveResult,
+    ReflexError,
+    RobotError,
+    RobotMode,
+    RobotState,
+    UserStopped,
+    check_joints,
+    check_pose,
+    check_range,
+)
+from ..straight_line import distance
+from .bounded import run_bounded
+from .libfranka_errors import typed_error
+
+__all__ = ["FR3_Q_MAX", "FR3_Q_MIN", "FR3Config", "FR3Robot"]
+
+T = TypeVar("T")
+FR3_Q_MIN = np.array([-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159])
+"""Lowest joint positions of an FR3 [rad]; they differ from the Panda's."""
+FR3_Q_MAX = np.array([2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159])
+"""Highest joint positions of an FR3 [rad]."""
+# A share of the speeds that all backends mean: those of the Panda, which has the slower joints.
+_DQ_MAX = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])  # [rad/s]
+_SHARE = float((DQ_MAX / _DQ_MAX).min())
+_QUICK = 5.0  # [s]
+_MOTION = 120.0  # [s]
+_MODES = {
+    "Idle": RobotMode.IDLE,
+    "Move": RobotMode.MOVING,
+    "Guiding": RobotMode.GUIDING,
+    "Reflex": RobotMode.REFLEX,
+    "UserStopped": RobotMode.USER_STOPPED,
+    "AutomaticErrorRecovery": RobotMode.RECOVERING,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FR3Config:
+    """How to reach an FR3 and what to expect of it."""
+
+    host: str = "172.16.0.2"
+    """Address of the robot's control box; the vendor's default."""
+    collision_torque_Nm: float = 20.0
+    """Torque at any joint that makes the robot stop itself [N m]."""
+    collision_force_N: float = 20.0
+    """Force on the hand that makes the robot stop itself [N]."""
+    arrival_tolerance_m: float = 3e-3
+    """How far from its target the TCP may end [m]."""
+    arrival_tolerance_rad: float = 0.035
+    """How far from its target orientation the TCP may end [rad], 2 degrees."""
+    gripper_speed: float = 0.05
+    """Speed of the opening [m/s]."""
+    min_held_m: float = 5e-4
+    """Opening after a grasp at and below which the fingers hold nothing [m]."""
+    held_tolerance_m: float = 5e-3
+    """How much wider than expected a held object may be [m]."""
+    connect_timeout_s: float = 10.0
+    """Time for the connection [s]."""
+
+
+class FR3Robot(Closing):
+    """A `Robot`: a Franka Research 3 with its hand. Connecting moves nothing.
+
+    Raises:
+        BackendMissing: franky-control is not installed
+        IncompatibleVersion: the robot is no FR3 of system version 5.9 or later
+        ConnectionFailed: nothing answers, FCI is not active, or another client has it
+    """
+
+    def __init__(self, config: FR3Config | None = None) -> None:
+        self.config = config or FR3Config()
+        try:
+            import franky
+        except ImportError as error:
+            raise BackendMissing(
+                f"franky cannot be loaded: {error}",
+                advice="install it: pip install 'warp-deform[fr3]'",
+            ) from error
+        self._franky = franky
+        self._closed = False
+        host = self.config.host
+        # Without a real-time kernel, too: `franka doctor` says what that costs.
+        self._robot = self._connect(
+            lambda: franky.Robot(host, realtime_config=franky.RealtimeConfig.Ignore)
+        )
+        self._gripper = self._connect(lambda: franky.Gripper(host))
+        c = self.config
+        self._quick(
+            lambda: self._robot.set_collision_behavior(c.collision_torque_Nm, c.collision_force_N)
+        )
+
+    def _connect(self, make: Callable[[], T]) -> T:
+        config, franky = self.config, self._franky
+        try:
+            return run_bounded(make, timeout_s=config.connect_timeout_s)
+        except TimeoutError as error:
+            raise ConnectionFailed(
+                f"{config.host} gave no answer in {config.connect_timeout_s:g} s"
+            ) from error
+        except franky.IncompatibleVersionException as error:
+            raise IncompatibleVersion(
+                str(error), advice="use --robot panda for a Panda; update an FR3 to system 5.9"
+            ) from error
+        except self._errors() as error:
+            raise ConnectionFailed(f"{config.host}: {error}") from error
+
+    def state(self) -> RobotState:
+        """Read the robot now; see `Robot.state`."""
+        reading = self._quick(lambda: self._robot.state)
+        return RobotState(
+            q=np.array(reading.q, dtype=float),
+            base_T_tcp=np.array(reading.O_T_EE.matrix, dtype=float),
+            force_N=np.array(reading.O_F_ext_hat_K, dtype=float),
+            gripper_width_m=float(self._quick(lambda: self._gripper.width)),
+            mode=_MODES.get(reading.robot_mode.name, RobotMode.OTHER),
+        )
+
+    def move_joints(self, q: np.ndarray, *, speed: float) -> None:
+        """Move through joint way-points; see `Robot.move_joints`. The arm rests at each.
+
+        Raises:
+            InputError: also beyond the FR3's own joint limits
+        """
+        points = check_joints(q)
+        check_range("speed", speed, low=0.0, high=1.0, unit="of the greatest speed")
+        beyond = (points < FR3_Q_MIN) | (points > FR3_Q_MAX)
+        if beyond.any():
+            joint = int(np.argwhere(beyond)[0][1])
+            raise InputError(
+                f"q: joint {joint + 1} is beyond an FR3's limits {FR3_Q_MIN[joint]} to "
+                f"{FR3_Q_MAX[joint]}; choose another way-point"
+            )
+        franky = self._franky
+        way = [franky.JointWaypoint(franky.JointState(point.tolist())) for point in points]
+        motion = franky.JointWaypointMotion(way, relative_dynamics_factor=speed * _SHARE)
+        self._move(motion)
+        off = float(np.abs(self.state().q - points[-1]).max())
+        if off > self.config.arrival_tolerance_rad:
+            raise MotionError(f"a joint ended {off:.3f} rad from its target")
+
+    def move_linear(
+        self, base_T_tcp: np.ndarray, *, speed: float, stop_force_N: float | None = None
+    ) -> MoveResult:
+        """Move the TCP in a straight line; see `Robot.move_linear`."""
+        target = check_pose(base_T_tcp)
+        check_range("speed", speed, low=0.0, high=1.7, unit="m/s")
+        if stop_force_N is not None:
+            high = self.config.collision_force_N
+            check_range("stop_force_N", stop_force_N, low=0.0, high=high, unit="N")
+        franky = self._franky
+        share = min(speed / float(self._robot.translation_velocity_limit.get()), 1.0)
+        # The constructor takes a matrix: no quaternion, whose order differs between libraries.
+        motion = franky.CartesianMotion(franky.Affine(target), relative_dynamics_factor=share)
+        met = threading.Event()
+        if stop_force_N is not None:
+            condition = False
+            for name in ("FORCE_X", "FORCE_Y", "FORCE_Z"):
+                force = getattr(franky.Measure, name)
+                condition = (force > stop_force_N) | (force < -stop_force_N) | condition
+            reaction = franky.CartesianPoseReaction(condition, franky.CartesianStopMotion())
+            reaction.register_callback(lambda *_: met.set())
+            motion.add_reaction(reaction)
+        self._move(motion)
+        reached = self.state().base_T_tcp
+        if met.is_set():
+            return MoveResult(reached, contact=True)
+        off, turned = distance(reached, target)
+        tolerance = self.config.arrival_tolerance_m, self.config.arrival_tolerance_rad
+        if off > tolerance[0] or turned > tolerance[1]:
+            raise MotionError(
+                f"the TCP ended {1e3 * off:.1f} mm and {turned:.3f} rad from its target "
+                f"(allowed: {1e3 * tolerance[0]:.1f} mm, {tolerance[1]:.3f} rad)"
+            )
+        return MoveResult(reached, contact=False)
+
+    def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:
+        """Move the fingers; see `Robot.open_gripper`."""
+        check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
+        if not self._finger(lambda: self._gripper.move(width_m, self.config.gripper_speed)):
+            raise GraspError(f"the fingers did not get to {width_m} m: something is between them")
+
+    def grasp(self, *, width_m: float, force_N: float) -> bool:
+        """Close the fingers; see `Robot.grasp`."""
+        check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
+        check_range("force_N", force_N, low=0.0, high=70.0, unit="N")
+        speed, wide = self.config.gripper_speed, GRIPPER_MAX_WIDTH
+        # A narrow tolerance makes the hand reopen; whether it holds says the measured width.
+        self._finger(
+            lambda: self._gripper.grasp(
+                width_m, speed, force_N, epsilon_inner=wide, epsilon_outer=wide
+            )
+        )
+        width = float(self._quick(lambda: self._gripper.width))
+        return self.config.min_held_m < width <= width_m + self.config.held_tolerance_m
+
+    def stop(self) -> None:
+        """End the motion in progress; see `Robot.stop`."""
+        self._quick(lambda: self._robot.stop())
+
+    def recover(self) -> None:
+        """Clear a reflex; see `Robot.recover`."""
+        mode = self.state().mode
+        if mode == RobotMode.USER_STOPPED:
+            raise UserStopped("the user stop is pressed")
+        if mode == RobotMode.REFLEX and not self._quick(lambda: self._robot.recover_from_errors()):
+            raise ReflexError("the robot does not recover", advice="recover it by hand in Desk")
+
+    def close(self) -> None:
+        """End the connection; see `Robot.close`."""
+        self._closed = True
+        self._robot = self._gripper = None
+
+    # Below: franky's exceptions made into typed errors.
+
+    def _errors(self) -> tuple[type[Exception], ...]:
+        """Franky's base class; what it raises through its bindings alone is a RuntimeError."""
+        return (self._franky.Exception, RuntimeError)
+
+    def _typed(self, error: Exception) -> RobotError:
+        if isinstance(error, self._franky.NetworkException):
+            return ConnectionLost(f"{self.config.host}: {error}")
+        return typed_error(str(error), host=self.config.host)
+
+    def _quick(self, call: Callable[[], T]) -> T:
+        if self._closed:
+            raise ConnectionLost("this connection was closed", advice="connect anew")
+        try:
+            return run_bounded(call, timeout_s=_QUICK)
+        except TimeoutError as error:
+            raise ConnectionLost(f"{self.config.host}: {error}") from error
+        except self._errors() as error:
+            raise self._typed(error) from error
+
+    def _move(self, motion: Any) -> None:
+        if self._closed:
+            raise ConnectionLost("this connection was closed", advice="connect anew")
+        robot = self._robot
+        try:
+            run_bounded(lambda: robot.move(motion), timeout_s=_MOTION, stop=robot.stop)
+        except TimeoutError as error:
+            raise MotionError("the motion did not end in time and was stopped") from error
+        except self._errors() as error:
+            raise self._typed(error) from error
+
+    def _finger(self, call: Callable[[], bool]) -> bool:
+        if self._closed:
+            raise ConnectionLost("this connection was closed", advice="connect anew")
+        try:
+            return bool(run_bounded(call, timeout_s=4 * _QUICK, stop=self._gripper.stop))
+        except TimeoutError as error:
+            raise GraspError("the fingers did not stop in time") from error
+        except self._franky.NetworkException as error:
+            raise ConnectionLost(f"{self.config.host}: {error}") from error
+        except (self._franky.GripperException, *self._errors()) as error:
+            raise GraspError(str(error)) from error

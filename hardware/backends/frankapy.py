@@ -1,0 +1,291 @@
+"""A Panda through frankapy, ROS and a control PC: for labs whose robots already run that way.
+
+frankapy swallows errors unless told otherwise, does not say whether a grasp holds, and its
+gripper call returns before the fingers stand. Here every motion is made with
+`ignore_errors=False`, its arrival is measured, and the fingers are watched until they stand.
+It has no call that clears a reflex: franka-interface does that itself.
+
+Never run on a physical robot by the authors; tested against a stand-in for frankapy. Stopping by
+software is no safety function.
+
+Source: iamlab-cmu/frankapy, `franka_arm.py` and `franka_arm_state_client.py`.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..closing import Closing
+from ..panda_arm import DQ_MAX, GRIPPER_MAX_WIDTH
+from ..robot import (
+    BackendMissing,
+    ConnectionFailed,
+    ConnectionLost,
+    GraspError,
+    MotionError,
+    MoveResult,
+    RobotError,
+    RobotMode,
+    RobotState,
+    UnreachablePose,
+    check_joints,
+    check_pose,
+    check_range,
+)
+from ..straight_line import distance
+from .libfranka_errors import typed_error
+
+__all__ = ["FrankapyConfig", "FrankapyRobot"]
+
+T = TypeVar("T")
+_PEAK = 1.875
+"""Greatest over mean speed of a minimum-jerk motion."""
+_TURN_SPEED = 0.5  # [rad/s]
+_SHORTEST = 0.5  # [s]
+_STANDS = 2e-4  # [m] between two looks at fingers that stand
+_POLL = 0.1  # [s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrankapyConfig:
+    """What to expect of the robot; its address stands in frankapy's own configuration."""
+
+    robot_num: int = 1
+    """Number of the robot on the control PC."""
+    collision_force_N: float = 20.0
+    """Greatest force at which a motion may be asked to stop [N]."""
+    arrival_tolerance_m: float = 3e-3
+    """How far from its target the TCP may end [m]."""
+    arrival_tolerance_rad: float = 0.035
+    """How far from its target orientation the TCP may end [rad], 2 degrees."""
+    gripper_speed: float = 0.05
+    """Speed of the opening [m/s]."""
+    gripper_timeout_s: float = 5.0
+    """Longest wait for the fingers to stand [s]."""
+    min_held_m: float = 5e-4
+    """Opening after a grasp at and below which the fingers hold nothing [m]."""
+    held_tolerance_m: float = 5e-3
+    """How much wider than expected a held object may be [m]."""
+
+
+class FrankapyRobot(Closing):
+    """A `Robot` over `frankapy.FrankaArm`. Connecting moves nothing.
+
+    Args:
+        config: what to expect
+        sleep: waits [s]
+
+    Raises:
+        BackendMissing: frankapy or ROS is not installed
+        ConnectionFailed: the control PC does not answer, or the robot is not ready
+    """
+
+    def __init__(
+        self, config: FrankapyConfig | None = None, *, sleep: Callable[[float], None] = time.sleep
+    ) -> None:
+        self.config = config or FrankapyConfig()
+        self._sleep = sleep
+        self._closed = False
+        try:
+            import frankapy
+            from autolab_core import RigidTransform
+            from frankapy import exceptions
+        except ImportError as error:
+            raise BackendMissing(
+                f"frankapy cannot be loaded: {error}",
+                advice="source the ROS workspace of frankapy, or use --robot panda, without ROS",
+            ) from error
+        self._transform = RigidTransform
+        self._exceptions = exceptions
+        # FrankaArm makes Ctrl-C leave the process at once; here it has to stop the arm first.
+        handler = signal.getsignal(signal.SIGINT)
+        try:
+            self._arm: Any = frankapy.FrankaArm(robot_num=self.config.robot_num)
+        except (
+            exceptions.FrankaArmCommException,
+            exceptions.FrankaArmFrankaInterfaceNotReadyException,
+            exceptions.FrankaArmException,
+        ) as error:
+            raise ConnectionFailed(
+                f"frankapy: {error}", advice="start the control PC and franka-interface, then retry"
+            ) from error
+        finally:
+            signal.signal(signal.SIGINT, handler)
+
+    def state(self) -> RobotState:
+        """Read the robot now; see `Robot.state`.
+
+        frankapy does not tell the robot's mode: it is "moving" while a skill runs, else "idle".
+        """
+        arm = self._arm
+        pose = self._call(arm.get_pose)
+        base_T_tcp = np.eye(4)
+        base_T_tcp[:3, :3], base_T_tcp[:3, 3] = pose.rotation, pose.translation
+        done = self._call(lambda: arm.is_skill_done(ignore_errors=False))
+        return RobotState(
+            q=np.array(self._call(arm.get_joints), dtype=float),
+            base_T_tcp=base_T_tcp,
+            force_N=np.array(self._call(arm.get_ee_force_torque), dtype=float),
+            gripper_width_m=float(self._call(arm.get_gripper_width)),
+            mode=RobotMode.IDLE if done else RobotMode.MOVING,
+        )
+
+    def move_joints(self, q: np.ndarray, *, speed: float) -> None:
+        """Move through joint way-points; see `Robot.move_joints`. The arm rests at each."""
+        points = check_joints(q)
+        check_range("speed", speed, low=0.0, high=1.0, unit="of the greatest speed")
+        at = self.state().q
+        for point in points:
+            self._joint_skill(point, at, speed)
+            at = point
+        off = float(np.abs(self.state().q - points[-1]).max())
+        if off > self.config.arrival_tolerance_rad:
+            raise MotionError(f"a joint ended {off:.3f} rad from its target")
+
+    def _joint_skill(self, point: np.ndarray, start: np.ndarray, speed: float) -> None:
+        seconds = _PEAK * float((np.abs(point - start) / (speed * DQ_MAX)).max())
+        self._skill(
+            lambda: self._arm.goto_joints(
+                point.tolist(),
+                duration=max(seconds, _SHORTEST),
+                use_impedance=False,
+                block=True,
+                ignore_errors=False,
+            )
+        )
+
+    def move_linear(
+        self, base_T_tcp: np.ndarray, *, speed: float, stop_force_N: float | None = None
+    ) -> MoveResult:
+        """Move the TCP in a straight line; see `Robot.move_linear`."""
+        target = check_pose(base_T_tcp)
+        check_range("speed", speed, low=0.0, high=1.7, unit="m/s")
+        limits = None
+        if stop_force_N is not None:
+            high = self.config.collision_force_N
+            check_range("stop_force_N", stop_force_N, low=0.0, high=high, unit="N")
+            # torques are not what a descent should feel
+            limits = [stop_force_N] * 3 + [high] * 3
+        far, turned = distance(self.state().base_T_tcp, target)
+        seconds = _PEAK * max(far / speed, turned / _TURN_SPEED)
+        pose = self._transform(
+            rotation=target[:3, :3],
+            translation=target[:3, 3],
+            from_frame="franka_tool",
+            to_frame="world",
+        )
+        self._skill(
+            lambda: self._arm.goto_pose(
+                pose,
+                duration=max(seconds, _SHORTEST),
+                use_impedance=False,
+                force_thresholds=limits,
+                block=True,
+                ignore_errors=False,
+            )
+        )
+        state = self.state()
+        off, turned = distance(state.base_T_tcp, target)
+        config = self.config
+        if off <= config.arrival_tolerance_m and turned <= config.arrival_tolerance_rad:
+            return MoveResult(state.base_T_tcp, contact=False)
+        # frankapy does not say that a threshold ended the skill: the force, still there, does.
+        if stop_force_N is not None and np.abs(state.force_N[:3]).max() > 0.5 * stop_force_N:
+            return MoveResult(state.base_T_tcp, contact=True)
+        raise MotionError(
+            f"the TCP ended {1e3 * off:.1f} mm and {turned:.3f} rad from its target "
+            f"(allowed: {1e3 * config.arrival_tolerance_m:.1f} mm, "
+            f"{config.arrival_tolerance_rad:.3f} rad)"
+        )
+
+    def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:
+        """Move the fingers; see `Robot.open_gripper`."""
+        check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
+        self._call(
+            lambda: self._arm.goto_gripper(
+                width_m, grasp=False, speed=self.config.gripper_speed, block=True
+            )
+        )
+        reached = self._standing_width()
+        if abs(reached - width_m) > self.config.held_tolerance_m:
+            raise GraspError(f"the fingers stand at {reached:.4f} m, not at {width_m} m")
+
+    def grasp(self, *, width_m: float, force_N: float) -> bool:
+        """Close the fingers; see `Robot.grasp`."""
+        check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
+        check_range("force_N", force_N, low=0.0, high=70.0, unit="N")
+        self._call(
+            lambda: self._arm.goto_gripper(
+                width_m,
+                grasp=True,
+                speed=self.config.gripper_speed,
+                force=force_N,
+                epsilon_inner=GRIPPER_MAX_WIDTH,
+                epsilon_outer=GRIPPER_MAX_WIDTH,
+                block=True,
+            )
+        )
+        reached = self._standing_width()
+        return self.config.min_held_m < reached <= width_m + self.config.held_tolerance_m
+
+    def stop(self) -> None:
+        """End the motion in progress; see `Robot.stop`."""
+        self._call(self._arm.stop_skill)
+
+    def recover(self) -> None:
+        """End what runs; franka-interface recovers from a reflex by itself; see `Robot.recover`."""
+        if self.state().mode is not RobotMode.IDLE:
+            self.stop()
+        if self.state().mode is not RobotMode.IDLE:
+            raise MotionError(
+                "a skill still runs after it was stopped", advice="restart franka-interface"
+            )
+
+    def close(self) -> None:
+        """Accept nothing more; frankapy has nothing to close."""
+        self._closed = True
+
+    def _standing_width(self) -> float:
+        """The opening once the fingers stand [m]: frankapy's own wait ends too early."""
+        before = float(self._call(self._arm.get_gripper_width))
+        for _ in range(max(int(self.config.gripper_timeout_s / _POLL), 1)):
+            self._sleep(_POLL)
+            now = float(self._call(self._arm.get_gripper_width))
+            if abs(now - before) < _STANDS:
+                return now
+            before = now
+        raise GraspError("the fingers did not stand in time")
+
+    def _skill(self, motion: Callable[[], Any]) -> None:
+        try:
+            self._call(motion)
+        except KeyboardInterrupt:
+            self._arm.stop_skill()
+            raise
+
+    def _call(self, call: Callable[[], T]) -> T:
+        if self._closed:
+            raise ConnectionLost("this connection was closed", advice="connect anew")
+        known = self._exceptions
+        try:
+            return call()
+        except known.FrankaArmCommException as error:
+            raise ConnectionLost(f"frankapy: {error}") from error
+        except known.FrankaArmFrankaInterfaceNotReadyException as error:
+            raise ConnectionLost(
+                f"franka-interface is not ready: {error}", advice="restart it on the control PC"
+            ) from error
+        except known.FrankaArmException as error:
+            raise self._typed(str(error)) from error
+        except ValueError as error:  # its joint limits and virtual walls
+            raise UnreachablePose(f"frankapy refuses the target: {error}") from error
+
+    @staticmethod
+    def _typed(message: str) -> RobotError:
+        return typed_error(message, host="frankapy")

@@ -1,0 +1,207 @@
+"""Who chooses actions: a learned policy, chance, or the twin's true state.
+
+Actions are in the base frame. What was missed, refused or skipped is not proposed again while the
+picture stays the same. `hardware.planner` and `hardware.human` hold the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from warp_deform.errors import InputError
+from warp_deform.tasks.cable_mask_goal import CableMaskGoal
+from warp_deform.tasks.metrics import mask_iou
+from warp_deform.tasks.strand_grasp import find_grasp, map_direction
+from warp_deform.tasks.task import Layout, Snapshot
+
+from .episode import Observation
+from .pick_place import PickPlaceAction
+from .top_down_view import TopDownView
+from .twin import TwinLook
+
+__all__ = ["PolicyChooser", "RandomChooser", "ScriptedChooser", "Tried", "tangent_at",
+           "to_action"]  # fmt: skip
+
+_SAME = 0.97
+"""Overlap of two masks above which they show the same cable, noise aside."""
+_NEAR = 0.008
+"""Picks this close to one that failed are the same one [m]: the paper's pixels are 1.9 mm."""
+_TWO_PICTURES = 2
+_MARGIN = 0.02  # [m] that random places keep from the workspace's rim
+
+
+def to_action(action: np.ndarray) -> PickPlaceAction:
+    """Return an environment's action (7,), whose lift the primitive's configuration decides."""
+    pick_x, pick_y, pick_yaw, place_x, place_y, place_yaw = (float(v) for v in action[:6])
+    return PickPlaceAction((pick_x, pick_y), pick_yaw, (place_x, place_y), place_yaw)
+
+
+def tangent_at(mask: np.ndarray, view: TopDownView, xy: tuple[float, float]) -> float:
+    """Return the cable's tangent [rad] in a mask near a point [m]; 0 where there is no cable."""
+    row, column = np.rint(view.base_to_pixel(np.array(xy)))
+    if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]):
+        return 0.0
+    found = find_grasp(mask, (int(row), int(column)))
+    return 0.0 if found is None else map_direction(found.tangent, np.eye(2))
+
+
+class Tried:
+    """Where was picked since the picture last changed."""
+
+    def __init__(self) -> None:
+        self._mask: np.ndarray | None = None
+        self._picks: list[tuple[float, float]] = []
+
+    def picks(self, seen: Observation) -> list[tuple[float, float]]:
+        """Picks [m] that failed on this picture, or were refused or skipped."""
+        if self._mask is None or mask_iou(seen.mask, self._mask) < _SAME:
+            self._picks = []
+        self._mask = seen.mask
+        return [*self._picks, *(action.pick_xy for action in seen.refused)]
+
+    def chose(self, action: PickPlaceAction) -> None:
+        """Remember an action; it counts as failed where the next picture is the same."""
+        self._picks.append(action.pick_xy)
+
+    def failed(self, seen: Observation, action: PickPlaceAction) -> bool:
+        """Whether the action's pick is near one of `picks`."""
+        return any(math.dist(action.pick_xy, xy) < _NEAR for xy in self.picks(seen))
+
+
+class RandomChooser:
+    """Any point of the cable, to anywhere in the workspace; the baseline.
+
+    Args:
+        rng: draws
+        view: the workspace
+    """
+
+    name = "random"
+
+    def __init__(self, rng: np.random.Generator, *, view: TopDownView | None = None) -> None:
+        self._rng = rng
+        self._view = view or TopDownView()
+
+    def reset(self) -> None:
+        """Nothing is remembered."""
+
+    def choose(self, seen: Observation) -> PickPlaceAction | None:
+        """See `Chooser.choose`."""
+        pixels = np.argwhere(seen.mask)
+        if not len(pixels):
+            return None
+        x, y = self._view.pixel_to_base(pixels[self._rng.integers(len(pixels))])
+        pick = float(x), float(y)
+        ranges = (self._view.x, self._view.y)
+        place = [float(self._rng.uniform(a + _MARGIN, b - _MARGIN)) for a, b in ranges]
+        yaw = tangent_at(seen.mask, self._view, pick)
+        return PickPlaceAction(pick, yaw, (place[0], place[1]), yaw)
+
+
+class ScriptedChooser:
+    """The scripted demonstrator of the simulated task on the twin's true state.
+
+    It takes the bead farthest from its target, across the chain, and brings it there.
+
+    Args:
+        look: tells the true state
+        targets: where the beads are to lie, along the chain [m], (n, 2)
+    """
+
+    name = "scripted"
+
+    def __init__(self, look: Callable[[], TwinLook], targets: np.ndarray) -> None:
+        self._look, self._task = look, CableMaskGoal()
+        self._tried = Tried()
+        self._layout = Layout(np.zeros((0, 3)), np.zeros((0, 7)), targets)
+
+    def reset(self) -> None:
+        """Forget what was missed."""
+        self._tried = Tried()
+
+    def choose(self, seen: Observation) -> PickPlaceAction | None:
+        """See `Chooser.choose`."""
+        beads = self._look().beads
+        snapshot = still_chain(beads - [0.0, 0.0, float(beads[:, 2].min())])
+        rng = np.random.default_rng(0)  # asked for by the protocol; this demonstrator draws nothing
+        for move in self._task.candidates(self._layout, snapshot, rng, len(beads)):
+            action = to_action(move)
+            if not self._tried.failed(seen, action):
+                self._tried.chose(action)
+                return action
+        return None
+
+
+def still_chain(beads: np.ndarray) -> Snapshot:
+    """Return beads (n, 3) [m] at rest as a task's snapshot, without pictures."""
+
+    def render() -> None:
+        raise InputError("a chain seen by a camera has no simulated picture")
+
+    none = np.zeros((0, 7)), np.zeros((0, 6))
+    return Snapshot(beads, np.zeros_like(beads), *none, (), render)  # type: ignore[arg-type]
+
+
+class PolicyChooser:
+    """A policy that `warp-deform train` made.
+
+    It sees the mask as three channels of 0 or 255 and a height of zeros, as in `cable-mask-goal`,
+    and picks elsewhere after an action that changed nothing.
+
+    Args:
+        path: a run's folder or a snapshot
+        view: the workspace; must be the policy's own
+
+    Raises:
+        InputError: no such policy, one of another task, or one that needs the simulator's state
+    """
+
+    def __init__(self, path: Path, *, view: TopDownView | None = None) -> None:
+        from learning.policy import ImagePolicy, load_policy
+
+        self._view = view or TopDownView()
+        policy = load_policy(path)
+        task = policy.description.task
+        if not isinstance(policy, ImagePolicy):
+            raise InputError(f"{path} sees the simulator's state; give a policy that sees pictures")
+        grid = CableMaskGoal.grid
+        corners = np.array([[0, 0], [self._view.shape[0] - 1, self._view.shape[1] - 1]])
+        same = np.allclose(grid.to_world(corners), self._view.pixel_to_base(corners), atol=1e-9)
+        if task != CableMaskGoal.name or not same:
+            raise InputError(
+                f"{path} was trained on {task} and sees another table; give a policy of "
+                f"{CableMaskGoal.name} and its workspace"
+            )
+        self._policy = policy
+        self._tried = Tried()
+        self.name = policy.description.agent
+
+    def reset(self) -> None:
+        """Forget what was missed."""
+        self._tried = Tried()
+
+    def choose(self, seen: Observation) -> PickPlaceAction | None:
+        """See `Chooser.choose`.
+
+        Raises:
+            InputError: the policy needs a goal and there is none
+        """
+        if not seen.mask.any():
+            return None
+        if seen.goal is None and self._policy.agent.pictures == _TWO_PICTURES:
+            raise InputError(f"{self.name} needs a goal; give --goal")
+        avoid = [np.array(xy) for xy in self._tried.picks(seen)]
+        goal = None if seen.goal is None else _picture(seen.goal)
+        action = to_action(self._policy.act(_picture(seen.mask), goal, avoid=avoid))
+        self._tried.chose(action)
+        return action
+
+
+def _picture(mask: np.ndarray) -> dict[str, np.ndarray]:
+    levels = np.where(mask, 255, 0).astype(np.uint8)
+    color = np.repeat(levels[..., None], 3, axis=2)
+    return {"color": color, "height": np.zeros(mask.shape, np.float32)}

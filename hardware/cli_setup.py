@@ -1,0 +1,119 @@
+"""The verbs of `warp-deform franka` that look at the machine and measure the setup."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from warp_deform.cli import CommandOptions, Outcome
+
+from .rig_config import CameraName, RigConfig, RobotName
+
+__all__ = ["CalibrateOptions", "DoctorOptions", "calibrate", "doctor"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorOptions(CommandOptions):
+    """What this machine has for a robot, what is missing, and how to get it; moves nothing."""
+
+    robot: RobotName = "sim"
+    """What must work for the exit code to be 0; sim needs nothing but this package."""
+    host: str | None = None
+    """Address of a robot to connect to and read."""
+    setup: Annotated[Path, arg(metavar="DIR")] = field(default_factory=lambda: Path("franka-setup"))
+    """Folder of the calibration."""
+
+
+def doctor(options: DoctorOptions) -> Outcome:
+    """Examine the machine."""
+    from .doctor import examine
+
+    checks = examine(options.robot, host=options.host, setup=options.setup)
+    missing = [check for check in checks if check.needed and not check.ok]
+    width = max(len(check.name) for check in checks)
+    lines = []
+    for check in checks:
+        mark = "ok" if check.ok else ("MISSING" if check.needed else "-")
+        lines.append(f"{mark:<8}{check.name:<{width}}  {check.found}")
+        if not check.ok:
+            lines.append(f"{'':<8}{'':<{width}}  {check.advice}")
+    data: dict[str, Any] = {
+        "ready": not missing,
+        "robot": options.robot,
+        "checks": [check._asdict() for check in checks],
+    }
+    first = missing[0] if missing else None
+    failure = None if first is None else f"{first.name}: {first.found}; {first.advice}"
+    return Outcome(data=data, text="\n".join(lines), failure=failure)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOptions(CommandOptions):
+    """Measure the setup: board, lens, table, camera, in this order; see docs/hardware.md.
+
+    Everything lands in the setup's folder.
+    """
+
+    what: Annotated[
+        Positional[Literal["board", "lens", "table", "camera", "empty"]], arg(metavar="WHAT")
+    ]
+    """board writes the ChArUco board to print; lens measures a video device's intrinsics with it;
+    table touches the foam with the closed fingers; camera finds the board, flat on the table, and
+    asks for some of its corners; empty takes a picture of the empty foam."""
+    robot: RobotName = "dry_run"
+    """The robot that touches."""
+    host: str | None = None
+    """Its address."""
+    camera: CameraName = "uvc"
+    """The camera."""
+    device: str | None = None
+    """Number of a video device, or serial number of a RealSense."""
+    setup: Annotated[Path, arg(metavar="DIR")] = field(default_factory=lambda: Path("franka-setup"))
+    """Folder of the setup."""
+    execute: bool = False
+    """Let a real arm move."""
+    table_z: Annotated[float | None, arg(metavar="M")] = None
+    """For `table`: a height in the base frame that is certainly 1 to 3 cm below the foam's top."""
+    views: Annotated[int, arg(metavar="N")] = 15
+    """For `lens`: views of the board."""
+    size: tuple[int, int] = (1280, 720)
+    """For `lens`: width and height of the video device's pictures."""
+    square_mm: float = 36.0
+    """Side of the printed board's squares: measure the print."""
+    corners: tuple[int, ...] = (0, 5, 18, 23)
+    """For `camera`: the board's corners to touch, by number."""
+
+    def rig(self) -> RigConfig:
+        """What to open."""
+        return RigConfig(
+            robot=self.robot,
+            camera=self.camera,
+            host=self.host,
+            setup=self.setup,
+            device=self.device,
+            execute=self.execute,
+        )
+
+
+def calibrate(options: CalibrateOptions) -> Outcome:
+    """Measure a part of the setup."""
+    from . import setting_up
+    from .charuco import BoardSpec
+
+    square = options.square_mm / 1e3
+    board = BoardSpec(square_m=square, marker_m=square * 26.0 / 36.0)
+    rig = options.rig()
+    if options.what == "board":
+        data = setting_up.print_board(options.setup, board)
+    elif options.what == "lens":
+        data = setting_up.measure_lens(rig, board, views=options.views, size=options.size)
+    elif options.what == "table":
+        data = setting_up.measure_table(rig, provisional_z=options.table_z)
+    elif options.what == "camera":
+        data = setting_up.measure_camera(rig, board, corner_ids=options.corners)
+    else:
+        data = setting_up.photograph_empty(rig)
+    return Outcome(data=data, text="\n".join(f"{key}  {value}" for key, value in data.items()))

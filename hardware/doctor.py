@@ -1,0 +1,141 @@
+"""What a machine has for a robot, what is missing, and how to get it."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import importlib.util
+import os
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+from warp_deform.errors import InputError
+
+from .rig_config import RobotName
+
+__all__ = ["Check", "examine"]
+
+_PACKAGES = (
+    ("panda_py", "panda-python", "panda", "Panda, server version 5",
+     "pip install 'warp-deform[panda]'"),
+    ("franky", "franky-control", "fr3", "FR3 of system 5.9 or later, server version 10",
+     "pip install 'warp-deform[fr3]'"),
+    ("frankapy", "frankapy", "frankapy", "Panda through ROS and a control PC",
+     "install ROS, franka-interface and frankapy from source; panda-python needs none of them"),
+    ("pyrealsense2", "pyrealsense2", None, "RealSense cameras",
+     "pip install 'warp-deform[realsense]', and libusb-1.0 of the system"),
+    ("pyk4a", "pyk4a-bundle", None, "depth of an Azure Kinect; its colour works as --camera uvc",
+     "needs numpy 1, so an environment of its own: pip install pyk4a-bundle 'numpy<2'"),
+)  # fmt: skip
+_OLD_DAYS = 30
+
+
+class Check(NamedTuple):
+    """One thing that was looked at; `advice` says what to do where it is not `ok`."""
+
+    name: str
+    ok: bool
+    needed: bool
+    found: str
+    advice: str
+
+
+def examine(robot: RobotName, *, host: str | None, setup: Path) -> list[Check]:
+    """Look at packages, kernel, compiler, cameras and setup, and at a robot where `host` names one.
+
+    Args:
+        robot: what is to work; what it needs is marked so
+    """
+    checks = [_simulation()]
+    for module, distribution, backend, purpose, advice in _PACKAGES:
+        checks.append(_package(module, distribution, purpose, advice, needed=backend == robot))
+    checks += [_compiler(), _kernel(real=robot in ("panda", "fr3")), _cameras()]
+    checks.append(_calibration(setup, needed=robot in ("panda", "fr3", "frankapy")))
+    if host is not None:
+        checks.append(_robot(robot, host))
+    elif robot in ("panda", "fr3"):
+        advice = "name it with --host; it is read and not moved"
+        checks.append(Check("robot", False, False, "not asked", advice))
+    return checks
+
+
+def _simulation() -> Check:
+    import warp_deform
+
+    found = f"warp-deform {warp_deform.__version__}: `warp-deform franka run --robot sim`"
+    return Check("simulation", True, True, found, "")
+
+
+def _package(module: str, distribution: str, purpose: str, advice: str, *, needed: bool) -> Check:
+    if importlib.util.find_spec(module) is None:
+        return Check(distribution, False, needed, f"not installed ({purpose})", advice)
+    try:
+        version = importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        version = "of unknown version"
+    return Check(distribution, True, needed, f"{version} ({purpose})", "")
+
+
+def _compiler() -> Check:
+    path = shutil.which("cc")
+    advice = "install one (apt install gcc); only `franka emulate` needs it"
+    return Check("C compiler", path is not None, False, path or "none", advice)
+
+
+def _kernel(*, real: bool) -> Check:
+    """A real-time kernel is not needed to connect, but without it the robot stops now and then."""
+    realtime = Path("/sys/kernel/realtime")
+    ok = realtime.is_file() and realtime.read_text().strip() == "1"
+    found = f"{os.uname().release}, {'PREEMPT_RT' if ok else 'not real-time'}"
+    advice = (
+        "expect communication_constraints_violation; install a PREEMPT_RT kernel and connect the "
+        "robot to a network card of its own"
+    )
+    return Check("kernel", ok or not real, False, found, advice)
+
+
+def _cameras() -> Check:
+    devices = sorted(path.name for path in Path("/dev").glob("video*"))
+    advice = "plug one in, and join the group `video`; --camera sim needs none"
+    return Check("video devices", bool(devices), False, ", ".join(devices) or "none", advice)
+
+
+def _calibration(setup: Path, *, needed: bool) -> Check:
+    from .calibration import Calibration
+
+    path = setup / "calibration.json"
+    if not path.is_file():
+        advice = "calibrate board, lens, table and camera, see docs/hardware.md"
+        return Check("calibration", False, needed, f"no {path}", advice)
+    try:
+        calibration = Calibration.load(path)
+        age = datetime.datetime.now(datetime.UTC) - datetime.datetime.fromisoformat(
+            calibration.created
+        )
+    except (InputError, TypeError, ValueError) as error:
+        return Check("calibration", False, needed, str(error), "calibrate anew")
+    found = (
+        f"{calibration.robot_id}, {calibration.camera_id}: {1e3 * calibration.error_m:.1f} mm by "
+        f"{calibration.method}, {age.days} days old"
+    )
+    return Check("calibration", age.days <= _OLD_DAYS, False, found, "calibrate the camera again")
+
+
+def _robot(robot: RobotName, host: str) -> Check:
+    from .rig import open_robot
+    from .rig_config import RigConfig
+    from .robot import RobotError
+
+    backend: RobotName = robot if robot in ("panda", "fr3", "frankapy") else "panda"
+    config = RigConfig(robot=backend, host=host, execute=True)
+    try:
+        with open_robot(config) as connected:
+            state = connected.state()
+    except RobotError as error:
+        what, _, advice = str(error).rpartition("; ")
+        return Check("robot", False, True, what, advice)
+    x, y, z = state.base_T_tcp[:3, 3]
+    found = f"{host}: {state.mode}, TCP at ({x:.3f}, {y:.3f}, {z:.3f}) m"
+    advice = "look at the arm and its lights; release the user stop, recover it in Desk"
+    return Check("robot", str(state.mode) == "idle", True, found, advice)

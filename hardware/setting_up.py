@@ -1,0 +1,210 @@
+"""Measuring a setup step by step, with a person at the robot; each step writes one file.
+
+    board -> lens.json -> table.json -> calibration.json -> empty_view.png
+
+The lens is measured for video devices alone: RealSense and Azure Kinect tell their intrinsics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from warp_deform.errors import InputError
+
+from .calibration import Calibration
+from .camera import Camera, CameraIntrinsics
+from .charuco import BoardSpec, Corners, calibrate_intrinsics, find_corners
+from .goal_file import write_picture
+from .homography import board_on_table, fit_homography
+from .human import Terminal
+from .json_file import read_json, require, write_json
+from .panda_arm import HOME_Q
+from .rig import open_camera, open_robot, read_intrinsics
+from .rig_config import REAL_ROBOTS, RigConfig
+from .safety import SafeRobot
+from .safety_limits import SafetyLimits
+from .table_plane import TablePlane, fit_table_plane
+from .top_down_view import TopDownView
+from .touch_off import touch_off
+
+__all__ = ["measure_camera", "measure_lens", "measure_table", "photograph_empty", "print_board"]
+
+_PIXELS_PER_METRE = 10_000.0  # 254 dots an inch
+_INSET = 0.05  # [m] from the workspace's rim, where the foam lies flat
+
+
+def print_board(setup: Path, board: BoardSpec) -> dict[str, Any]:
+    """Write the board's picture; print it at 254 dots an inch and measure the squares."""
+    picture = board.picture(_PIXELS_PER_METRE)
+    path = setup / "board.png"
+    write_picture(path, np.repeat(picture[..., None], 3, axis=2))
+    size = f"{1e3 * board.square_m:g} mm squares, {board.columns} x {board.rows}"
+    return {"board": path, "size": size, "dots_an_inch": 254}
+
+
+def measure_lens(
+    config: RigConfig,
+    board: BoardSpec,
+    *,
+    views: int = 15,
+    size: tuple[int, int] = (1280, 720),
+    camera: Camera | None = None,
+    operator: Terminal | None = None,
+) -> dict[str, Any]:
+    """Measure a video device's intrinsics from views of the board, one an Enter.
+
+    Raises:
+        InputError: too few good views, or stopped
+        CameraError: the device cannot be opened
+    """
+    operator = operator or Terminal()
+    rough = CameraIntrinsics(
+        size,
+        np.array([[size[0], 0.0, size[0] / 2], [0.0, size[0], size[1] / 2], [0.0, 0.0, 1.0]]),
+        np.zeros(0),
+    )
+    seen: list[Corners] = []
+    with camera or open_camera(config, rough) as device:
+        while len(seen) < views:
+            text = f"view {len(seen) + 1} of {views}: hold the board still, tilted, elsewhere"
+            if not operator.wait(text):
+                raise InputError("stopped before all views were taken; nothing was written")
+            try:
+                seen.append(find_corners(device.read().rgb, board))
+            except InputError as error:
+                operator.wait(str(error))
+    intrinsics, rms = calibrate_intrinsics(seen, board, size)
+    path = config.setup / "lens.json"
+    write_json(path, {"schema": 1, **intrinsics.to_record(), "error_px": rms})
+    return {"lens": path, "error_px": rms}
+
+
+def measure_table(
+    config: RigConfig, *, provisional_z: float | None, touch: Callable[..., np.ndarray] = touch_off
+) -> dict[str, Any]:
+    """Touch the foam at the workspace's corners and fit a plane; the arm moves.
+
+    Raises:
+        InputError: nothing that moves, no provisional height, or no plane
+        RobotError: see `touch_off`
+    """
+    if provisional_z is None:
+        raise InputError(
+            "give --table-z, a height [m] in the base frame that is 1 to 3 cm below the foam's top"
+        )
+    if config.robot not in REAL_ROBOTS or not config.execute:
+        raise InputError("touching the table moves an arm: give --robot panda and --execute")
+    limits = SafetyLimits(table=TablePlane(provisional_z), max_joint_speed=config.joint_speed)
+    (x0, x1), (y0, y1) = limits.x, limits.y
+    corners = [(x, y) for x, y in ((x0, y0), (x0, y1), (x1, y1), (x1, y0), ((x0 + x1) / 2, 0.0))]
+    middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
+    inside = [tuple(np.add(c, _INSET * np.sign(middle - c)).tolist()) for c in corners]
+    with SafeRobot(open_robot(config), limits) as robot:
+        robot.home()
+        points = touch(robot, inside)
+        robot.home()
+        robot.open_gripper()
+    plane, residuals = fit_table_plane(points)
+    path = config.setup / "table.json"
+    record = {
+        "schema": 1,
+        "height_m": plane.height_m,
+        "slope_x": plane.slope_x,
+        "slope_y": plane.slope_y,
+        "points": points.tolist(),
+        "residuals_m": residuals.tolist(),
+    }
+    write_json(path, record)
+    return {"table": path, "height_m": float(plane.z(middle)),
+            "worst_residual_m": float(np.abs(residuals).max())}  # fmt: skip
+
+
+def measure_camera(
+    config: RigConfig,
+    board: BoardSpec,
+    *,
+    corner_ids: tuple[int, ...],
+    camera: Camera | None = None,
+    robot: SafeRobot | None = None,
+    operator: Terminal | None = None,
+) -> dict[str, Any]:
+    """Find the board on the table and the arm's touches of its corners; fit and save.
+
+    The arm goes home for the picture. Then a person guides the closed fingertips onto each corner.
+
+    Raises:
+        InputError: the board is not seen, or the fit is worse than 3 mm
+        RobotError, CameraError: robot or camera fail
+    """
+    operator = operator or Terminal()
+    table = _table(config.setup / "table.json")
+    if robot is None and (config.robot not in REAL_ROBOTS or not config.execute):
+        raise InputError("calibrating the camera moves an arm: give --robot panda and --execute")
+    limits = SafetyLimits(table=table, max_joint_speed=config.joint_speed)
+    lens = read_intrinsics(config.setup / "lens.json") if config.camera == "uvc" else None
+    with robot or SafeRobot(open_robot(config), limits) as arm:
+        if not operator.wait("lay the board flat into the workspace; the arm then goes home"):
+            raise InputError("stopped; nothing was written")
+        arm.home()
+        with camera or open_camera(config, lens) as device:
+            frame = device.read()
+        corners = find_corners(frame.rgb, board)
+        hidden = sorted(set(corner_ids) - set(corners.ids.tolist()))
+        if hidden:
+            raise InputError(f"corners {hidden} are not seen; choose others with --corners")
+        touched = []
+        for corner in corner_ids:
+            text = f"guide the closed fingertips onto corner {corner} of the board"
+            if not operator.wait(text):
+                raise InputError("stopped; nothing was written")
+            touched.append(arm.state().base_T_tcp[:2, 3])
+    on_table = board_on_table(corners, board, np.array(corner_ids), np.array(touched))
+    fit = fit_homography(corners.pixels, on_table, frame.intrinsics)
+    calibration = Calibration(
+        robot_id=f"{config.robot} {config.host or ''}".strip(),
+        camera_id=f"{config.camera} {config.device or ''}".strip(),
+        home_q=np.array(HOME_Q),
+        intrinsics=frame.intrinsics,
+        base_H_pixel=fit.base_H_pixel,
+        table=table,
+        method="charuco",
+        error_m=fit.error_m,
+        details={"board": board.to_record(), "report": fit.report()},
+    )
+    path = config.setup / "calibration.json"
+    calibration.save(path)
+    write_picture(config.setup / "board_seen.png", _marked(frame.rgb, corners.pixels))
+    return {"calibration": path, "report": fit.report(), "error_m": fit.error_m}
+
+
+def photograph_empty(config: RigConfig) -> dict[str, Any]:
+    """Take the picture of the empty foam, for the segmentation; the arm must stand at home.
+
+    Raises:
+        InputError: there is no calibration yet
+        CameraError: no picture
+    """
+    calibration = Calibration.load(config.setup / "calibration.json")
+    with open_camera(config, calibration.intrinsics) as device:
+        view = TopDownView().rectify(device.read().rgb, calibration)
+    path = config.setup / "empty_view.png"
+    write_picture(path, view)
+    return {"empty": path}
+
+
+def _table(path: Path) -> TablePlane:
+    record = read_json(path, what="table", schema=1)
+    keys = ("height_m", "slope_x", "slope_y")
+    return TablePlane(*(float(require(record, k, float, what=f"table {path}")) for k in keys))
+
+
+def _marked(rgb: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    picture = rgb.copy()
+    for column, row in np.rint(pixels).astype(int):
+        cv2.circle(picture, (int(column), int(row)), 5, (255, 0, 0), 1)
+    return picture

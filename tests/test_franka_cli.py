@@ -1,0 +1,193 @@
+"""`warp-deform franka`: what its verbs print, write and refuse."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from board_photographs import BOARD
+from franka_episodes import ACTION, CALIBRATION, GOAL, chain
+from test_episode import Arm, episode
+
+import hardware.robot as robot_module
+from hardware import RobotError
+from hardware.camera import CameraError
+from hardware.goal_file import read_goal, sampled_goal, write_goal
+from hardware.look_server import LookServer, remote_look
+from hardware.top_down_view import TopDownView
+from hardware.twin import TwinLook
+from warp_deform.cli import main
+from warp_deform.episodes import EpisodeReader
+from warp_deform.errors import InputError
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def run(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, object], str]:
+    code = main(["franka", *arguments, "--json"])
+    said = capfd.readouterr()
+    lines = said.out.splitlines()
+    return code, json.loads(lines[-1]) if lines else {}, said.err
+
+
+def test_a_dry_run_needs_nothing_and_moves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, data, said = run(capfd, "run", "--agent", "random", "--seed", "3")
+    assert code == 0 and data["executed"] is False and data["actions"] <= 1
+    assert data["folder"] == "franka-episodes/0000" and "dry run: move_linear" in said
+    code, data, _ = run(capfd, "score", "franka-episodes/0000")
+    assert code == 0 and data["n_episodes"] == 1
+
+
+def test_a_simulated_episode_is_run_scored_replayed_and_packed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "demos"
+    code, data, _ = run(
+        capfd, "collect", "-n", "1", "--robot", "sim", "--agent", "scripted", "--seed", "2",
+        "--max-actions", "2", "--out", str(out),
+    )  # fmt: skip
+    assert code == 0 and data["episodes"] == 1 and data["actions"] == 2
+    episode = next(iter(EpisodeReader(out)))
+    assert episode.info.task == "cable-mask-goal" and len(episode.steps) == 3
+    folder = str(out / "live" / "0000")
+    code, scored, _ = run(capfd, "score", folder)
+    assert code == 0 and len(scored["episodes"][0]["iou"]) == 3
+    film = tmp_path / "plans.mp4"
+    code, replayed, _ = run(capfd, "replay", folder, "--video", str(film))
+    assert code == 0 and replayed["mismatches"] == 0 and film.stat().st_size > 1000
+    assert [row["iou"] for row in replayed["rows"]] == scored["episodes"][0]["iou"]
+
+
+def test_a_replay_finds_a_changed_mask(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "a"
+    episode(folder, Arm(), [ACTION], max_actions=1)
+    write_goal(
+        folder / "frames" / "000_mask.png", np.zeros_like(GOAL), np.zeros((2, 2, 3), np.uint8)
+    )
+    (folder / "frames" / "000_mask.png").write_bytes(
+        (folder / "frames" / "001_mask.png").read_bytes()[:-20]
+    )
+    assert run(capfd, "replay", str(folder))[0] == 2  # a damaged file
+    import cv2
+
+    grey = np.zeros(GOAL.shape, np.uint8)
+    (folder / "frames" / "000_mask.png").write_bytes(cv2.imencode(".png", grey)[1].tobytes())
+    code, data, said = run(capfd, "replay", str(folder))
+    assert code == 1 and data["mismatches"] == 1 and "differ" in said
+
+
+def test_a_goal_is_captured_and_read(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "goals" / "0.png"
+    code, data, _ = run(capfd, "capture-goal", "--robot", "sim", "--seed", "5", "--out", str(file))
+    assert code == 0 and data["pixels"] > 300 and Path(str(data["view"])).is_file()
+    goal = read_goal(file, TopDownView())
+    truth = sampled_goal(5)
+    both, either = goal.mask & truth.mask, goal.mask | truth.mask
+    assert both.sum() / either.sum() > 0.6
+    assert goal.targets is not None and truth.targets is not None
+    ways = [np.linalg.norm(goal.targets[::w] - truth.targets, axis=1).mean() for w in (1, -1)]
+    assert min(ways) < 8e-3
+    with pytest.raises(InputError, match="capture-goal"):
+        write_goal(file, np.zeros_like(truth.mask), np.zeros((320, 160, 3), np.uint8))
+        read_goal(file, TopDownView())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "--robot", "panda", "--execute", "--host", "10.0.0.1"], "not an address of this"),
+        (["run", "--robot", "sim", "--camera", "uvc"], "--camera sim"),
+        (["run", "--camera", "uvc", "--setup", "nowhere"], "calibration"),
+        (["run", "--agent", "policy"], "--policy"),
+        (["run", "--agent", "policy", "--policy", "nowhere"], "nowhere"),
+        (["run", "--robot", "ur5"], "--robot"),
+        (["run", "--joint-speed", "0.9"], "max_joint_speed"),
+        (["collect"], "--out"),
+        (["score"], "EPISODE|episode"),
+        (["score", "nowhere"], "nowhere"),
+        (["replay", "nowhere"], "nowhere"),
+        (["emulate", "--chain", "1", "--table-z", "0.1"], "exclude"),
+        (["calibrate", "table"], "--table-z"),
+        (["calibrate", "table", "--table-z", "0.0"], "--execute"),
+        (["calibrate", "empty", "--setup", "nowhere"], "calibration"),
+        (["calibrate", "nonsense"], "board"),
+        ([], "Expected one of"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+    arguments: list[str], message: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert main(["franka", *arguments]) == 2
+    said = capfd.readouterr().err.strip().splitlines()
+    assert re.search(message, said[-1]) and "Traceback" not in "".join(said)
+
+
+def test_a_robot_that_is_not_there_is_exit_code_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code = main(["franka", "run", "--robot", "panda", "--execute", "--host", "127.0.99.9"])
+    assert code == 1 and "franka emulate" in capfd.readouterr().err
+
+
+def test_doctor_explains_a_bare_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    code, data, _ = run(capfd, "doctor", "--setup", str(tmp_path))
+    assert code == 0 and data["ready"] is True
+    missing = {check["name"]: check["advice"] for check in data["checks"] if not check["ok"]}
+    assert "warp-deform[panda]" in missing["panda-python"]
+    assert "warp-deform[fr3]" in missing["franky-control"] and "calibrate" in missing["calibration"]
+    code, data, said = run(capfd, "doctor", "--robot", "panda", "--setup", str(tmp_path))
+    assert code == 1 and data["ready"] is False and "panda-python: not installed" in said
+    CALIBRATION.save(tmp_path / "calibration.json")
+    checks = run(capfd, "doctor", "--setup", str(tmp_path))[1]["checks"]
+    assert next(c for c in checks if c["name"] == "calibration")["ok"] is True
+
+
+def test_the_board_is_written_at_its_size(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    code, data, _ = run(capfd, "calibrate", "board", "--setup", str(tmp_path))
+    assert code == 0 and data["dots_an_inch"] == 254
+    from hardware.camera import read_image
+
+    height, width = read_image(tmp_path / "board.png", color=True).shape[:2]
+    assert (width, height) == (BOARD.columns * 360, BOARD.rows * 360)
+
+
+def test_a_look_crosses_processes_on_loopback_alone() -> None:
+    look = TwinLook(chain(0.45), np.eye(4), 0.03, (4, 5))
+    with LookServer(lambda: look, port=0) as server:
+        seen = remote_look("127.0.0.1", port=server.port)
+    np.testing.assert_array_equal(seen.beads, look.beads)
+    assert (seen.gripper_width, seen.held) == (0.03, (4, 5))
+    with pytest.raises(CameraError, match="franka emulate"):
+        remote_look("127.0.0.1", port=server.port)
+    with pytest.raises(InputError, match="this machine"):
+        LookServer(lambda: look, host="0.0.0.0", port=0)
+
+
+def test_the_documentation_names_every_error_and_says_what_was_not_tried() -> None:
+    text = (ROOT / "docs" / "hardware.md").read_text()
+    names = [
+        name
+        for name in vars(robot_module)
+        if isinstance(getattr(robot_module, name), type)
+        and issubclass(getattr(robot_module, name), RobotError)
+    ]
+    assert len(names) > 9 and [name for name in names if f"`{name}`" not in text] == []
+    for name in ("CameraError", "SegmentationError", "InputError", "PhysicsError"):
+        assert f"`{name}`" in text
+    assert "ever run on a physical robot" in " ".join(text.split())
+    assert text.index("## Safety first") < text.index("## What you need")
