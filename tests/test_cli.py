@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -107,6 +108,11 @@ def test_every_verb_explains_itself(name: str, capsys: pytest.CaptureFixture[str
     assert main([name, "--help"]) == 0
     said = capsys.readouterr().out
     assert said.startswith(f"usage: warp-deform {name}")
+    inner = re.search(r"{([a-z,-]+)}", said.splitlines()[0])
+    for part in inner[1].split(",") if inner else ():
+        assert main([name, part, "--help"]) == 0
+        said = capsys.readouterr().out
+        assert "--json" in said, part
     assert "--json" in said
     assert "--no-json" not in said
 
