@@ -14,6 +14,7 @@ import numpy as np
 from warp_deform.errors import InputError
 
 from .backends.dry_run import DryRunConfig, DryRunRobot, RecordedCommand
+from .backends.franka_config import NetworkedConfig
 from .calibration import Calibration
 from .camera import Camera, CameraIntrinsics, FileCamera, read_image
 from .emulator.world import World
@@ -126,12 +127,12 @@ def open_robot(
     if config.host is None:
         raise InputError(f"--robot {config.robot} needs --host, the address of its control box")
     if config.robot == "panda":
-        from .backends.panda import PandaConfig, PandaRobot
+        from .backends.panda import PandaRobot
 
-        return PandaRobot(PandaConfig(host=config.host))
-    from .backends.fr3 import FR3Config, FR3Robot
+        return PandaRobot(NetworkedConfig(host=config.host))
+    from .backends.fr3 import FR3Robot
 
-    return FR3Robot(FR3Config(host=config.host))
+    return FR3Robot(NetworkedConfig(host=config.host))
 
 
 def _tell(command: RecordedCommand) -> None:

@@ -17,9 +17,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from warp_deform.collection import Attempt, Collection, append_attempt
 from warp_deform.episode_loop import SOLVED, Run, play, worlds_for
 from warp_deform.episodes import (
@@ -34,6 +31,7 @@ from warp_deform.episodes import (
 from warp_deform.errors import InputError
 from warp_deform.goals import CONSTRUCTED
 from warp_deform.planning import SearchConfig, lookahead_for, search
+from warp_deform.progress import progress_bar
 from warp_deform.recording import observe, record
 from warp_deform.replay import Recording
 from warp_deform.robots import robot as find_robot
@@ -42,7 +40,8 @@ from warp_deform.tasks.task import Action, Task
 from warp_deform.workers import Workers, worker_count
 from warp_deform.worlds import Worlds
 
-__all__ = ["ACCEPT", "RECORDED", "REFINED", "REFINEMENT", "RefineConfig", "RefineReport", "refine"]
+__all__ = ["ACCEPT", "RECORDED", "REFINED", "REFINEMENT", "RefineConfig", "RefineReport", "refine",
+           "seeds_by_task"]  # fmt: skip
 
 ACCEPT = ("score", "solved")
 """When a new episode takes the place of the original. `score`: no lower last score, no more
@@ -124,12 +123,8 @@ def refine(config: RefineConfig) -> RefineReport:
     search = replace(config.search, polish=True)
     config = replace(config, source=source, out=out, search=search)
     reader = EpisodeReader(source)
-    groups: dict[tuple[str, str], list[int]] = {}
     infos = reader.infos()
-    for info in infos:
-        if info.demonstrator == CONSTRUCTED:
-            raise InputError(f"{source} holds goals that nobody acted for; give demonstrations")
-        groups.setdefault((info.task, info.robot), []).append(info.seed)
+    groups = seeds_by_task(source, infos)
     for task, robot in groups:
         _check_search(task, robot, config.search)
     count = worker_count(config.workers, _COLLECTED * len(reader))
@@ -144,12 +139,26 @@ def refine(config: RefineConfig) -> RefineReport:
             for kind, seeds in todo.items()
             for i in range(0, len(seeds), size)
         ]
-        with Workers(min(count, max(1, len(chunks)))) as crew, _progress() as progress:
-            bar = progress.add_task("refine", total=len(reader), completed=len(reader) - left)
+        bar = progress_bar("refine", len(reader), done=len(reader) - left)
+        with Workers(min(count, max(1, len(chunks)))) as crew, bar as advance:
             for _ in crew.run(_refine_chunk, chunks):
-                progress.advance(bar)
+                advance()
     rebuild_index(out)
     return _report(EpisodeReader(out).infos(), time.perf_counter() - began)
+
+
+def seeds_by_task(source: Path, infos: Sequence[EpisodeInfo]) -> dict[tuple[str, str], list[int]]:
+    """Seeds of a folder's demonstrations by task and robot.
+
+    Raises:
+        InputError: they are no demonstrations.
+    """
+    groups: dict[tuple[str, str], list[int]] = {}
+    for info in infos:
+        if info.demonstrator == CONSTRUCTED:
+            raise InputError(f"{source} holds goals that nobody acted for; give demonstrations")
+        groups.setdefault((info.task, info.robot), []).append(info.seed)
+    return groups
 
 
 def _check_search(task: str, robot: str, config: SearchConfig) -> None:
@@ -310,18 +319,4 @@ def _report(infos: Sequence[EpisodeInfo], seconds: float) -> RefineReport:
         ),
         seconds=seconds,
         state_hash=combine_hashes(info.state_hash for info in infos),
-    )
-
-
-def _progress() -> Progress:
-    """A bar on stderr while somebody looks at it."""
-    console = Console(stderr=True)
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
     )

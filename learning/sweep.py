@@ -16,22 +16,22 @@ import contextlib
 import difflib
 import fcntl
 import json
+import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
 import joblib
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from warp_deform.collect import CollectConfig, collect
 from warp_deform.demonstrators import demonstrator
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.progress import progress_bar
 from warp_deform.robots import robot as find_robot
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.workers import Workers, worker_count
@@ -197,9 +197,11 @@ def run_sweep(
     with _owned(config.out):
         for task in dict.fromkeys(cell.task for cell in todo):
             _collect(config, task, workers=workers, ray=ray)
-        with crew, _progress(len(cells), len(cells) - len(todo)) as tell:
+        bar = progress_bar("sweep", len(cells), done=len(cells) - len(todo))
+        with crew, bar as advance:
             for name, said, error in crew.run(_run, [(cell, config) for cell in todo]):
-                tell(f"{name}: {error or said}")
+                print(f"{name}: {error or said}", file=sys.stderr, flush=True)
+                advance()
                 if error:
                     failed.append({"run": name, "error": error})
         done = [cell.out for cell in cells if _done(cell, config)]
@@ -333,19 +335,3 @@ def _owned(out: Path) -> Iterator[None]:
         except BlockingIOError as error:
             raise InputError(f"another sweep is at work in {out}; wait for it to end") from error
         yield
-
-
-@contextlib.contextmanager
-def _progress(total: int, done: int) -> Iterator[Callable[[str], None]]:
-    """Yields what tells of a run that is over: a line on stderr, under it a bar on a terminal."""
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
-    columns = TextColumn("sweep"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    hidden = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=hidden) as bars:
-        bar = bars.add_task("sweep", total=total, completed=done)
-
-        def tell(line: str) -> None:
-            console.print(line, markup=False)
-            bars.advance(bar)
-
-        yield tell

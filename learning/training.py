@@ -12,25 +12,23 @@ ours.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from warp_deform.episodes import versions
 from warp_deform.errors import InputError
+from warp_deform.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 
 from .batches import image_batch, state_batch, task_lifts
@@ -187,7 +185,8 @@ def train(config: TrainConfig) -> TrainReport:
         stopped = _stopped(run, config)
 
         shown = config.progress and rank == 0
-        with _progress(config.task, first, plan.steps, enabled=shown) as advance:
+        bar = progress_bar(f"train {config.task}", plan.steps, done=first, shown=shown)
+        with bar as advance:
             for step in range(first + 1, plan.steps + 1):
                 if stopped:
                     break
@@ -388,16 +387,3 @@ def _stopped(run: RunFolder, config: TrainConfig) -> bool:
 def _hash(path: Path) -> str:
     """BLAKE2b-128 of a snapshot's file."""
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
-
-
-@contextlib.contextmanager
-def _progress(name: str, done: int, total: int, *, enabled: bool) -> Iterator[Callable[[], None]]:
-    """A bar on stderr while somebody looks at it; yields what moves it by a step."""
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    hidden = not (enabled and console.is_terminal)
-    with Progress(
-        *columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden
-    ) as bars:
-        bar = bars.add_task(f"train {name}", total=total, completed=done)
-        yield lambda: bars.advance(bar)

@@ -25,8 +25,8 @@ import numpy as np
 from warp_deform.episode_loop import Run, play, worlds_for
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
-from warp_deform.goals import CONSTRUCTED
 from warp_deform.planning.way_points import Bent, WayPointConfig, WayPoints
+from warp_deform.progress import progress_bar
 from warp_deform.replay import Recording
 from warp_deform.rollout import GripPath
 from warp_deform.tasks.registry import task as find_task
@@ -34,6 +34,8 @@ from warp_deform.tasks.task import Action, Task
 from warp_deform.workers import Workers, worker_count
 from warp_deform.world_state import WorldState
 from warp_deform.worlds import Worlds
+
+from .refinement import seeds_by_task
 
 __all__ = ["WAY_POINTS", "BendConfig", "BendReport", "bend", "read_path"]
 
@@ -94,13 +96,10 @@ def bend(config: BendConfig) -> BendReport:
         raise InputError(f"{config.out} holds the demonstrations; give --out another folder")
     config = replace(config, source=source, out=out)
     infos = EpisodeReader(source).infos()
-    groups: dict[tuple[str, str], list[int]] = {}
-    for info in infos:
-        if info.demonstrator == CONSTRUCTED:
-            raise InputError(f"{source} holds goals that nobody acted for; give demonstrations")
-        if type(find_task(info.task)).loss is Task.loss:
-            raise InputError(f"{info.task} has no loss to differentiate, so no paths to bend by")
-        groups.setdefault((info.task, info.robot), []).append(info.seed)
+    groups = seeds_by_task(source, infos)
+    for task, _ in groups:
+        if type(find_task(task)).loss is Task.loss:
+            raise InputError(f"{task} has no loss to differentiate, so no paths to bend by")
     _label(config, combine_hashes(info.state_hash for info in infos))
     todo = {k: [s for s in of if not _file(out, s).exists()] for k, of in groups.items()}
     chunks = [
@@ -109,9 +108,10 @@ def bend(config: BendConfig) -> BendReport:
         for i in range(0, len(seeds), _CHUNK)
     ]
     count = worker_count(config.workers, _COLLECTED * len(infos))
-    with Workers(min(count, max(1, len(chunks)))) as crew:
+    bar = progress_bar("way-points", len(infos), done=len(infos) - sum(map(len, todo.values())))
+    with Workers(min(count, max(1, len(chunks)))) as crew, bar as advance:
         for _ in crew.run(_bend_chunk, chunks):
-            pass
+            advance()
     stories = [json.loads(_file(out, info.seed).read_text()) for info in infos]
     ran = [a for story in stories for a in story["actions"] if a["before"] is not None]
 

@@ -52,7 +52,8 @@ def panda(emulator, client):
 @pytest.fixture(scope="module")
 def connection(emulator):
     """Our backend, connected to the emulated Panda."""
-    from hardware.backends.panda import PandaConfig, PandaRobot
+    from hardware.backends.franka_config import NetworkedConfig
+    from hardware.backends.panda import PandaRobot
 
-    with PandaRobot(PandaConfig(host=emulator.host)) as robot:
+    with PandaRobot(NetworkedConfig(host=emulator.host)) as robot:
         yield robot

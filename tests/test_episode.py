@@ -290,7 +290,8 @@ def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
     """Chooser, safety, panda-python, emulator, twin, camera, mask, overlap; recorded and read."""
     import emulator_client  # noqa: F401  skips where the vendor has no wheels
 
-    from hardware.backends.panda import PandaConfig, PandaRobot
+    from hardware.backends.franka_config import NetworkedConfig
+    from hardware.backends.panda import PandaRobot
 
     config = TwinConfig(seed=7)
     world = functools.partial(CableTwin, config)
@@ -303,7 +304,7 @@ def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
         camera = SimCamera(look, twin=config, config=SMALL)
         chooser = ScriptedChooser(look, targets)
         with (
-            PandaRobot(PandaConfig(host=emulator.host)) as panda,
+            PandaRobot(NetworkedConfig(host=emulator.host)) as panda,
             recorder(tmp_path / "a", goal=goal) as made,
         ):
             result = run_episode(

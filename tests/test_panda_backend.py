@@ -21,7 +21,8 @@ from hardware import (
     UnreachablePose,
     UserStopped,
 )
-from hardware.backends.panda import PandaConfig, PandaRobot
+from hardware.backends.franka_config import NetworkedConfig
+from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.panda_arm import PandaKinematics
 from hardware.straight_line import distance
@@ -303,7 +304,7 @@ def test_lock_step_gives_the_same_bits_twice() -> None:
     def run() -> list[bytes]:
         with (
             EmulatorProcess(world=RecordingWorld, free_host=True) as emulator,
-            PandaRobot(PandaConfig(host=emulator.host)) as robot,
+            PandaRobot(NetworkedConfig(host=emulator.host)) as robot,
         ):
             robot.move_linear(moved(0.2, 0.1, -0.3, yaw=0.5), speed=0.2)
             robot.move_linear(moved(0.2, 0.1, -0.45, yaw=0.5), speed=0.05, stop_force_N=8.0)

@@ -21,7 +21,8 @@ from hardware import (
     ReflexError,
     RobotMode,
 )
-from hardware.backends.panda import PandaConfig, PandaRobot
+from hardware.backends.franka_config import NetworkedConfig
+from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.server import EmulatorConfig
 
@@ -35,11 +36,11 @@ pytestmark = [
 
 def test_a_robot_in_reflex_can_be_connected_to() -> None:
     with EmulatorProcess(free_host=True) as emulator:
-        with PandaRobot(PandaConfig(host=emulator.host)) as robot:
+        with PandaRobot(NetworkedConfig(host=emulator.host)) as robot:
             emulator.inject_reflex("joint_reflex", after_ticks=50)
             with pytest.raises(ReflexError):
                 robot.move_joints(OFF_HOME, speed=0.2)
-        with PandaRobot(PandaConfig(host=emulator.host)) as robot:
+        with PandaRobot(NetworkedConfig(host=emulator.host)) as robot:
             assert robot.state().mode == RobotMode.REFLEX
             robot.recover()
             robot.move_joints(HOME, speed=0.3)
@@ -50,7 +51,7 @@ def test_a_robot_in_reflex_can_be_connected_to() -> None:
 
 def test_nothing_listens() -> None:
     with pytest.raises(ConnectionFailed, match="refused") as caught:
-        PandaRobot(PandaConfig(host="127.0.79.1"))
+        PandaRobot(NetworkedConfig(host="127.0.79.1"))
     assert says_what_to_do(caught.value) and "activate FCI" in caught.value.advice
 
 
@@ -58,7 +59,7 @@ def test_something_listens_that_never_answers() -> None:
     clock = time.monotonic()
     with socket.create_server(("127.0.79.2", 1337)):
         with pytest.raises(ConnectionFailed, match=r"no answer in 0\.5 s") as caught:
-            PandaRobot(PandaConfig(host="127.0.79.2", connect_timeout_s=0.5))
+            PandaRobot(NetworkedConfig(host="127.0.79.2", connect_timeout_s=0.5))
     assert says_what_to_do(caught.value)
     assert time.monotonic() - clock < 5.0
 
@@ -66,14 +67,14 @@ def test_something_listens_that_never_answers() -> None:
 def test_another_version() -> None:
     with EmulatorProcess(EmulatorConfig(version=4), free_host=True) as emulator:
         with pytest.raises(IncompatibleVersion, match="version 4") as caught:
-            PandaRobot(PandaConfig(host=emulator.host))
+            PandaRobot(NetworkedConfig(host=emulator.host))
         assert says_what_to_do(caught.value)
 
 
 def test_the_vendors_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "panda_py", None)
     with pytest.raises(BackendMissing, match=r"pip install 'warp-deform\[panda\]'") as caught:
-        PandaRobot(PandaConfig(host="127.0.79.1"))
+        PandaRobot(NetworkedConfig(host="127.0.79.1"))
     assert says_what_to_do(caught.value)
 
 
@@ -81,12 +82,13 @@ KILLED = """
 import json, threading, time
 import numpy as np
 from hardware import ConnectionLost
-from hardware.backends.panda import PandaConfig, PandaRobot
+from hardware.backends.franka_config import NetworkedConfig
+from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 
 if __name__ == "__main__":
     emulator = EmulatorProcess(free_host=True)
-    robot = PandaRobot(PandaConfig(host=emulator.host))
+    robot = PandaRobot(NetworkedConfig(host=emulator.host))
     goal = np.array([0.6, -0.5, 0.1, -2.2, 0.05, 1.7, 0.9])
     threading.Timer(0.3, emulator.kill).start()
     report = []

@@ -288,14 +288,15 @@ def test_a_camera_at_the_foam_sees_nothing(twin: CableTwin) -> None:
 def test_the_vendors_client_moves_the_chain_and_the_camera_sees_it() -> None:
     import emulator_client  # noqa: F401  skips where the vendor has no wheels
 
-    from hardware.backends.panda import PandaConfig, PandaRobot
+    from hardware.backends.franka_config import NetworkedConfig
+    from hardware.backends.panda import PandaRobot
 
     world = functools.partial(CableTwin, TwinConfig(seed=7))
     with EmulatorProcess(world=world, free_host=True) as emulator:
         look = functools.partial(emulator.call_world, "look")
         emulator.call_world("lay", beads=ALONG_Y)
         camera, calibration, task = SimCamera(look), sim_calibration(), CableMaskGoal()
-        with PandaRobot(PandaConfig(host=emulator.host)) as panda:
+        with PandaRobot(NetworkedConfig(host=emulator.host)) as panda:
             result = execute(SafeRobot(panda, LIMITS), MIDDLE)
         assert result.outcome == PickPlaceOutcome.PLACED
         assert result.width_after_lift_m == pytest.approx(2 * CONFIG.chain.radius, abs=2e-4)

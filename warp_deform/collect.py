@@ -12,15 +12,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from .collection import Attempt, Collection, append_attempt, check_seeds
 from .demonstrators import demonstrator
 from .episode_loop import SLOTS, SOLVED, play, worlds_for
 from .episodes import EpisodeReader, EpisodeWriter, Goal, combine_hashes, rebuild_index
 from .errors import InputError
 from .goals import load_goals
+from .progress import progress_bar
 from .recording import observe, record, task_config
 from .robots import robot as find_robot
 from .tasks.registry import task as find_task
@@ -131,9 +129,8 @@ def collect(config: CollectConfig) -> CollectReport:
 def _attempt_all(config: CollectConfig, attempts: dict[int, Attempt], workers: Workers) -> None:
     """Attempt seeds, round after round, until there are successes enough or no hope of them."""
     here = Workers(1)
-    with _progress() as progress:
-        done = sum(attempt.success for attempt in attempts.values())
-        bar = progress.add_task(config.task, total=config.episodes, completed=done)
+    done = sum(attempt.success for attempt in attempts.values())
+    with progress_bar(config.task, config.episodes, done=done) as advance:
         crew = here
         while todo := _plan(config, attempts):
             # The first few run here, while the workers start: kernels are compiled once.
@@ -141,7 +138,7 @@ def _attempt_all(config: CollectConfig, attempts: dict[int, Attempt], workers: W
             chunks = [_Chunk(config, part) for part in _split(few, crew.count)]
             for attempt in crew.run(attempt_chunk, chunks):
                 attempts[attempt.seed] = attempt
-                progress.advance(bar, attempt.success)
+                advance(attempt.success)
             crew = workers
 
 
@@ -245,17 +242,4 @@ def _report(
         physics_ok=all(info.physics_ok for info in infos),
         state_hash=combine_hashes(info.state_hash for info in infos),
         discarded_starts=sum(info.discarded_starts for info in infos),
-    )
-
-
-def _progress() -> Progress:
-    """A bar on stderr while somebody looks at it."""
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    return Progress(
-        *columns,
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
     )

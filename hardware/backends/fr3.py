@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -39,9 +38,10 @@ from ..robot import (
 )
 from ..straight_line import distance
 from .bounded import run_bounded
+from .franka_config import NetworkedConfig
 from .libfranka_errors import typed_error
 
-__all__ = ["FR3_Q_MAX", "FR3_Q_MIN", "FR3Config", "FR3Robot"]
+__all__ = ["FR3_Q_MAX", "FR3_Q_MIN", "FR3Robot"]
 
 T = TypeVar("T")
 FR3_Q_MIN = np.array([-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159])
@@ -63,30 +63,6 @@ _MODES = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class FR3Config:
-    """How to reach an FR3 and what to expect of it."""
-
-    host: str = "172.16.0.2"
-    """Address of the robot's control box; the vendor's default."""
-    collision_torque_Nm: float = 20.0
-    """Torque at any joint that makes the robot stop itself [N m]."""
-    collision_force_N: float = 20.0
-    """Force on the hand that makes the robot stop itself [N]."""
-    arrival_tolerance_m: float = 3e-3
-    """How far from its target the TCP may end [m]."""
-    arrival_tolerance_rad: float = 0.035
-    """How far from its target orientation the TCP may end [rad], 2 degrees."""
-    gripper_speed: float = 0.05
-    """Speed of the opening [m/s]."""
-    min_held_m: float = 5e-4
-    """Opening after a grasp at and below which the fingers hold nothing [m]."""
-    held_tolerance_m: float = 5e-3
-    """How much wider than expected a held object may be [m]."""
-    connect_timeout_s: float = 10.0
-    """Time for the connection [s]."""
-
-
 class FR3Robot(Closing):
     """A `Robot`: a Franka Research 3 with its hand. Connecting moves nothing.
 
@@ -96,8 +72,8 @@ class FR3Robot(Closing):
         ConnectionFailed: nothing answers, FCI is not active, or another client has it
     """
 
-    def __init__(self, config: FR3Config | None = None) -> None:
-        self.config = config or FR3Config()
+    def __init__(self, config: NetworkedConfig | None = None) -> None:
+        self.config = config or NetworkedConfig()
         try:
             import franky
         except ImportError as error:

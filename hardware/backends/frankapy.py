@@ -39,6 +39,7 @@ from ..robot import (
     check_range,
 )
 from ..straight_line import distance
+from .franka_config import FrankaConfig
 from .libfranka_errors import typed_error
 
 __all__ = ["FrankapyConfig", "FrankapyRobot"]
@@ -53,25 +54,13 @@ _POLL = 0.1  # [s]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrankapyConfig:
-    """What to expect of the robot; its address stands in frankapy's own configuration."""
+class FrankapyConfig(FrankaConfig):
+    """The same; the robot's address stands in frankapy's own configuration."""
 
     robot_num: int = 1
     """Number of the robot on the control PC."""
-    collision_force_N: float = 20.0
-    """Greatest force at which a motion may be asked to stop [N]."""
-    arrival_tolerance_m: float = 3e-3
-    """How far from its target the TCP may end [m]."""
-    arrival_tolerance_rad: float = 0.035
-    """How far from its target orientation the TCP may end [rad], 2 degrees."""
-    gripper_speed: float = 0.05
-    """Speed of the opening [m/s]."""
     gripper_timeout_s: float = 5.0
     """Longest wait for the fingers to stand [s]."""
-    min_held_m: float = 5e-4
-    """Opening after a grasp at and below which the fingers hold nothing [m]."""
-    held_tolerance_m: float = 5e-3
-    """How much wider than expected a held object may be [m]."""
 
 
 class FrankapyRobot(Closing):

@@ -14,7 +14,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -41,9 +40,10 @@ from ..robot import (
 )
 from ..straight_line import distance, straight_line
 from .bounded import run_bounded
+from .franka_config import NetworkedConfig
 from .libfranka_errors import reflex_names, typed_error
 
-__all__ = ["PandaConfig", "PandaRobot"]
+__all__ = ["PandaRobot"]
 
 T = TypeVar("T")
 # A reading or setting takes milliseconds; libfranka itself gives up after 1 s without a state.
@@ -68,30 +68,6 @@ MODES = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class PandaConfig:
-    """How to reach a Panda and what to expect of it."""
-
-    host: str = "172.16.0.2"
-    """Address of the robot's control box; the vendor's default."""
-    collision_torque_Nm: float = 20.0
-    """Torque at any joint that makes the robot stop itself [N m]; the vendor's default."""
-    collision_force_N: float = 20.0
-    """Force [N], and torque [N m], on the hand that makes the robot stop itself."""
-    arrival_tolerance_m: float = 3e-3
-    """How far from its target the TCP may end [m]."""
-    arrival_tolerance_rad: float = 0.035
-    """How far from its target orientation the TCP may end [rad], 2 degrees."""
-    gripper_speed: float = 0.05
-    """Speed of the opening [m/s]."""
-    min_held_m: float = 5e-4
-    """Opening after a grasp at and below which the fingers hold nothing [m]."""
-    held_tolerance_m: float = 5e-3
-    """How much wider than expected a held object may be [m]."""
-    connect_timeout_s: float = 10.0
-    """Time for the connection and the model library [s]."""
-
-
 class PandaRobot(Closing):
     """A `Robot`: a Franka Panda with its hand.
 
@@ -105,8 +81,8 @@ class PandaRobot(Closing):
         ConnectionFailed: nothing answers, FCI is not active, or another client has it
     """
 
-    def __init__(self, config: PandaConfig | None = None) -> None:
-        self.config = config or PandaConfig()
+    def __init__(self, config: NetworkedConfig | None = None) -> None:
+        self.config = config or NetworkedConfig()
         check_range("collision_force_N", self.config.collision_force_N, low=0, high=100, unit="N")
         try:
             import panda_py

@@ -7,17 +7,14 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from warp_deform.errors import InputError
 
-__all__ = ["ConversionReport", "new_file", "new_folder", "progress", "size_of"]
+__all__ = ["ConversionReport", "new_file", "new_folder", "size_of"]
 
 _MARK = "conversion.json"
 
@@ -127,22 +124,6 @@ def new_file(target: Path) -> Iterator[Path]:
         partial.rename(target)
     finally:
         partial.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def progress(what: str, total: int, *, done: int = 0) -> Iterator[Callable[[], None]]:
-    """A bar of episodes on stderr while somebody looks at it; call what it gives for each one."""
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    with Progress(
-        *columns,
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    ) as bars:
-        bar = bars.add_task(what, total=total, completed=done)
-        yield lambda: bars.advance(bar)
 
 
 def size_of(path: Path) -> int:

@@ -37,6 +37,7 @@ from warp_deform.episodes import (
     versions,
 )
 from warp_deform.errors import InputError
+from warp_deform.progress import progress_bar
 from warp_deform.recording import GOAL_TARGETS
 from warp_deform.rendering.camera import Camera
 from warp_deform.rendering.fusion import fuse
@@ -45,7 +46,7 @@ from warp_deform.tasks.registry import TASKS
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.workers import Workers, worker_count
 
-from .conversion import ConversionReport, new_folder, progress, size_of
+from .conversion import ConversionReport, new_folder, size_of
 from .restricted_pickle import read_pickles
 
 __all__ = ["DEMONSTRATOR", "OUTCOME", "import_deformable_ravens", "read_recording"]
@@ -107,7 +108,10 @@ def import_deformable_ravens(
         there = set(EpisodeReader(folder).seeds) if any(folder.glob("*.parquet")) else set()
         missing = [(seed, steps) for seed, steps in recordings if seed not in there]
         chunks = [_Chunk(source.resolve(), folder, name, (one,)) for one in missing]
-        with progress(name, len(recordings), done=len(there)) as advance, Workers(count) as crew:
+        with (
+            progress_bar(name, len(recordings), done=len(there)) as advance,
+            Workers(count) as crew,
+        ):
             for _ in crew.run(_import_chunk, chunks):
                 advance()
         rebuild_index(folder)

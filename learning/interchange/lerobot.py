@@ -29,8 +29,9 @@ import pyarrow.parquet as pq
 from warp_deform import __version__
 from warp_deform.episodes import Episode, EpisodeReader
 from warp_deform.errors import InputError
+from warp_deform.progress import progress_bar
 
-from .conversion import ConversionReport, new_folder, progress, size_of
+from .conversion import ConversionReport, new_folder, size_of
 from .running_statistics import RunningStatistics
 
 __all__ = ["ACTION_NAMES", "SIDECAR", "export_lerobot"]
@@ -118,7 +119,7 @@ def export_lerobot(source: Path, target: Path) -> ConversionReport:
     reader = EpisodeReader(source)
     description = {"source": str(Path(source).resolve()), "to": "lerobot", "version": __version__}
     with new_folder(target, description=description) as folder:
-        with progress("lerobot", len(reader)) as advance, _Dataset(folder) as dataset:
+        with progress_bar("lerobot", len(reader)) as advance, _Dataset(folder) as dataset:
             for episode in reader:
                 dataset.add(episode)
                 advance()

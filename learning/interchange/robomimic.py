@@ -22,10 +22,11 @@ import numpy as np
 from warp_deform import __version__
 from warp_deform.episodes import Episode, EpisodeReader, Step
 from warp_deform.errors import InputError
+from warp_deform.progress import progress_bar
 from warp_deform.registration import env_id
 from warp_deform.tasks.registry import TASKS
 
-from .conversion import ConversionReport, new_file, progress, size_of
+from .conversion import ConversionReport, new_file, size_of
 
 __all__ = ["STATE_PARTS", "VALIDATION_EVERY", "export_robomimic"]
 
@@ -56,7 +57,7 @@ def export_robomimic(source: Path, target: Path) -> ConversionReport:
     task = reader.info(reader.seeds[0]).task
     total = 0
     first: dict[str, tuple[int, ...]] = {}
-    with new_file(target) as partial, progress("robomimic", len(reader)) as advance:
+    with new_file(target) as partial, progress_bar("robomimic", len(reader)) as advance:
         with h5py.File(partial, "x") as file:
             data = file.create_group("data")
             for number, episode in enumerate(reader):
