@@ -241,17 +241,20 @@ def train(config: TrainConfig) -> TrainReport:
 
 def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
     """The agent for a task at a preset."""
-    lifts = task_lifts(data.task)
+    lifts, yaws = task_lifts(data.task), data.task.place_yaws
     if issubclass(AGENTS[config.agent], Transporter):
-        return AgentDescription(
-            task=config.task,
-            agent=config.agent,
-            config=asdict(replace(PRESETS[config.preset], lifts=lifts)),
+        preset = PRESETS[config.preset]
+        sizes = replace(
+            preset,
+            lifts=lifts,
+            n_rotations_train=max(preset.n_rotations_train, yaws),
+            n_rotations_eval=yaws,
         )
+        return AgentDescription(task=config.task, agent=config.agent, config=asdict(sizes))
     return AgentDescription(
         task=config.task,
         agent=config.agent,
-        config=asdict(GtStateConfig(lifts=lifts)),
+        config=asdict(GtStateConfig(lifts=lifts, one_rotation=yaws == 1)),
         state_size=data.state_size,
     )
 

@@ -246,6 +246,21 @@ def test_presets_are_the_papers_and_ours() -> None:
     assert (paper.ema, paper.decay, paper.warmup) == (0.0, False, 0)
 
 
+def test_place_yaws_are_chosen_where_they_matter(
+    folder: Path, straight: tuple[Path, TrainReport], tmp_path: Path
+) -> None:
+    block = write_demonstrations(tmp_path / "block", 1, task="block-notarget", actions=1)
+    one = Schedule(steps=1, batch=1, lr=1e-3, snapshots=1)
+    settings = {"task": "block-notarget", "preset": "fast", "schedule": one, "data": block}
+    for agent in "goal-stack", "gt-mlp":
+        train(TrainConfig(agent=agent, out=tmp_path / agent, **settings))
+    images = load_policy(tmp_path / "goal-stack").description.config
+    assert (images["n_rotations_train"], images["n_rotations_eval"]) == (24, 24)
+    assert not load_policy(tmp_path / "gt-mlp").description.config["one_rotation"]
+    elsewhere = load_policy(straight[0]).description.config
+    assert (elsewhere["n_rotations_train"], elsewhere["n_rotations_eval"]) == (1, 1)
+
+
 def test_two_processes_train_together(folder: Path, tmp_path: Path) -> None:
     """Under torchrun the gradients are averaged, so both end with one set of weights."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2",

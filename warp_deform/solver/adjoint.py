@@ -64,14 +64,8 @@ def adjoint_kernel(
     sweep_predict_body = rigid_.sweep_predict_body
     solid_ = body_adjoint(scalar, lanes, with_sheets)
     sweep_body_pairs, sweep_body_contacts = solid_.sweep_body_pairs, solid_.sweep_body_contacts
-    R3, Q, Shapes, Bodies, Contacts, BodyAdjoint = (
-        t.R3,
-        t.Q,
-        t.Shapes,
-        t.Bodies,
-        t.Contacts,
-        t.BodyAdjoint,
-    )
+    R3, Q = t.R3, t.Q
+    Shapes, Bodies, Contacts, BodyAdjoint = t.Shapes, t.Bodies, t.Contacts, t.BodyAdjoint
     Settings, Topology, Springs, Pairs = t.Settings, t.Topology, t.Springs, t.Pairs
     Group, Grips, Tape, Adjoint = t.Group, t.Grips, t.Tape, t.Adjoint
     Particles, Sheets = t.Particles, t.Sheets

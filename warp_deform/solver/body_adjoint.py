@@ -8,7 +8,7 @@ import warp as wp
 
 from .body_contact import PASSES, VISIT, body_contact
 from .body_contact_adjoint import body_contact_adjoint
-from .box_box import box_box
+from .body_pairs import body_pairs
 from .box_box_adjoint import box_box_adjoint
 from .box_particle_adjoint import box_particle_adjoint
 from .box_table import box_table
@@ -33,12 +33,10 @@ def body_adjoint(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     Topology, Shapes, Group, Sheets = t.Topology, t.Shapes, t.Group, t.Sheets
     Bodies, Contacts, Tape = t.Bodies, t.Contacts, t.Tape
     Adjoint, BodyAdjoint = t.Adjoint, t.BodyAdjoint
-    table_ = box_table(scalar, lanes, True)
-    list_table, corner = table_.list_table, table_.corner
-    list_boxes = box_box(scalar, lanes, True).list_boxes
+    corner = box_table(scalar, lanes, True).corner
+    list_pairs = body_pairs(scalar, lanes, True).list_pairs
     sweep_boxes = box_box_adjoint(scalar, lanes).sweep_boxes
-    bodies_ = body_contact(scalar, lanes, True)
-    begin_body, solve_contacts = bodies_.begin_body, bodies_.solve_contacts
+    solve_contacts = body_contact(scalar, lanes, True).solve_contacts
     contact_ = body_contact_adjoint(scalar, lanes)
     sweep_end_body, sweep_visits, sweep_listed, sweep_spread, clear_contacts = (
         getattr(contact_, name)
@@ -69,38 +67,21 @@ def body_adjoint(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
         one = wp.grad(itself)(push)
         count = top.body_count[k]
         b0 = group.body_start[g] + lane * count
-        first = group.shape_start[g] + lane * top.shape_count[k]
-        last = first + top.shape_count[k]
-        mv = group.contact_friction[g]
-        tv = group.table_friction[g]
-        mu = mv[lane]
-        table_mu = tv[lane]
         for b in range(count):
             bodies.x[b0 + b] = position(at + b * wp.static(POSE), tape)
             bodies.q[b0 + b] = quaternion(at + b * wp.static(POSE) + 3, tape)
-            begin_body(b0 + b, bodies)
         start = group.contact_start[g]
-        c = int(start)
-        for sa in range(first, last):
-            for sb in range(sa + 1, last):
-                a = b0 + shapes.body[sa]
-                b = b0 + shapes.body[sb]
-                if a != b and bodies.w[a] + bodies.w[b] > S(0.0):
-                    pair_mu = mu * wp.min(shapes.friction[sa], shapes.friction[sb])
-                    c = list_boxes(c, sa, a, sb, b, pair_mu, push, shapes, bodies, contacts)
-        for b in range(count):
-            if bodies.w[b0 + b] > S(0.0):
-                c = list_table(c, b0 + b, b, first, last, table_mu, push, shapes, bodies, contacts)
-        passes = solve_contacts(start, c, bodies, contacts)
-        clear_contacts(start, c, ba)
+        end = list_pairs(g, lane, k, push, top, shapes, group, bodies, contacts)
+        passes = solve_contacts(start, end, bodies, contacts)
+        clear_contacts(start, end, ba)
         for b in range(b0, b0 + count):
             sweep_end_body(b, bodies.q[b], bodies, ba)
         log = start * wp.static(PASSES * VISIT)
-        sweep_visits(start, c, passes, log, lane, counts, bodies, contacts, ba, adj)
+        sweep_visits(start, end, passes, log, lane, counts, bodies, contacts, ba, adj)
         by_table = one - one
         by_contact = S(0.0)
-        for r in range(c - start):
-            i = c - 1 - r
+        for r in range(end - start):
+            i = end - 1 - r
             a = contacts.a[i]
             b = contacts.b[i]
             code = contacts.code[i]

@@ -224,5 +224,5 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
 
     return SimpleNamespace(
         begin_body=begin_body, list_contact=list_contact, share_load=share_load,
-        solve_contacts=solve_contacts, end_body=end_body,
+        relative=relative, solve_contacts=solve_contacts, end_body=end_body,
     )  # fmt: skip

@@ -11,7 +11,8 @@ from typing import Any
 
 import warp as wp
 
-from .body_contact import GIVEN_BACK, VISIT
+from .body_contact import GIVEN_BACK, VISIT, body_contact
+from .lane_access import lane_access
 from .rigid import rigid
 from .structures import structures
 from .tape import Kind
@@ -29,7 +30,9 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     t = structures(scalar, lanes)
     S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
     Bodies, Contacts, BodyAdjoint, Adjoint = t.Bodies, t.Contacts, t.BodyAdjoint, t.Adjoint
+    count_one = lane_access(scalar, lanes).count_one
     turned = rigid(scalar, lanes).turned
+    relative = body_contact(scalar, lanes, True).relative
     TINY = 1.0e-36 if scalar is wp.float32 else 1.0e-200
 
     @wp.func
@@ -102,15 +105,6 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             ba.dx[a] = ba.dx[a] - g
             ba.dr[a] = ba.dr[a] - wp.cross(contacts.ra[c], g)
             ba.ra[c] = ba.ra[c] - wp.cross(g, bodies.dr[a])
-
-    @wp.func
-    def relative(c: int, bodies: Bodies, contacts: Contacts):
-        b = contacts.b[c]
-        d = bodies.dx[b] + wp.cross(bodies.dr[b], contacts.rb[c])
-        a = contacts.a[c]
-        if a >= 0:
-            d -= bodies.dx[a] + wp.cross(bodies.dr[a], contacts.ra[c])
-        return d
 
     @wp.func
     def sweep_visit(c: int, at: int, bodies: Bodies, contacts: Contacts, ba: BodyAdjoint):
@@ -202,15 +196,11 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
                 kind = int(counts) + wp.static(int(Kind.BODY_TABLE))
                 if contacts.a[c] >= 0:
                     kind = int(counts) + wp.static(int(Kind.BODY_BODY))
-                fired = adj.fired[kind]
-                fired[lane] = fired[lane] + S(1.0)
-                adj.fired[kind] = fired
+                count_one(kind, lane, adj)
                 across = wp.sqrt(held[1] * held[1] + held[2] * held[2])
                 if across > S(0.999) * contacts.mu[c] * held[0]:
                     kind = int(counts) + wp.static(int(Kind.BODY_SLIP))
-                    fired = adj.fired[kind]
-                    fired[lane] = fired[lane] + S(1.0)
-                    adj.fired[kind] = fired
+                    count_one(kind, lane, adj)
         count = end - start
         for back in range(passes):
             p = passes - 1 - back

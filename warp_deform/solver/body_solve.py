@@ -7,10 +7,9 @@ from typing import Any
 import warp as wp
 
 from .body_contact import body_contact
-from .box_box import box_box
+from .body_pairs import body_pairs
 from .box_particle import box_particle
 from .box_particle_adjoint import box_particle_adjoint
-from .box_table import box_table
 from .box_triangle import box_triangle
 from .box_triangle_adjoint import box_triangle_adjoint
 from .rigid_adjoint import rigid_adjoint
@@ -33,17 +32,14 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
     Topology, Shapes, Group, Particles = t.Topology, t.Shapes, t.Group, t.Particles
     Bodies, Contacts, Sheets, Cells = t.Bodies, t.Contacts, t.Sheets, t.Cells
     Tape = t.Tape
-    list_table = box_table(scalar, lanes).list_table
     project_box_particle = box_particle(scalar, lanes).project_box_particle
     project_box_triangles = box_triangle(scalar, lanes).project_box_triangles
-    list_boxes = box_box(scalar, lanes).list_boxes
+    list_pairs = body_pairs(scalar, lanes).list_pairs
     record_box_particle = box_particle_adjoint(scalar, lanes).record_box_particle
     record_box_triangles = box_triangle_adjoint(scalar, lanes).record_box_triangles
     push_pose = rigid_adjoint(scalar, lanes).push_pose
     bodies_ = body_contact(scalar, lanes)
-    begin_body, solve_contacts, end_body = (
-        getattr(bodies_, n) for n in ("begin_body", "solve_contacts", "end_body")
-    )
+    solve_contacts, end_body = bodies_.solve_contacts, bodies_.end_body
 
     @wp.func
     def solve_bodies(
@@ -59,7 +55,6 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
         last = first + top.shape_count[k]
         mv = group.contact_friction[g]
         mu = mv[lane]
-        tv = group.table_friction[g]
         radii = top.particle_start[k]
         mark = int(tops[2])
         for shape in range(first, last):
@@ -104,21 +99,8 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
             for b in range(b0, b0 + count):
                 push_pose(tops[3], bodies.x[b], bodies.q[b], tape)
                 tops[3] += 7
-        for b in range(b0, b0 + count):
-            begin_body(b, bodies)
-        start = group.contact_start[g]
-        c = int(start)
-        for sa in range(first, last):
-            for sb in range(sa + 1, last):
-                a = b0 + shapes.body[sa]
-                b = b0 + shapes.body[sb]
-                if a != b and bodies.w[a] + bodies.w[b] > S(0.0):
-                    pair_mu = mu * wp.min(shapes.friction[sa], shapes.friction[sb])
-                    c = list_boxes(c, sa, a, sb, b, pair_mu, push, shapes, bodies, contacts)
-        for b in range(count):
-            if bodies.w[b0 + b] > S(0.0):
-                c = list_table(c, b0 + b, b, first, last, tv[lane], push, shapes, bodies, contacts)
-        solve_contacts(start, c, bodies, contacts)
+        end = list_pairs(g, lane, k, push, top, shapes, group, bodies, contacts)
+        solve_contacts(group.contact_start[g], end, bodies, contacts)
         for b in range(b0, b0 + count):
             end_body(b, bodies)
         return tops

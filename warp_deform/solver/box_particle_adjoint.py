@@ -31,6 +31,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     Shapes, Particles, Bodies = t.Shapes, t.Particles, t.Bodies
     Tape, Adjoint, BodyAdjoint = t.Tape, t.Adjoint, t.BodyAdjoint
     access = lane_access(scalar, lanes)
+    count_one = access.count_one
     get, put, get_mass, put_scalar = access.get, access.put, access.get_mass, access.put_scalar
     stands = box_particle(scalar, lanes).stands
     project_box_particle = box_particle(scalar, lanes).project_box_particle
@@ -151,9 +152,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         q = quaternion(at + 9, tape)
         wi = get_mass(adj.w_flat, i, lane)
         kind = counts + wp.static(int(Kind.BOX_PARTICLE))
-        fired = adj.fired[kind]
-        fired[lane] = fired[lane] + S(1.0)
-        adj.fired[kind] = fired
+        count_one(kind, lane, adj)
         inverse = M33()
         if bodies.w[b] > S(0.0):
             inverse = bodies.inverse_inertia[b]

@@ -33,6 +33,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     Sheets, Cells, Tape = t.Sheets, t.Cells, t.Tape
     Adjoint, BodyAdjoint = t.Adjoint, t.BodyAdjoint
     access = lane_access(scalar, lanes)
+    count_one = access.count_one
     get, put, get_mass = access.get, access.put, access.get_mass
     barycentric = closest_point(scalar, lanes).barycentric
     stands = box_particle(scalar, lanes).stands
@@ -206,9 +207,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         x = position(at + 9, tape)
         q = quaternion(at + 12, tape)
         kind = counts + wp.static(int(Kind.BOX_TRIANGLE))
-        fired = adj.fired[kind]
-        fired[lane] = fired[lane] + S(1.0)
-        adj.fired[kind] = fired
+        count_one(kind, lane, adj)
         inverse = M33()
         if bodies.w[b] > S(0.0):
             inverse = bodies.inverse_inertia[b]

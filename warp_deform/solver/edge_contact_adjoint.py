@@ -29,6 +29,7 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     R2 = wp.types.vector(2, S)
     Sheets, Cells, Tape, Adjoint = t.Sheets, t.Cells, t.Tape, t.Adjoint
     access = lane_access(scalar, lanes)
+    count_one = access.count_one
     get, get_mass = access.get, access.get_mass
     edges_ = edge_contact(scalar, lanes)
     nearest, project_edge = edges_.nearest, edges_.project_edge
@@ -77,9 +78,7 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         ic = p0 + second[0]
         id = p0 + second[1]
         kind = counts + wp.static(int(Kind.EDGE))
-        fired = adj.fired[kind]
-        fired[lane] = fired[lane] + S(1.0)
-        adj.fired[kind] = fired
+        count_one(kind, lane, adj)
         h = wp.abs(signed)
         side = wp.sign(signed)
         e = b - a

@@ -8,6 +8,7 @@ import warp as wp
 
 from .box_particle import box_particle
 from .box_table import box_table
+from .lane_access import lane_access
 from .lanes import add, mul, sub  # noqa: F401  (operators are found by name)
 from .sphere_contact import sphere_contact
 from .structures import structures
@@ -181,6 +182,7 @@ def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
     t = structures(scalar, lanes)
     S, R3, Q = t.S, t.R3, t.Q
     Grips, Tape, Adjoint, BodyAdjoint = t.Grips, t.Tape, t.Adjoint, t.BodyAdjoint
+    count_one = lane_access(scalar, lanes).count_one
 
     @wp.func
     def record_grip(
@@ -330,9 +332,7 @@ def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
         adj.shift[w] = shift
         if tape.k[at + 4] > 0:
             kind = counts + wp.static(int(Kind.RELEASE))
-        fired = adj.fired[kind]
-        fired[lane] = fired[lane] + S(1.0)
-        adj.fired[kind] = fired
+        count_one(kind, lane, adj)
 
     return SimpleNamespace(
         record_grip=record_grip, sweep_grip=sweep_grip, held_again=held_again, turned_by=turned_by

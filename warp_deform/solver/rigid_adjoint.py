@@ -1,7 +1,9 @@
 """Adjoint of the motion of rigid bodies, see `rigid`.
 
 Derivatives by a quaternion are those by its four numbers: what a function does is differentiated as
-it is computed. Scalar functions without state are differentiated by `wp.grad`.
+it is computed. Scalar functions without state are differentiated by `wp.grad`. They say again what
+the forward pass says: of a function that a forward kernel also builds, Warp 1.19 gives wrong
+derivatives and no warning.
 """
 
 import functools
@@ -10,6 +12,7 @@ from typing import Any
 
 import warp as wp
 
+from .lane_access import lane_access
 from .rigid import SLEEP_SPEED, SLEEP_TURN, rigid
 from .structures import structures
 from .tape import BODY_SCALARS, Kind
@@ -29,6 +32,7 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     t = structures(scalar, lanes)
     S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
     Bodies, Tape, Adjoint, BodyAdjoint = t.Bodies, t.Tape, t.Adjoint, t.BodyAdjoint
+    count_one = lane_access(scalar, lanes).count_one
     turned = rigid(scalar, lanes).turned
 
     @wp.func
@@ -104,9 +108,7 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         elif wp.length(bodies.x[b] - bodies.xp[b]) > fastest:
             kind = counts + wp.static(int(Kind.BODY_CLAMP))
         if kind >= 0:
-            fired = adj.fired[kind]
-            fired[lane] = fired[lane] + S(1.0)
-            adj.fired[kind] = fired
+            count_one(kind, lane, adj)
         gx, gq, gxp, gqp, _dt, _fastest, _moves, _gv, _go = wp.grad(velocities)(
             bodies.x[b], bodies.q[b], bodies.xp[b], bodies.qp[b], dt, fastest, moves, ba.v[b],
             ba.omega[b],

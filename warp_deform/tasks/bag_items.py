@@ -274,6 +274,7 @@ class BagItems2(BagItems1):
     """bag-items-1 with two boxes of different sizes, which may have to be turned."""
 
     name = "bag-items-2"
+    place_yaws = 24
     max_actions = 9
     ground_truth_size = 108
     objects: ClassVar[tuple[str, ...]] = ("bag", "box", "box")
@@ -281,7 +282,6 @@ class BagItems2(BagItems1):
         BoxConfig(parts=(BoxPart((0.035, 0.035, 0.03)),), mass=0.1, friction=1.5, color=BROWN),
         BoxConfig(parts=(BoxPart((0.035, 0.035, 0.03)),), mass=0.1, friction=1.5, color=BROWN),
     )
-    turns = 24
 
     def draw_items(self, rng: np.random.Generator) -> tuple[BoxConfig, ...]:
         """Two boxes whose two sides add up to 7 cm, each in a shade of brown."""

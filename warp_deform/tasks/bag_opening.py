@@ -260,9 +260,6 @@ class BagTask(Task):
 
     # -- inserting
 
-    turns: ClassVar[int] = 1
-    """Yaws in which the demonstrators place an item."""
-
     def item_mask(self, layout: Layout, snapshot: Snapshot, item: int) -> np.ndarray:
         """Pixels (320, 160) of the item with this number among the scene's boxes."""
         boxes = [o for o in snapshot.objects if isinstance(o, Box)]
@@ -283,7 +280,8 @@ class BagTask(Task):
             return None
         pixels = np.argwhere(clear)
         place = pixel_to_world(pixels[rng.integers(len(pixels))])
-        yaw = 2 * np.pi * rng.integers(self.turns) / self.turns if self.turns > 1 else 0.0
+        yaws = self.place_yaws
+        yaw = 2 * np.pi * rng.integers(yaws) / yaws if yaws > 1 else 0.0
         return pick_place(pick, place, stage=INSERT, place_yaw=float(yaw))
 
     # -- ground truth
