@@ -187,6 +187,7 @@ def _collect(options: CollectOptions) -> Outcome:
         raise InputError(f"--episodes is {options.episodes}; it must be 1 or more")
     live, writer = options.out / "live", EpisodeWriter(options.out)
     done: list[EpisodeResult] = []
+    kept = 0
     with open_rig(options.rig()) as rig:
         for number in range(options.episodes):
             seed = options.seed + number
@@ -197,17 +198,20 @@ def _collect(options: CollectOptions) -> Outcome:
             done.append(_episode(options, rig, _next_folder(live), seed=seed))
             if done[-1].error is not None:
                 break
-            if done[-1].outcomes:
-                writer.write(pack(done[-1].folder, seed=int(done[-1].folder.name)))
-    successes = sum(r.score is not None and r.score.success for r in done)
+            if not done[-1].outcomes:
+                continue
+            episode = pack(done[-1].folder, seed=int(done[-1].folder.name))
+            if episode.info.success:
+                writer.write(episode)
+                kept += 1
     data = {
         "out": options.out,
         "episodes": len(done),
-        "successes": successes,
+        "demonstrations": kept,
         "actions": sum(len(r.outcomes) for r in done),
         "recordings": [r.folder for r in done],
     }
-    text = f"{len(done)} episodes, {successes} of them successes, in {options.out}"
+    text = f"{len(done)} episodes, {kept} of them kept as demonstrations, in {options.out}"
     return Outcome(data=data, text=text, failure=_failure(done[-1]) if done else None)
 
 

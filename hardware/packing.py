@@ -12,7 +12,7 @@ from warp_deform.episodes import Episode, EpisodeInfo, Goal, Step, cpu_fingerpri
 from .camera import read_image
 from .json_file import read_numbers, require
 from .recording import Recording
-from .scoring import SUCCESS_IOU, score_recording
+from .scoring import SUCCESS_IOU, score_masks, score_recording
 
 __all__ = ["pack"]
 
@@ -24,7 +24,8 @@ def pack(
     """Return the recording as an episode of the dataset format.
 
     There is no simulation: particles, bodies and ground truth are empty, heights are zero, and the
-    simulated time is 0. Score and success are computed from the pictures.
+    simulated time is 0. Score and success are computed from the pictures. An episode without a goal
+    shows how to reach where it ended, so that is its goal (hindsight).
 
     Args:
         folder: the recording
@@ -37,15 +38,20 @@ def pack(
     """
     recording = Recording.read(folder)
     meta, what = recording.meta, f"recording {folder}"
-    goal_mask = recording.goal_mask()
-    score = None if goal_mask is None else score_recording(folder)
     # A picture shows what an action did; an action after the last picture is left out.
     rows = len(recording.observations)
+    goal_mask = recording.goal_mask()
+    hindsight = goal_mask is None
+    if goal_mask is None:
+        goal_mask = recording.mask(rows - 1)
+        score = score_masks([recording.mask(i) for i in range(rows)], goal_mask)
+    else:
+        score = score_recording(folder)
     steps = []
     for i in range(rows):
         last = i == rows - 1
         mask = recording.mask(i)
-        iou = 0.0 if score is None else score.iou[i]
+        iou = score.iou[i]
         record = {} if last else recording.actions[i]
         action = None if last else read_numbers(record, "action", (7,), what=f"{what}, action {i}")
         outcome = None if last else require(record, "outcome", str, what=f"{what}, action {i}")
@@ -66,18 +72,17 @@ def pack(
                 ground_truth=np.zeros(0, np.float32),
             )
         )
-    goal = None
-    if goal_mask is not None:
-        color = _triple(goal_mask)
-        if images == "view":
-            color = read_image(folder / "goal_view.png", color=True)
-        height = np.zeros(goal_mask.shape, np.float32)
-        goal = Goal(color, height, np.zeros((0, 3)), kind="demonstrated", seed=seed)
+    color = _triple(goal_mask)
+    if images == "view":
+        end = recording.view(rows - 1)
+        color = end if hindsight else read_image(folder / "goal_view.png", color=True)
+    height = np.zeros(goal_mask.shape, np.float32)
+    goal = Goal(color, height, np.zeros((0, 3)), kind="demonstrated", seed=seed)
     info = EpisodeInfo(
         task=task,
         seed=seed,
-        success=score is not None and score.success,
-        score=0.0 if score is None else score.best[-1],
+        success=score.success and not (hindsight and rows == 1),  # standing still shows nothing
+        score=score.best[-1],
         actions=rows - 1,
         demonstrator=require(meta, "actor", str, what=what),
         robot=require(meta, "robot_id", str, what=what),
@@ -97,9 +102,10 @@ def pack(
             "outcome": meta.get("outcome"),
             "note": require(meta, "note", str, what=what),
             "images": images,
+            "hindsight": hindsight,
             "times_s": [float(row["t"]) for row in recording.observations],
             "actions_after_last_picture": len(recording.actions) - (rows - 1),
-            "warnings": list(recording.warnings if score is None else score.warnings),
+            "warnings": sorted({*recording.warnings, *score.warnings}),
         },
     )
     return Episode(info, tuple(steps), goal)

@@ -20,7 +20,6 @@ from hardware.look_server import LookServer, remote_look
 from hardware.top_down_view import TopDownView
 from hardware.twin import TwinLook
 from warp_deform.cli import main
-from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -53,8 +52,7 @@ def test_a_simulated_episode_is_run_scored_replayed_and_packed(
         "--max-actions", "2", "--out", str(out),
     )  # fmt: skip
     assert code == 0 and data["episodes"] == 1 and data["actions"] == 2
-    episode = next(iter(EpisodeReader(out)))
-    assert episode.info.task == "cable-mask-goal" and len(episode.steps) == 3
+    assert data["demonstrations"] == 0 and not list(out.glob("*.parquet"))  # the goal is too far
     folder = str(out / "live" / "0000")
     code, scored, _ = run(capfd, "score", folder)
     assert code == 0 and len(scored["episodes"][0]["iou"]) == 3

@@ -27,10 +27,18 @@ from warp_deform.tasks.metrics import mask_iou
 
 TESTS = Path(__file__).resolve().parent
 
+GOAL = mask(0)
 
-def record(folder: Path, shifts: tuple[int, ...] = (4, 2, 1), *, finish: bool = True) -> None:
+
+def record(
+    folder: Path,
+    shifts: tuple[int, ...] = (4, 2, 1),
+    *,
+    finish: bool = True,
+    goal: np.ndarray | None = GOAL,
+) -> None:
     """An episode whose cable is `shifts` pixels from the goal, before and after each action."""
-    with EpisodeRecorder(folder, CONFIG, goal_mask=mask(0)) as recorder:
+    with EpisodeRecorder(folder, CONFIG, goal_mask=goal) as recorder:
         for number, shift in enumerate(shifts):
             observe(recorder, number, shift)
             if number < len(shifts) - 1:
@@ -92,6 +100,19 @@ def test_scores_of_masks() -> None:
     for masks, message in (([], "no score"), ([far[:5]], "use one view")):
         with pytest.raises(InputError, match=message):
             score_masks(masks, goal)
+
+
+def test_an_episode_without_a_goal_shows_how_to_reach_where_it_ended(tmp_path: Path) -> None:
+    record(tmp_path / "a", (8, 4, 1), goal=None)
+    episode = pack(tmp_path / "a", seed=0)
+    assert episode.info.success and episode.info.extra["hindsight"] and episode.info.score == 1.0
+    assert [step.score for step in episode.steps] == [
+        mask_iou(mask(shift), mask(1)) for shift in (8, 4, 1)
+    ]
+    assert episode.goal is not None
+    np.testing.assert_array_equal(episode.goal.color[..., 0] > 0, mask(1))
+    seen = pack(tmp_path / "a", seed=0, images="view")
+    assert seen.goal is not None and (seen.goal.color == 2).all()
 
 
 @pytest.mark.parametrize("steps", [1, 4, 9])
