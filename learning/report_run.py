@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import joblib
-from rich.console import Console
-from rich.progress import track
 
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
+from warp_deform.progress import progress_bar
 
 from .evaluation import Evaluation, Protocol, best, check_goals, evaluate_snapshot
 from .snapshots import RunFolder, write_json
@@ -66,6 +65,14 @@ def evaluate_run(
         count = workers or max(1, min(joblib.cpu_count(), protocol.episodes // _LEAST_EPISODES))
         return evaluate_snapshot(run, step, protocol, workers=count)
 
+    def play_all(what: str, protocol: Protocol) -> list[Evaluation]:
+        found = []
+        with progress_bar(what, len(steps), shown=progress) as advance:
+            for step in steps:
+                found.append(play(step, protocol))
+                advance()
+        return found
+
     validation = Protocol(
         split="validation",
         episodes=validation_episodes,
@@ -76,7 +83,7 @@ def evaluate_run(
     test = replace(validation, split="test", episodes=episodes, goal_folder=goals)
     if goals is not None:  # a wrong folder is told of before anything is played
         check_goals(goals, task)
-    validated = [play(step, validation) for step in _bar(steps, "validation", shown=progress)]
+    validated = play_all("validation", validation)
     chosen = best([each for each in validated if each.step], task=task)
     result = play(chosen.step, test)
     report: dict[str, Any] = {
@@ -104,8 +111,7 @@ def evaluate_run(
             goal_folder=None,
             retry=False,
         )
-        bar = _bar(steps, "paper's protocol", shown=progress)
-        played = [play(step, theirs) for step in bar]
+        played = play_all("paper's protocol", theirs)
         top = best([each for each in played if each.step], task=task)
         report["paper"] = {
             "protocol": "best of the snapshots on the test seeds themselves (optimistic)",
@@ -129,10 +135,3 @@ def _named(goals: Path | None) -> str:
     if goals is None:
         return "constructed"
     return f"given, {combine_hashes(info.state_hash for info in EpisodeReader(goals).infos())[:12]}"
-
-
-def _bar(steps: list[int], name: str, *, shown: bool) -> Any:
-    """The steps, with a bar on stderr while somebody looks at it."""
-    console = Console(stderr=True)
-    hidden = not (shown and console.is_terminal)
-    return track(steps, name, console=console, transient=True, disable=hidden)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from training_samples import write_demonstrations
 
 from learning import evaluation
@@ -25,6 +26,7 @@ from learning.evaluation import (
     summarise,
 )
 from learning.failures import FAILURES, bag_opening, closed, failure, puts_back
+from learning.policy import load_policy
 from learning.report_run import evaluate_run
 from learning.snapshots import RunFolder
 from learning.training import Schedule, TrainConfig, train
@@ -154,6 +156,27 @@ def test_a_run_is_reported_once(run: RunFolder, capsys: pytest.CaptureFixture[st
         assert all(key in row for row in (*report["snapshots"].values(), report["test"]))
     again = evaluate_run(run.path, episodes=4, validation_episodes=3, workers=1)
     assert again["test"] == report["test"] and again["snapshots"] == report["snapshots"]
+
+
+def test_a_shared_run_is_the_chosen_snapshot_in_half_its_bytes(
+    run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shared = tmp_path / "shared"
+    short = ["--episodes", "2", "--validation-episodes", "2", "--workers", "1", "--json"]
+    arguments = ["eval", str(run.path), *short, "--share", str(shared)]
+    assert main(arguments) == 0
+    weights = Path(json.loads(capsys.readouterr().out)["shared"])
+    chosen = run.chosen_snapshot()
+    assert RunFolder(shared).chosen_snapshot() == weights and weights.name == chosen.name
+    assert weights.stat().st_size < 0.55 * chosen.stat().st_size
+    assert str(tmp_path) not in (shared / "run.json").read_text()
+    before, after = (load_policy(each).agent.state_dict() for each in (chosen, shared))
+    for name, each in before.items():
+        torch.testing.assert_close(after[name], each, rtol=2**-8, atol=0)
+    assert main(["eval", str(shared), *short]) == 0
+    assert json.loads(capsys.readouterr().out)["demos"] == 2
+    assert main(arguments) == 2
+    assert "exists" in capsys.readouterr().err
 
 
 def test_goals_come_from_goal_seeds(run: RunFolder) -> None:
