@@ -58,11 +58,13 @@ class CalibrateOptions(CommandOptions):
     """
 
     what: Annotated[
-        Positional[Literal["board", "lens", "table", "camera", "empty"]], arg(metavar="WHAT")
+        Positional[Literal["board", "lens", "table", "camera", "hand", "empty"]],
+        arg(metavar="WHAT"),
     ]
     """board writes the ChArUco board to print; lens measures a video device's intrinsics with it;
     table touches the foam with the closed fingers; camera finds the board, flat on the table, and
-    asks for some of its corners; empty takes a picture of the empty foam."""
+    asks for some of its corners; hand finds a camera on the hand by looking at the board from many
+    sides, and replaces camera; empty takes a picture of the empty foam."""
     robot: RobotName = "dry_run"
     """The robot that touches."""
     host: str | None = None
@@ -78,7 +80,7 @@ class CalibrateOptions(CommandOptions):
     table_z: Annotated[float | None, arg(metavar="M")] = None
     """For `table`: a height in the base frame that is certainly 1 to 3 cm below the foam's top."""
     views: Annotated[int, arg(metavar="N")] = 15
-    """For `lens`: views of the board."""
+    """For `lens` and `hand`: views of the board."""
     size: tuple[int, int] = (1280, 720)
     """For `lens`: width and height of the video device's pictures."""
     square_mm: float = 36.0
@@ -114,6 +116,8 @@ def calibrate(options: CalibrateOptions) -> Outcome:
         data = setting_up.measure_table(rig, provisional_z=options.table_z)
     elif options.what == "camera":
         data = setting_up.measure_camera(rig, board, corner_ids=options.corners)
+    elif options.what == "hand":
+        data = setting_up.measure_hand_eye(rig, board, views=options.views)
     else:
         data = setting_up.photograph_empty(rig)
     return Outcome(data=data, text="\n".join(f"{key}  {value}" for key, value in data.items()))

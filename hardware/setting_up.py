@@ -2,6 +2,9 @@
 
     board -> lens.json -> table.json -> calibration.json -> empty_view.png
 
+The camera is found by touching corners of a board that it sees from home (`measure_camera`), or by
+looking at a board that nobody touches from many sides (`measure_hand_eye`).
+
 The lens is measured for video devices alone: RealSense and Azure Kinect tell their intrinsics.
 """
 
@@ -18,9 +21,10 @@ from warp_deform.errors import InputError
 
 from .calibration import Calibration
 from .camera import Camera, CameraIntrinsics
-from .charuco import BoardSpec, Corners, calibrate_intrinsics, find_corners
+from .charuco import BoardSpec, Corners, board_pose, calibrate_intrinsics, find_corners
 from .goal_file import write_picture
-from .homography import board_on_table, fit_homography
+from .hand_eye import calibrate_hand_eye
+from .homography import board_on_table, fit_homography, plane_homography
 from .human import Terminal
 from .json_file import read_json, require, write_json
 from .panda_arm import HOME_Q
@@ -32,7 +36,8 @@ from .table_plane import TablePlane, fit_table_plane
 from .top_down_view import TopDownView
 from .touch_off import touch_off
 
-__all__ = ["measure_camera", "measure_lens", "measure_table", "photograph_empty", "print_board"]
+__all__ = ["measure_camera", "measure_hand_eye", "measure_lens", "measure_table",
+           "photograph_empty", "print_board"]  # fmt: skip
 
 _PIXELS_PER_METRE = 10_000.0  # 254 dots an inch
 _INSET = 0.05  # [m] from the workspace's rim, where the foam lies flat
@@ -165,13 +170,11 @@ def measure_camera(
             touched.append(arm.state().base_T_tcp[:2, 3])
     on_table = board_on_table(corners, board, np.array(corner_ids), np.array(touched))
     fit = fit_homography(corners.pixels, on_table, frame.intrinsics)
-    calibration = Calibration(
-        robot_id=f"{config.robot} {config.host or ''}".strip(),
-        camera_id=f"{config.camera} {config.device or ''}".strip(),
-        home_q=np.array(HOME_Q),
-        intrinsics=frame.intrinsics,
-        base_H_pixel=fit.base_H_pixel,
-        table=table,
+    calibration = _calibration(
+        config,
+        frame.intrinsics,
+        fit.base_H_pixel,
+        table,
         method="charuco",
         error_m=fit.error_m,
         details={"board": board.to_record(), "report": fit.report()},
@@ -180,6 +183,75 @@ def measure_camera(
     calibration.save(path)
     write_picture(config.setup / "board_seen.png", _marked(frame.rgb, corners.pixels))
     return {"calibration": path, "report": fit.report(), "error_m": fit.error_m}
+
+
+def measure_hand_eye(
+    config: RigConfig,
+    board: BoardSpec,
+    *,
+    views: int = 15,
+    camera: Camera | None = None,
+    robot: SafeRobot | None = None,
+    operator: Terminal | None = None,
+) -> dict[str, Any]:
+    """Find a camera on the hand from pictures of a board that stands still; save.
+
+    A person guides the hand from one view to the next; from the last the arm goes home. The table
+    in the camera's picture from there follows from its height.
+
+    Raises:
+        InputError: stopped, or the board does not stand still to 4 mm rms
+        RobotError, CameraError: robot or camera fail
+    """
+    operator = operator or Terminal()
+    table = _table(config.setup / "table.json")
+    if robot is None and (config.robot not in REAL_ROBOTS or not config.execute):
+        raise InputError("calibrating the hand moves an arm: give --robot panda and --execute")
+    limits = SafetyLimits(table=table, max_joint_speed=config.joint_speed)
+    lens = read_intrinsics(config.setup / "lens.json") if config.camera == "uvc" else None
+    hands: list[np.ndarray] = []
+    seen: list[np.ndarray] = []
+    with (
+        robot or SafeRobot(open_robot(config), limits) as arm,
+        camera or open_camera(config, lens) as device,
+    ):
+        while len(seen) < views:
+            text = (
+                f"view {len(seen) + 1} of {views}: guide the hand so that it sees the board from "
+                "elsewhere, tilted by some 25 degrees, and hold still"
+            )
+            if not operator.wait(text):
+                raise InputError("stopped before all views were taken; nothing was written")
+            frame = device.read()
+            try:
+                found = board_pose(find_corners(frame.rgb, board), board, frame.intrinsics)
+            except InputError as error:
+                operator.wait(str(error))
+                continue
+            hands.append(arm.state().base_T_tcp)
+            seen.append(found)
+        hand_eye = calibrate_hand_eye(np.array(hands), np.array(seen))
+        if not operator.wait("the arm now goes home"):
+            raise InputError("stopped; nothing was written")
+        arm.home()
+        base_T_camera = arm.state().base_T_tcp @ hand_eye.tcp_T_camera
+        intrinsics = device.read().intrinsics
+    calibration = _calibration(
+        config,
+        intrinsics,
+        plane_homography(intrinsics, base_T_camera, table),
+        table,
+        method="hand-eye",
+        error_m=hand_eye.error_m,
+        details={
+            "board": board.to_record(),
+            "report": hand_eye.report(),
+            "tcp_T_camera": hand_eye.tcp_T_camera.tolist(),
+        },
+    )
+    path = config.setup / "calibration.json"
+    calibration.save(path)
+    return {"calibration": path, "report": hand_eye.report(), "error_m": hand_eye.error_m}
 
 
 def photograph_empty(config: RigConfig) -> dict[str, Any]:
@@ -195,6 +267,29 @@ def photograph_empty(config: RigConfig) -> dict[str, Any]:
     path = config.setup / "empty_view.png"
     write_picture(path, view)
     return {"empty": path}
+
+
+def _calibration(
+    config: RigConfig,
+    intrinsics: CameraIntrinsics,
+    base_H_pixel: np.ndarray,
+    table: TablePlane,
+    *,
+    method: str,
+    error_m: float,
+    details: dict[str, Any],
+) -> Calibration:
+    return Calibration(
+        robot_id=f"{config.robot} {config.host or ''}".strip(),
+        camera_id=f"{config.camera} {config.device or ''}".strip(),
+        home_q=np.array(HOME_Q),
+        intrinsics=intrinsics,
+        base_H_pixel=base_H_pixel,
+        table=table,
+        method=method,
+        error_m=error_m,
+        details=details,
+    )
 
 
 def _table(path: Path) -> TablePlane:

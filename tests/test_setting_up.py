@@ -1,0 +1,106 @@
+"""The camera on the hand, found by a person who guides it around a board."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from board_photographs import BOARD, INTRINSICS, TABLE, photograph, rotation, transform
+from safety_spy import ARM, HOME, SpyRobot
+
+from hardware.calibration import Calibration
+from hardware.camera import Frame
+from hardware.homography import plane_homography
+from hardware.human import Terminal
+from hardware.rig_config import RigConfig
+from hardware.safety import SafeRobot
+from hardware.safety_limits import SafetyLimits
+from hardware.setting_up import measure_hand_eye
+from warp_deform.errors import InputError
+
+TCP_T_CAMERA = transform(rotation(0.02, -0.03, 0.05), [0.05, 0.0, -0.06])
+VIEWS = 10
+
+
+class GuidedRobot(SpyRobot):
+    """An arm that a person guides to another posture whenever the operator is asked."""
+
+    def guide(self, rng: np.random.Generator) -> None:
+        self.q = HOME + rng.uniform(-0.08, 0.08, 7)
+        self.q[4:6] += rng.uniform(-0.35, 0.35, 2)
+
+
+class HandCamera:
+    """Sees the board from the arm's hand."""
+
+    def __init__(self, robot: SpyRobot, rng: np.random.Generator) -> None:
+        self.robot, self.rng = robot, rng
+        x, y, _ = (ARM.pose(HOME) @ TCP_T_CAMERA)[:3, 3]
+        self.base_T_board = transform(rotation(np.pi, 0, 0), [x - 0.08, y + 0.06, TABLE.height_m])
+
+    def read(self) -> Frame:
+        camera = self.robot.state().base_T_tcp @ TCP_T_CAMERA
+        rgb = photograph(self.rng, np.linalg.inv(camera) @ self.base_T_board)
+        return Frame(rgb, None, INTRINSICS, 0.0)
+
+    def close(self) -> None:
+        pass
+
+    def __enter__(self) -> HandCamera:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def setup(folder: Path) -> RigConfig:
+    (folder / "table.json").write_text(
+        json.dumps(
+            {
+                "schema": 1,
+                "height_m": TABLE.height_m,
+                "slope_x": TABLE.slope_x,
+                "slope_y": TABLE.slope_y,
+            }
+        )
+    )
+    return RigConfig(setup=folder, camera="realsense")
+
+
+def test_a_camera_on_the_hand_is_found(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    robot = GuidedRobot()
+    said: list[str] = []
+
+    def guide(text: str) -> str:
+        said.append(text)
+        robot.guide(rng)
+        return ""
+
+    found = measure_hand_eye(
+        setup(tmp_path), BOARD, views=VIEWS, camera=HandCamera(robot, rng),
+        robot=SafeRobot(robot, SafetyLimits(table=TABLE)), operator=Terminal(guide),
+    )  # fmt: skip
+    assert len(said) >= VIEWS + 1 and "home" in said[-1] and robot.log.count("move_joints") == 1
+    calibration = Calibration.load(tmp_path / "calibration.json")
+    assert calibration.method == "hand-eye" and found["error_m"] < 1e-3
+    H = plane_homography(INTRINSICS, ARM.pose(HOME) @ TCP_T_CAMERA, TABLE)
+    pixels = np.array([[300.0, 200.0], [900.0, 200.0], [900.0, 500.0], [300.0, 500.0], [640, 360]])
+    at = [np.column_stack([pixels, np.ones(5)]) @ each.T for each in (calibration.base_H_pixel, H)]
+    mine, true = (each[:, :2] / each[:, 2:] for each in at)
+    assert np.linalg.norm(mine - true, axis=1).max() < 1.5e-3
+
+
+def test_stopping_writes_nothing(tmp_path: Path) -> None:
+    robot = GuidedRobot()
+    config = setup(tmp_path)
+    safe = SafeRobot(robot, SafetyLimits(table=TABLE))
+    camera = HandCamera(robot, np.random.default_rng(0))
+    with pytest.raises(InputError, match="nothing was written"):
+        measure_hand_eye(config, BOARD, camera=camera, robot=safe, operator=Terminal(lambda _: "q"))
+    with pytest.raises(InputError, match="--execute"):
+        measure_hand_eye(config, BOARD)
+    assert [path.name for path in tmp_path.iterdir()] == ["table.json"]
+    assert not robot.joints and not robot.lines
