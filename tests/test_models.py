@@ -72,8 +72,9 @@ def test_single_precision_gradients_agree_with_double() -> None:
         assert (ours.grad - exact.grad).abs().max() <= 1e-4 * exact.grad.abs().max()
 
 
-def test_receptive_span_is_what_gradients_reach() -> None:
-    network = ResNet43(1, 1, width=0.01, generator=generator())
+@pytest.mark.parametrize("skips", [False, True])
+def test_receptive_span_is_what_gradients_reach(skips: bool) -> None:
+    network = ResNet43(1, 1, width=0.01, skips=skips, generator=generator())
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.abs_()  # no ReLU stops a gradient
@@ -83,6 +84,21 @@ def test_receptive_span_is_what_gradients_reach() -> None:
         (gradient,) = torch.autograd.grad(y[0, 0, row].sum(), x, retain_graph=True)
         reached = torch.nonzero(gradient[0, 0].sum(dim=1)).flatten()
         assert (int(reached[0]), int(reached[-1]) + 1) == receptive_span(row, row + 1)
+
+
+def test_skips_leave_the_rest_as_it_was() -> None:
+    """Laterals are drawn last, so networks with and without begin with the same weights."""
+    plain, skipping = (
+        ResNet43(6, 1, width=0.25, skips=each, generator=generator()) for each in (False, True)
+    )
+    for before, after in zip(plain.convolutions(), skipping.convolutions(), strict=False):
+        assert torch.equal(before.weight, after.weight)
+    x = torch.rand(1, 6, 16, 24, generator=generator())
+    assert not torch.equal(plain(x), skipping(x))
+    with torch.no_grad():
+        for lateral in skipping.laterals:
+            lateral.weight.zero_()
+    assert torch.equal(plain(x), skipping(x))
 
 
 def test_image_sides_must_be_multiples_of_eight() -> None:
@@ -195,7 +211,7 @@ def test_crop_reach_bounds_what_is_sampled() -> None:
 )
 def test_window_of_the_query_changes_nothing(picks: list[list[int]], n_rotations: int) -> None:
     g = generator(3)
-    transport = Transport(crop=16, width=0.125, exact=True, generator=g)
+    transport = Transport(crop=16, width=0.125, skips=n_rotations == 5, exact=True, generator=g)
     image = (
         torch.rand(2, 4, 320, 80, generator=g) * torch.tensor([255, 255, 255, 0.1])[:, None, None]
     )

@@ -28,6 +28,7 @@ class Attention(nn.Module):
     Args:
         images: k, 2 where the goal's image is stacked below the current one
         width: channels relative to the original's
+        skips: see `ResNet43`
         exact: pad to a square, as the original does
         bfloat16: convolve in bfloat16
         generator: draws the initial weights
@@ -38,13 +39,16 @@ class Attention(nn.Module):
         *,
         images: int = 1,
         width: float = 1.0,
+        skips: bool = False,
         exact: bool = False,
         bfloat16: bool = False,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.exact = exact
-        self.network = ResNet43(6 * images, 1, width=width, bfloat16=bfloat16, generator=generator)
+        self.network = ResNet43(
+            6 * images, 1, width=width, skips=skips, bfloat16=bfloat16, generator=generator
+        )
 
     def forward(self, image: Tensor) -> Tensor:
         """Pick logits (B, H, W) of raw images (B, 4 k, H, W)."""

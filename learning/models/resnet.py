@@ -30,6 +30,8 @@ STRIDE = 8
 """Height and width of an input are multiples of this [pixels]: the smallest map has 1/8 of them."""
 _CHANNELS = (64, 128, 256, 512)
 _HEAD_CHANNELS = 16
+_GROWING = 3
+"""Stages at the end that double the map; as many at the beginning halve it or keep it whole."""
 
 
 class ResNet43(nn.Module):
@@ -42,6 +44,7 @@ class ResNet43(nn.Module):
         in_channels: channels of the image
         out_channels: channels of the map
         width: channels relative to the original's
+        skips: join finer features to the coarse ones that grow, as U-Nets do (ours)
         bfloat16: convolve in bfloat16 (weights, gradients and the returned map stay float32)
         generator: draws the initial weights
 
@@ -55,6 +58,7 @@ class ResNet43(nn.Module):
         out_channels: int,
         *,
         width: float = 1.0,
+        skips: bool = False,
         bfloat16: bool = False,
         generator: torch.Generator,
     ) -> None:
@@ -76,12 +80,18 @@ class ResNet43(nn.Module):
                 _Stage(c1, _HEAD_CHANNELS, out_channels, upsample=True, activate=False),
             ]
         )
+        self.laterals = nn.ModuleList(
+            [_convolution(*c, 1) for c in ((c3, c2), (c2, c1), (c1, _HEAD_CHANNELS)) if skips]
+        )
         for convolution in self.convolutions():
             nn.init.xavier_uniform_(convolution.weight, generator=generator)
             nn.init.zeros_(convolution.bias)
 
     def convolutions(self) -> list[nn.Conv2d]:
-        """In order: the stem; for every stage 1x1, 3x3, 1x1, shortcut, then 1x1, 3x3, 1x1."""
+        """In order: the stem; for every stage 1x1, 3x3, 1x1, shortcut, then 1x1, 3x3, 1x1.
+
+        With `skips`, three 1x1 come last.
+        """
         return [module for module in self.modules() if isinstance(module, nn.Conv2d)]
 
     def forward(self, x: Tensor) -> Tensor:
@@ -95,8 +105,13 @@ class ResNet43(nn.Module):
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.bfloat16):
             x = functional.relu(self.stem(x), inplace=True)
-            for stage in self.stages:
+            finer: list[Tensor] = []
+            for stage in self.stages[:-_GROWING]:
                 x = stage(x)
+                finer.append(x)
+            for k, stage in enumerate(self.stages[-_GROWING:]):
+                lateral = self.laterals[k](finer[_GROWING - 1 - k]) if self.laterals else None
+                x = stage(x, lateral)
         return x.float()
 
 
@@ -125,8 +140,8 @@ class _Stage(nn.Module):
         )
         self.identity = _Block(out_channels, middle, out_channels, activate=activate)
 
-    def forward(self, x: Tensor) -> Tensor:
-        y: Tensor = self.identity(self.project(x))
+    def forward(self, x: Tensor, lateral: Tensor | None = None) -> Tensor:
+        y: Tensor = self.identity(self.project(x, lateral))
         return y
 
 
@@ -156,7 +171,8 @@ class _Block(nn.Module):
         self.upsample = upsample
         self.activate = activate
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, lateral: Tensor | None = None) -> Tensor:
+        """`lateral` (B, middle, H, W) joins the bottleneck before its 3x3 convolution."""
         if self.stride > 1:
             # In place of convolutions with a stride: for fewer than 16 channels stored last, their
             # weight gradient writes out of bounds (uxlfoundation/oneDNN issue 6035, torch 2.13).
@@ -167,6 +183,8 @@ class _Block(nn.Module):
             x = self.shortcut(x)
         if self.upsample:
             x, y = _twice(x), _twice(y)
+        if lateral is not None:
+            y = y + lateral
         y = functional.relu(self.spatial(functional.relu(y, inplace=True)), inplace=True)
         y = self.expand(y) + x
         return functional.relu(y, inplace=True) if self.activate else y

@@ -37,6 +37,7 @@ class Transport(nn.Module):
         crop_before_query: run the query network on rotated crops of the image, as the first
             Transporters did; else rotate and crop its features, as the paper's
         width: channels relative to the original's
+        skips: see `ResNet43`
         gain: what place logits are multiplied by
         exact: correlate directly, as the original does
         bfloat16: convolve in bfloat16; the correlation stays float32
@@ -50,6 +51,7 @@ class Transport(nn.Module):
         crop: int = 64,
         crop_before_query: bool = False,
         width: float = 1.0,
+        skips: bool = False,
         gain: float = 1.0,
         exact: bool = False,
         bfloat16: bool = False,
@@ -61,7 +63,14 @@ class Transport(nn.Module):
         self.gain = gain
         self.exact = exact
         self.key, self.query = (
-            ResNet43(6 * images, _FEATURES, width=width, bfloat16=bfloat16, generator=generator)
+            ResNet43(
+                6 * images,
+                _FEATURES,
+                width=width,
+                skips=skips,
+                bfloat16=bfloat16,
+                generator=generator,
+            )
             for _ in range(2)
         )
 
@@ -94,6 +103,7 @@ class TransportGoalSplit(nn.Module):
         *,
         crop: int = 64,
         width: float = 1.0,
+        skips: bool = False,
         gain: float = 1.0,
         goal_bias: float = 0.0,
         exact: bool = False,
@@ -105,7 +115,7 @@ class TransportGoalSplit(nn.Module):
         self.gain, self.goal_bias = gain, goal_bias
         self.exact = exact
         self.key, self.query, self.goal = (
-            ResNet43(6, _FEATURES, width=width, bfloat16=bfloat16, generator=generator)
+            ResNet43(6, _FEATURES, width=width, skips=skips, bfloat16=bfloat16, generator=generator)
             for _ in range(3)
         )
 

@@ -47,6 +47,8 @@ class TransporterConfig:
     """Camera pixels along the side of a network pixel: 1 for 320 x 160, 2 for 160 x 80."""
     width: float = 1.0
     """Channels relative to the original's."""
+    skips: bool = False
+    """Finer features join the coarse ones that grow, see `ResNet43`: picks become sharp."""
     crop: int = 64
     """Side of the crop around the pick [network pixels]; 64 are 0.2 m at scale 1."""
     crop_before_query: bool | None = None
@@ -97,7 +99,7 @@ PRESETS = {
     "paper": TransporterConfig(),
     # A step costs nearly 30 times less CPU time than the paper's (benchmarks/models.py).
     "fast": TransporterConfig(
-        scale=2, width=0.25, crop=32, gain=100.0, goal_bias=1.0, n_rotations_train=1
+        scale=2, width=0.25, skips=True, crop=32, gain=100.0, goal_bias=1.0, n_rotations_train=1
     ),
 }
 
@@ -172,6 +174,7 @@ class Transporter(nn.Module):
         self.attention = Attention(
             images=self.pictures,
             width=config.width,
+            skips=config.skips,
             exact=config.exact,
             bfloat16=config.bfloat16,
             generator=generator,
@@ -190,6 +193,7 @@ class Transporter(nn.Module):
             crop=config.crop,
             crop_before_query=self.crop_before_query if before is None else before,
             width=config.width,
+            skips=config.skips,
             gain=config.gain,
             exact=config.exact,
             bfloat16=config.bfloat16,
@@ -287,6 +291,7 @@ class GoalSplit(Transporter):
         return TransportGoalSplit(
             crop=config.crop,
             width=config.width,
+            skips=config.skips,
             gain=config.gain,
             goal_bias=config.goal_bias,
             exact=config.exact,
