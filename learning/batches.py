@@ -15,7 +15,10 @@ from .dataset import Demonstrations
 from .models.gt_state import encode_action
 from .models.transporter import Batch, Transporter
 
-__all__ = ["image_batch", "state_batch", "task_lifts"]
+__all__ = ["StateBatch", "check_lifts", "image_batch", "state_batch", "task_lifts"]
+
+_LIFT_GAP = 0.015
+"""Lifts of one stage may differ by this [m]: a robot lifts 1 cm less to carry over short ways."""
 
 StateBatch = tuple[Tensor, Tensor, Tensor]
 """States (B, D), encoded actions (B, 6), lift indices (B,)."""
@@ -31,6 +34,18 @@ def task_lifts(task: Task) -> tuple[float, ...]:
     return tuple(sorted({stage.lift for stage in task.stages}))
 
 
+def check_lifts(data: Demonstrations) -> None:
+    """See that every action's lift is that of a stage of the task.
+
+    Raises:
+        InputError: one is not.
+    """
+    lifts = task_lifts(data.task)
+    for name, actions in data.actions():
+        for action in actions:
+            _lift_index(action, lifts, what=name)
+
+
 def image_batch(
     data: Demonstrations,
     agent: Transporter,
@@ -42,7 +57,7 @@ def image_batch(
     """`count` moments, drawn and moved by `rng`, as an agent over pictures sees them.
 
     Raises:
-        InputError: a pick or place is out of view.
+        InputError: a pick or place is out of view, or a lift is no stage's.
     """
     images, picks, places, thetas, lifts = [], [], [], [], []
     grid, copies = data.task.grid, data.task.rotated_copies
@@ -81,7 +96,11 @@ def state_batch(
     rng: np.random.Generator,
     augment: bool = True,
 ) -> StateBatch:
-    """`count` moments, drawn and moved by `rng`, as a ground-truth baseline sees them."""
+    """`count` moments, drawn and moved by `rng`, as a ground-truth baseline sees them.
+
+    Raises:
+        InputError: a lift is no stage's.
+    """
     states, actions = [], []
     for _ in range(count):
         state, action = data.state(*data.draw(rng))
@@ -97,5 +116,14 @@ def state_batch(
     return torch.from_numpy(np.stack(states)), torch.from_numpy(target), indices
 
 
-def _lift_index(action: np.ndarray, lifts: tuple[float, ...]) -> int:
-    return int(np.abs(np.array(lifts) - action[6]).argmin())
+def _lift_index(
+    action: np.ndarray, lifts: tuple[float, ...], *, what: str = "a demonstration"
+) -> int:
+    gaps = np.abs(np.array(lifts) - action[6])
+    if not gaps.min() <= _LIFT_GAP:  # or it is not a number
+        stages = ", ".join(f"{lift:g}" for lift in lifts)
+        raise InputError(
+            f"{what} lifts to {action[6]:g} m; the task's stages lift to {stages} m, and an agent "
+            "learns these alone"
+        )
+    return int(gaps.argmin())

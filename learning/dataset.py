@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import os
 import secrets
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,10 @@ __all__ = ["Demonstrations", "Moment", "choose"]
 
 _FOLDER = "rows"
 _FORMAT = 1
+_IMPORTED = "original"
+"""Whose the recordings of the original code are, `interchange.deformable_ravens.DEMONSTRATOR`."""
+_IMPORTED_ABOVE = {"bag-color-goal": 0.5}
+"""Scores that the original code's recordings of a task must exceed to be kept."""
 
 
 class Moment(NamedTuple):
@@ -74,6 +79,10 @@ class Demonstrations:
     Pictures stay on the disk: one moment takes two reads, and memory holds only actions and
     ground truth. Building reads each chosen episode once, unless the cache has it.
 
+    Recordings that were imported from the original code count as it counts them: it keeps failed
+    ones, but in bag-color-goal those alone that score above 0.5. Imported ones that do not count,
+    and those without an action, are left out (`left_out` says how many).
+
     Args:
         folder: what `warp-deform demo` wrote
         task: the task that must be in it
@@ -82,24 +91,32 @@ class Demonstrations:
 
     Raises:
         InputError: no folder, another task's episodes, failures among them, or too few.
+
+    Source: Seita et al., ICRA 2021, code that records demonstrations.
     """
 
     def __init__(self, folder: Path, *, task: str, count: int | None = None, seed: int = 0) -> None:
         self.task = find_task(task)
         reader = EpisodeReader(Path(folder))
         index = read_index(Path(folder))["episodes"]
-        for name, entry in index.items():
+        seeds: list[int] = []
+        for name, entry in sorted(index.items()):
             if entry["task"] != task:
                 raise InputError(
                     f"{Path(folder) / name} is an episode of {entry['task']}, not of {task}; "
                     "name the folder of its demonstrations"
                 )
-            if not entry["success"] or entry["actions"] == 0:
+            if _counts(entry):
+                seeds.append(entry["seed"])
+            elif entry["demonstrator"] != _IMPORTED:
                 raise InputError(
                     f"{Path(folder) / name} is no successful demonstration; train on a folder "
                     "that `warp-deform demo` wrote"
                 )
-        self.seeds = choose(reader.seeds, len(reader) if count is None else count, seed=seed)
+        self.left_out = len(reader) - len(seeds)
+        if not seeds:
+            raise InputError(f"{folder}: none of its {len(reader)} episodes is a demonstration")
+        self.seeds = choose(tuple(seeds), len(seeds) if count is None else count, seed=seed)
         self.seals = tuple(index[episode_name(number)]["seal"] for number in self.seeds)
         cache = Path(folder) / _FOLDER
         self._episodes = [
@@ -111,14 +128,28 @@ class Demonstrations:
         """Number of demonstrations."""
         return len(self._episodes)
 
+    def actions(self) -> Iterator[tuple[str, np.ndarray]]:
+        """Of every demonstration the name of its file, and its actions (T, 7)."""
+        for seed, episode in zip(self.seeds, self._episodes, strict=True):
+            yield episode_name(seed), episode.actions
+
     def lengths(self) -> list[int]:
         """Actions of every demonstration."""
         return [len(episode.actions) for episode in self._episodes]
 
     @property
     def state_size(self) -> int:
-        """Length of a ground-truth state."""
-        return int(self._episodes[0].ground_truth.shape[1])
+        """Length of a ground-truth state.
+
+        Raises:
+            InputError: the recordings have none, as those of robots and of the original code.
+        """
+        size = int(self._episodes[0].ground_truth.shape[1])
+        if size == 0:
+            raise InputError(
+                "these demonstrations hold no ground truth; train an agent that sees pictures"
+            )
+        return size
 
     def draw(self, rng: np.random.Generator) -> tuple[int, int]:
         """A demonstration and one of its moments: first the one, then the other, both uniformly.
@@ -153,6 +184,16 @@ class Demonstrations:
             half = len(state) // 2
             state[half:] = found.ground_truth[-1, :half]
         return state, found.actions[t]
+
+
+def _counts(entry: Mapping[str, Any]) -> bool:
+    """Whether an episode, as the index has it, is a demonstration."""
+    if entry["actions"] == 0:
+        return False
+    if entry["demonstrator"] != _IMPORTED:
+        return bool(entry["success"])
+    least = _IMPORTED_ABOVE.get(entry["task"])
+    return least is None or entry["score"] > least
 
 
 def _open(reader: EpisodeReader, seed: int, path: Path) -> _Rows:

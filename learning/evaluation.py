@@ -1,123 +1,45 @@
 """Evaluation: which snapshot is best on validation seeds, and how good it is on test seeds.
 
-Seeds of validation (50,000 and up), test (10,000 and up) and goals (100,000 and up) are apart from
-those of training. A snapshot is chosen on validation seeds and then plays the test seeds once. The
-paper's own protocol, the best of ten snapshots on the test seeds themselves, is a second, labelled
-result: it is optimistic.
+A snapshot is chosen on validation seeds and then plays the test seeds once. The paper's own
+protocol, the best of ten snapshots on the test seeds themselves, is a second, labelled result: it
+is optimistic.
 
 Source: Seita et al., ICRA 2021, sections on training and evaluation; Wilson, JASA 1927.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
 
-from warp_deform.episode_loop import SOLVED, Run, play, worlds_for
-from warp_deform.episodes import EpisodeReader, Goal, combine_hashes, versions
+from warp_deform.episode_loop import SLOTS, worlds_for
+from warp_deform.episodes import EpisodeReader, combine_hashes, versions
 from warp_deform.errors import InputError
-from warp_deform.goals import GOAL_SEED, load_goals, make_goals
-from warp_deform.tasks.registry import task as find_task
-from warp_deform.tasks.task import Stage
 from warp_deform.workers import Workers
-from warp_deform.worlds import Worlds
-from warp_deform.wrappers import stage_at
 
-from .failures import bag_opening, failure
-from .policy import (
-    AgentDescription,
-    ImagePolicy,
-    Policy,
-    RetryingPolicy,
-    StatePolicy,
-    load_policy,
-)
-from .snapshots import RunFolder, read_json, read_snapshot, write_json
+from .paper_results import partial_credit
+from .playing import Played, play_policy
+from .policy import ImagePolicy, StatePolicy, load_policy
+from .protocol import Protocol, goals_for, goals_of
+from .snapshots import Fields, RunFolder, check_fields, read_json, read_record, write_json
 
-__all__ = ["PARTIAL_CREDIT", "UNCLASSIFIED", "Evaluation", "Measured", "Played", "Protocol",
-           "best", "check_goals", "evaluate_snapshot", "goal_distance", "goals_for", "known",
-           "play_policy", "summarise"]  # fmt: skip
+__all__ = ["UNCLASSIFIED", "Evaluation", "best", "evaluate_snapshot", "known", "measure",
+           "stopped_early", "summarise", "trained_steps", "wilson"]  # fmt: skip
 
-FIRST_SEED = {"validation": 50_000, "test": 10_000}
-PARTIAL_CREDIT = frozenset(
-    {
-        "cable-shape", "cable-shape-notarget", "cable-line-notarget", "fabric-flat",
-        "fabric-flat-notarget", "bag-color-goal",
-    }
-)  # fmt: skip
-"""Tasks whose result in the paper's table is the mean score; that of the others is successes."""
 UNCLASSIFIED = "unclassified"
 """Failures of results that an earlier release stored, which did not say why."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Protocol:
-    """What a snapshot plays.
-
-    split: "validation" or "test", whose seeds are played
-    episodes: their number, from the split's first seed on
-    goals: "constructed": for validation from the episode's own seed, for test from goal seeds;
-        "demonstrated": ends of demonstrations on goal seeds, the paper's
-    n_goals: goals that the test episodes share in turn
-    goal_folder: a folder of goals that the test episodes share in turn instead
-    stage_rule: who chooses the lift, "action" (the policy) or "privileged" (the paper's hidden
-        rule, which reads the simulator)
-    retry: whether agents over pictures pick elsewhere after an action that changed nothing that
-        they see, see `policy.RetryingPolicy`; the paper's do not
-    """
-
-    split: Literal["validation", "test"]
-    episodes: int
-    goals: Literal["constructed", "demonstrated"] = "constructed"
-    n_goals: int = 200
-    goal_folder: Path | None = None
-    stage_rule: Literal["action", "privileged"] = "action"
-    retry: bool = True
-    robot: str = "ur5"
-
-    def __post_init__(self) -> None:
-        if self.episodes < 1 or self.n_goals < 1:
-            raise InputError(f"episodes is {self.episodes}; it must be 1 or more")
-
-    @property
-    def seeds(self) -> range:
-        """Seeds of the episodes."""
-        first = FIRST_SEED[self.split]
-        return range(first, first + self.episodes)
-
-
-@dataclass(frozen=True)
-class Played:
-    """One episode. score: at its end, 0 if its physics cannot be trusted; reason: why it ended.
-
-    failure: which of `failures.FAILURES` it is; None if solved, or stored by an earlier release
-    goal_l2: for goal-conditioned tasks, `goal_distance` at the start and after every action
-    """
-
-    seed: int
-    success: bool
-    score: float
-    actions: int
-    reason: str
-    failure: str | None = None
-    goal_l2: tuple[float, ...] | None = None
-
-
-class Measured(NamedTuple):
-    """What evaluation takes down of a state: score, distance to the goal, opening of a bag."""
-
-    score: float
-    goal_l2: float | None
-    opening: float | None
+_CHUNK = 2 * SLOTS
+"""Episodes that a process is given at a time: what a kill loses, against idle lanes at the end."""
 
 
 @dataclass(frozen=True)
@@ -138,45 +60,79 @@ def evaluate_snapshot(
     interruption changes a result.
 
     Raises:
-        InputError: there is no such snapshot, or it cannot play this.
+        InputError: there is no such snapshot, it cannot play this, or a file is damaged.
     """
-    description = AgentDescription(**read_snapshot(run.snapshot(step))[1]["agent"])
-    path = _path(run, step, protocol)
-    done = {} if not path.exists() else {e["seed"]: e for e in read_json(path)["episodes"]}
-    missing = [seed for seed in protocol.seeds if seed not in done]
+    kept = _Kept(run, step, protocol)
+    missing = [seed for seed in protocol.seeds if seed not in kept.played]
     if missing:
-        goals = goals_for(run, description.task, protocol)
-        crew = Workers(min(workers, len(missing)))
-        size = math.ceil(len(missing) / crew.count)
+        goals = goals_for(run, kept.task, protocol)
+        count = min(workers, len(missing))
+        size = math.ceil(len(missing) / count)
+        if count > 1:  # results of other processes come a chunk at a time
+            size = min(size, _CHUNK)
         chunks = [
-            _Chunk(
-                run.snapshot(step), description.task, protocol, goals, tuple(missing[i : i + size])
-            )
+            _Chunk(run.snapshot(step), kept.weights, protocol, goals, tuple(missing[i : i + size]))
             for i in range(0, len(missing), size)
         ]
-        run.evaluations.mkdir(exist_ok=True)
-        with crew:
+        with Workers(count) as crew:
             for played in crew.run(_play_chunk, chunks):
-                done[played.seed] = asdict(played)
-                record = _identity(run, step, protocol)
-                write_json(path, {**record, "episodes": [done[seed] for seed in sorted(done)]})
-    episodes = tuple(_played(done[seed]) for seed in protocol.seeds)
-    return Evaluation(step, episodes, summarise(episodes, task=description.task))
+                kept.add(played)
+    episodes = tuple(kept.played[seed] for seed in protocol.seeds)
+    return Evaluation(step, episodes, summarise(episodes, task=kept.task))
 
 
 def known(run: RunFolder, step: int, protocol: Protocol) -> bool:
     """Whether a snapshot has played all of a protocol."""
-    path = _path(run, step, protocol)
-    if not path.exists():
+    return _Kept(run, step, protocol).whole
+
+
+def stopped_early(run: RunFolder) -> bool:
+    """Whether a run's validation brought nothing better for as long as its `patience` allows.
+
+    By what is kept in the folder, for the versions that trained; nothing is played.
+
+    Raises:
+        InputError: this is no run's folder, or a file is damaged.
+    """
+    settings = run.read_settings()
+    patience, episodes = settings.get("patience"), settings.get("validate", 0)
+    if patience is None or not episodes:
         return False
-    return {e["seed"] for e in read_json(path)["episodes"]} >= set(protocol.seeds)
+    protocol = Protocol(split="validation", episodes=episodes)
+    values = []
+    for step in filter(None, run.steps()):
+        kept = _Kept(run, step, protocol, by=settings.get("versions"))
+        if kept.whole:
+            found = summarise([kept.played[seed] for seed in protocol.seeds], task=kept.task)
+            values.append(found[measure(kept.task)])
+    return len(values) - 1 - int(np.argmax(values or [0])) >= patience
+
+
+def trained_steps(run: RunFolder) -> int:
+    """Steps that a run was trained for; of one that was handed on, those of the original.
+
+    Raises:
+        InputError: its training has not come to its end, or a file is damaged.
+    """
+    settings, steps = run.read_settings(), run.steps()
+    planned = int(settings["schedule"]["steps"])
+    if not any(steps):
+        raise InputError(f"{run.path} has no snapshot yet; run `warp-deform train` to its end")
+    if "rounded" in settings:
+        return int(settings.get("trained_steps", planned))
+    if steps[-1] < planned and not stopped_early(run):
+        raise InputError(
+            f"{run.path} is trained for {steps[-1]} of {planned} steps; run `warp-deform train` "
+            "to its end"
+        )
+    return steps[-1]
 
 
 def best(evaluations: Sequence[Evaluation], *, task: str) -> Evaluation:
     """The evaluation with the best result; of equals that with fewer actions, then the latest."""
 
     def rank(each: Evaluation) -> tuple[float, float, int]:
-        return each.summary[_measure(task)], -each.summary["mean_actions"], each.step
+        return each.summary[measure(task)], -each.summary["mean_actions"], each.step
 
     return max(evaluations, key=rank)
 
@@ -186,12 +142,11 @@ def summarise(episodes: Sequence[Played], *, task: str) -> dict[str, Any]:
 
     n_episodes, n_success, pc_success [%], pc_success_ci95: Wilson's interval [%], mean_score in
     [0, 1] with its standard_error, mean_actions, mean_actions_solved (of successes, None without),
-    paper_value [%]: what the paper's table calls success, see `PARTIAL_CREDIT`
+    paper_value [%]: what the paper's table calls success, see `partial_credit`
     failures: how often each of `failures.FAILURES` happened, and `UNCLASSIFIED`
     goal_l2: mean of the last states' `goal_distance`, None where there is no goal
     """
     n, solved = len(episodes), [e for e in episodes if e.success]
-    interval = binomtest(len(solved), n).proportion_ci(method="wilson")
     scores = np.array([e.score for e in episodes])
     mean, rate = float(scores.mean()), 100 * len(solved) / n
     failed = Counter(e.failure or UNCLASSIFIED for e in episodes if not e.success)
@@ -200,27 +155,38 @@ def summarise(episodes: Sequence[Played], *, task: str) -> dict[str, Any]:
         "n_episodes": n,
         "n_success": len(solved),
         "pc_success": rate,
-        "pc_success_ci95": [100 * float(interval.low), 100 * float(interval.high)],
+        "pc_success_ci95": list(wilson(len(solved), n)),
         "mean_score": mean,
         "standard_error": float(scores.std(ddof=1) / math.sqrt(n)) if n > 1 else None,
         "mean_actions": float(np.mean([e.actions for e in episodes])),
         "mean_actions_solved": float(np.mean([e.actions for e in solved])) if solved else None,
-        "paper_value": 100 * mean if task in PARTIAL_CREDIT else rate,
+        "paper_value": 100 * mean if partial_credit(task) else rate,
         "failures": dict(sorted(failed.items())),
         "goal_l2": float(np.mean(distances)) if distances else None,
     }
 
 
-def _measure(task: str) -> str:
-    return "mean_score" if task in PARTIAL_CREDIT else "pc_success"
+def measure(task: str) -> str:
+    """The key of a summary by which snapshots of a task are compared."""
+    return "mean_score" if partial_credit(task) else "pc_success"
+
+
+def wilson(successes: int, n: int) -> tuple[float, float]:
+    """Wilson's 95 % interval [%] of a share of successes.
+
+    >>> [round(bound, 1) for bound in wilson(15, 20)]
+    [53.1, 88.8]
+    """
+    interval = binomtest(successes, n).proportion_ci(method="wilson")
+    return 100 * float(interval.low), 100 * float(interval.high)
 
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Episodes for one process."""
+    """Episodes for one process. weights: hash of the snapshot's file"""
 
     snapshot: Path
-    task: str
+    weights: str
     protocol: Protocol
     goals: Path | None
     seeds: tuple[int, ...]
@@ -228,159 +194,99 @@ class _Chunk:
 
 def _play_chunk(chunk: _Chunk) -> Iterator[Played]:
     """Play episodes side by side; each is yielded when it is over."""
-    policy = load_policy(chunk.snapshot)
-    worlds = worlds_for(chunk.task, chunk.protocol.robot)
-    goals = load_goals(chunk.goals) if chunk.goals is not None else []
+    policy = _policy(chunk.snapshot, chunk.weights)
+    worlds = worlds_for(policy.description.task, chunk.protocol.robot)
+    goals = None
+    if chunk.goals is not None:
+        goals = goals_of(chunk.goals, chunk.protocol, chunk.seeds)
     for _, played, _ in play_policy(policy, worlds, chunk.protocol, chunk.seeds, goals):
         yield played
 
 
-def play_policy(
-    policy: ImagePolicy | StatePolicy,
-    worlds: Worlds,
-    protocol: Protocol,
-    seeds: Sequence[int],
-    goals: Sequence[Goal] = (),
-    *,
-    watch: Callable[[int, Mapping[str, np.ndarray], np.ndarray], None] | None = None,
-) -> Iterator[tuple[int, Played, Run[Measured]]]:
-    """Play episodes of a protocol in `worlds`; each is yielded, after its slot, when it is over.
+@functools.lru_cache(maxsize=1)
+def _policy(snapshot: Path, weights: str) -> ImagePolicy | StatePolicy:
+    """This process's policy, loaded once for all chunks."""
+    return load_policy(snapshot)
 
-    goals: shared by the split's seeds in turn; none: every seed constructs its own
-    watch: called with a slot, what is seen there, and the action chosen
+
+class _Kept:
+    """What a snapshot has played of a protocol so far, and the file that keeps it.
+
+    A file's name is that of all that its episodes depend on, not of how many were played.
+
+    by: versions of the packages that played; None for those in force
     """
-    first = FIRST_SEED[protocol.split]
-    stages: dict[int, Stage | None] = {}
-    players: dict[int, Policy] = {}
 
-    def goal(seed: int) -> Goal | None:
-        return goals[(seed - first) % len(goals)] if goals else None
+    def __init__(
+        self,
+        run: RunFolder,
+        step: int,
+        protocol: Protocol,
+        *,
+        by: Mapping[str, str] | None = None,
+    ) -> None:
+        snapshot = run.snapshot(step)
+        self.task: str = read_record(snapshot)["agent"]["task"]
+        self.weights = hashlib.blake2b(snapshot.read_bytes(), digest_size=8).hexdigest()
+        self._seeds = protocol.seeds
+        self._record = {
+            "step": step,
+            "weights": self.weights,
+            "protocol": _described(protocol, self.task),
+            "versions": versions() if by is None else dict(by),
+        }
+        text = json.dumps(self._record, sort_keys=True)
+        key = hashlib.blake2b(text.encode(), digest_size=6).hexdigest()
+        self._path = run.evaluations / f"step_{step:08d}-{protocol.split}-{key}.json"
+        self.played = _read_played(self._path)
 
-    def act(worlds: Worlds, runs: Mapping[int, Run[Measured]]) -> dict[int, np.ndarray | None]:
-        """What the policy does in every slot, one picture at a time: no neighbour changes a bit."""
-        chosen: dict[int, np.ndarray | None] = {}
-        for slot, run in runs.items():
-            if not run.actions:
-                players[slot] = _player(policy, protocol)
-            seen = _observe(worlds, slot, state=isinstance(policy, StatePolicy))
-            action = players[slot].act(seen, rng=run.rng)
-            if protocol.stage_rule == "privileged":
-                before = stages.get(slot) if run.actions else None
-                stage = stages[slot] = stage_at(worlds, slot, action[:6], before)
-                action[6] = stage.lift
-            if watch is not None:
-                watch(slot, seen, action)
-            chosen[slot] = action
-        return chosen
+    @property
+    def whole(self) -> bool:
+        """Whether all of the protocol has been played."""
+        return self.played.keys() >= set(self._seeds)
 
-    def measure(worlds: Worlds, slot: int) -> Measured:
-        episode, distance = worlds.episodes[slot], None
-        if episode.goal is not None:
-            distance = goal_distance(episode.snapshot.images.color, episode.goal.color)
-        return Measured(float(worlds.score(slot)), distance, bag_opening(worlds, slot))
-
-    for slot, run in play(worlds, seeds, act=act, look=measure, goals=goal):
-        ended = run.ended or ""
-        # an episode that ends for its physics has one row fewer and counts with nothing
-        trusted = bool(run.rows) and len(run.rows) == len(run.actions) + 1
-        distances = tuple(row.goal_l2 for row in run.rows if row.goal_l2 is not None)
-        played = Played(
-            seed=run.seed,
-            success=ended == SOLVED,
-            score=run.rows[-1].score if trusted else 0.0,
-            actions=len(run.actions),
-            reason=ended,
-            failure=failure(worlds, slot, run, [row.opening for row in run.rows]),
-            goal_l2=distances or None,
-        )
-        yield slot, played, run
+    def add(self, played: Played) -> None:
+        """Keep an episode."""
+        self.played[played.seed] = played
+        self._path.parent.mkdir(exist_ok=True)
+        episodes = [asdict(self.played[seed]) for seed in sorted(self.played)]
+        write_json(self._path, {**self._record, "episodes": episodes})
 
 
-def goal_distance(color: np.ndarray, goal: np.ndarray) -> float:
-    """Euclidean norm of the difference of two pictures (H, W, 3) uint8, over their H x W x 3.
-
-    Source: Seita et al., ICRA 2021, code of the evaluation; there the difference of bytes wraps
-    around at 256, here it has its sign.
-    """
-    difference = color.astype(np.int16) - goal.astype(np.int16)
-    return float(np.linalg.norm(difference.ravel().astype(float)) / difference.size)
-
-
-def _played(entry: Mapping[str, Any]) -> Played:
-    """An episode as a file has it, or as it was just played."""
-    distances = entry.get("goal_l2")
-    return Played(**{**entry, "goal_l2": None if distances is None else tuple(distances)})
-
-
-def _player(policy: ImagePolicy | StatePolicy, protocol: Protocol) -> Policy:
-    """Who plays one episode."""
-    if protocol.retry and isinstance(policy, ImagePolicy):
-        return RetryingPolicy(policy)
-    return policy
-
-
-def _observe(worlds: Worlds, slot: int, *, state: bool) -> dict[str, np.ndarray]:
-    """What a policy sees of a slot."""
-    episode = worlds.episodes[slot]
-    if state:
-        return {"ground_truth": worlds.task.ground_truth(episode.layout, episode.snapshot)}
-    images = episode.snapshot.images
-    seen = {"color": images.color, "height": images.height}
-    if episode.goal is not None:
-        seen |= {"goal_color": episode.goal.color, "goal_height": episode.goal.height}
-    return seen
-
-
-def goals_for(run: RunFolder, task: str, protocol: Protocol) -> Path | None:
-    """Folder of the goals to play for, made if need be; None: every seed constructs its own.
-
-    Raises:
-        InputError: the protocol's folder holds no goals of the task.
-    """
-    if protocol.goal_folder is not None and protocol.split == "test":
-        return check_goals(protocol.goal_folder, task)
-    if not find_task(task).goal_conditioned:
-        return None
-    if protocol.split == "validation" and protocol.goals == "constructed":
-        return None
-    seed = GOAL_SEED if protocol.split == "test" else FIRST_SEED["validation"]
-    count = min(protocol.n_goals, protocol.episodes)
-    folder = run.path / "goals" / f"{protocol.goals}-{seed}-{count}"
-    made = make_goals(task, folder, count=count, seed=seed, kind=protocol.goals, workers=1)
-    if made["goals"] < count:
-        raise InputError(f"only {made['goals']} of {count} goals of {task} could be made")
-    return folder
-
-
-def check_goals(folder: Path, task: str) -> Path:
-    """The folder, if it holds goals of the task.
-
-    Raises:
-        InputError: it does not, or the task has no goals.
-    """
-    if not find_task(task).goal_conditioned:
-        raise InputError(f"{task} has no goal image, so no goals can be given")
-    for info in EpisodeReader(folder).infos():
-        if info.task != task:
-            raise InputError(f"{folder} holds goals of {info.task}, not of {task}")
-    load_goals(folder)
-    return folder
-
-
-def _identity(run: RunFolder, step: int, protocol: Protocol) -> dict[str, Any]:
-    """What the results of a protocol depend on; not on how many of its episodes were played."""
-    weights = hashlib.blake2b(run.snapshot(step).read_bytes(), digest_size=8).hexdigest()
-    goals = min(protocol.n_goals, protocol.episodes) if protocol.split == "test" else None
-    described = {**asdict(protocol), "episodes": None, "n_goals": goals}
-    folder = described.pop("goal_folder")
-    if folder is not None and protocol.split == "test":
+def _described(protocol: Protocol, task: str) -> dict[str, Any]:
+    """A protocol as JSON, without what changes no episode of it."""
+    described = {**asdict(protocol), "episodes": None}
+    if not protocol.makes_goals(task):
+        described["n_goals"] = None
+    del described["goal_folder"]
+    if protocol.given is not None:
         # goals count by what they are, not by where they lie
-        shown = (info.state_hash for info in EpisodeReader(folder).infos())
-        described |= {"goals": combine_hashes(shown), "n_goals": None}
-    return {"step": step, "weights": weights, "protocol": described, "versions": versions()}
+        shown = (info.state_hash for info in EpisodeReader(protocol.given).infos())
+        described["goals"] = combine_hashes(shown)
+    return described
 
 
-def _path(run: RunFolder, step: int, protocol: Protocol) -> Path:
-    text = json.dumps(_identity(run, step, protocol), sort_keys=True)
-    key = hashlib.blake2b(text.encode(), digest_size=6).hexdigest()
-    return run.evaluations / f"step_{step:08d}-{protocol.split}-{key}.json"
+_PLAYED: Fields = {
+    "seed": int, "success": bool, "score": float, "actions": int, "reason": str,
+    "failure": (str, type(None)), "goal_l2": (list, type(None)),
+}  # fmt: skip
+
+
+def _read_played(path: Path) -> dict[int, Played]:
+    """Episodes of a file of results, by their seeds; none where there is no file."""
+    if not path.exists():
+        return {}
+    what = f"{path} is damaged, remove it to have its episodes played again"
+    record = read_json(path)
+    check_fields(record, {"episodes": list}, what=what)
+    found = {}
+    for entry in record["episodes"]:
+        check_fields({"episode": entry}, {"episode": dict}, what=what)
+        values = {"failure": None, "goal_l2": None, **entry}  # earlier releases lack them
+        check_fields(values, _PLAYED, what=what)
+        for distance in values["goal_l2"] or ():
+            check_fields({"goal_l2": distance}, {"goal_l2": float}, what=what)
+        if values["goal_l2"] is not None:
+            values["goal_l2"] = tuple(values["goal_l2"])
+        found[entry["seed"]] = Played(**{name: values[name] for name in _PLAYED})
+    return found

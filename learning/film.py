@@ -18,14 +18,16 @@ import torch
 
 from warp_deform.episode_loop import Run, worlds_for
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.goals import load_goals
-from warp_deform.rendering.pixels import world_to_pixel
+from warp_deform.rendering.pixels import PixelGrid
 from warp_deform.rendering.video import VideoWriter
+from warp_deform.tasks.registry import task as find_task
 from warp_deform.workers import single_threaded
 from warp_deform.worlds import Worlds
 
-from .evaluation import Evaluation, Measured, Played, Protocol, goals_for, play_policy
+from .evaluation import Evaluation
+from .playing import Measured, Played, play_policy
 from .policy import ImagePolicy, load_policy
+from .protocol import Protocol, goals_for, goals_of
 from .snapshots import RunFolder
 
 __all__ = ["HeatMaps", "Sight", "draw", "film_episodes", "heat_maps"]
@@ -76,7 +78,8 @@ def heat_maps(
         goal = observation["goal_color"], observation["goal_height"]
     image = agent.image((observation["color"], observation["height"]), goal)[None]
     image = image.to(next(agent.parameters()).device)
-    pick = torch.from_numpy(config.to_network(world_to_pixel(action[:2])))[None]
+    grid = find_task(policy.description.task).grid
+    pick = torch.from_numpy(config.to_network(grid.to_pixel(action[:2])))[None]
     attention = agent.attention(image).flatten().softmax(0)
     transport = agent.transport(image, pick, n_rotations=config.n_rotations_eval)
     place = transport.flatten().softmax(0).view(-1, *config.shape).amax(0)
@@ -120,7 +123,7 @@ def film_episodes(
             worlds,
             protocol,
             list(known),
-            [] if goals is None else load_goals(goals),
+            None if goals is None else goals_of(goals, protocol, list(known)),
             watch=watch,
         )
         for slot, played, episode in plays:
@@ -139,21 +142,27 @@ def film_episodes(
 
 
 def draw(
-    sight: Sight, action: np.ndarray | None, lines: tuple[str, str], *, maps: bool
+    sight: Sight,
+    action: np.ndarray | None,
+    lines: tuple[str, str],
+    *,
+    maps: bool,
+    grid: PixelGrid,
 ) -> np.ndarray:
     """One frame (H, W, 3) uint8.
 
     action: (7,) what was done, if anything; lines: title and state; maps: whether there is room for
-    heat maps, so that all frames of an episode have one size
+    heat maps, so that all frames of an episode have one size; grid: the task's, of the pictures
     """
     plain = _enlarge(sight.color, _SCALE)
-    panels = {"observation, action": _mark(plain, action, arrow=True)}
+    ends = None if action is None else _ends(action, grid)
+    panels = {"observation, action": _mark(plain, ends, arrow=True)}
     if sight.goal is not None:
         panels["goal"] = _enlarge(sight.goal, _SCALE)
     if maps:
         heat = sight.heat
-        panels["pick"] = _mark(_overlay(plain, heat.pick if heat else None), action, pick=True)
-        panels["place"] = _mark(_overlay(plain, heat.place if heat else None), action, pick=False)
+        panels["pick"] = _mark(_overlay(plain, heat.pick if heat else None), ends, pick=True)
+        panels["place"] = _mark(_overlay(plain, heat.place if heat else None), ends, pick=False)
     rows, columns = plain.shape[:2]
     width = max(len(panels) * (columns + _GAP) + _GAP, 2 * columns)
     frame = np.full((_HEADER + rows + _GAP, width, 3), _PAPER, np.uint8)
@@ -181,6 +190,7 @@ def _write_video(
     path: Path, task: str, played: Played, run: Run[Measured], seen: list[Sight]
 ) -> None:
     total, maps = len(run.actions), any(sight.heat for sight in seen)
+    grid = find_task(task).grid
     with VideoWriter(path, _FPS) as video:
         for t, sight in enumerate(seen):
             action = run.actions[t] if t < total else None
@@ -189,7 +199,7 @@ def _write_video(
             else:
                 doing = "solved" if played.success else f"failed: {played.failure}"
             lines = f"{task}, seed {played.seed}", f"score {run.rows[t].score:.3f}   {doing}"
-            frame = draw(sight, action, lines, maps=maps)
+            frame = draw(sight, action, lines, maps=maps, grid=grid)
             for _ in range(_HOLD if action is not None else 2 * _HOLD):
                 video.write(frame)
 
@@ -207,16 +217,24 @@ def _overlay(color: np.ndarray, probability: np.ndarray | None) -> np.ndarray:
     return mixed
 
 
+def _ends(action: np.ndarray, grid: PixelGrid) -> list[tuple[int, int]]:
+    """Where an action (7,) picks and places: x, y in a picture of `_SCALE` times its size."""
+    points = (grid.to_pixel(action[[0, 1, 3, 4]].reshape(2, 2)) + 0.5) * _SCALE
+    # far outside of the picture is outside of OpenCV's integers
+    return [(int(u), int(v)) for v, u in points.clip(-(2**12), 2**12)]
+
+
 def _mark(
-    picture: np.ndarray, action: np.ndarray | None, *, arrow: bool = False, pick: bool = True
+    picture: np.ndarray,
+    ends: list[tuple[int, int]] | None,
+    *,
+    arrow: bool = False,
+    pick: bool = True,
 ) -> np.ndarray:
     """A copy with an action's arrow from pick to place, or a ring around one of them."""
     picture = picture.copy()
-    if action is None:
+    if ends is None:
         return picture
-    points = (world_to_pixel(action[[0, 1, 3, 4]].reshape(2, 2)) + 0.5) * _SCALE
-    # far outside of the picture is outside of OpenCV's integers
-    ends = [(int(u), int(v)) for v, u in points.clip(-(2**12), 2**12)]
     # Twice, dark and wide below bright and narrow: the marks show on every background.
     for dark, width in ((True, 3), (False, 1)):
         if arrow:

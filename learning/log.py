@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -15,13 +16,16 @@ from warp_deform.errors import InputError, WarpDeformError
 
 from .snapshots import RunFolder
 
-__all__ = ["TrainingLog"]
+__all__ = ["LINE_STEPS", "TrainingLog"]
 
-_EVERY = 50
+LINE_STEPS = 50
+"""Steps that a line of the log stands for."""
 
 
 class TrainingLog:
-    """Mean losses [nat] of every 50 steps.
+    """Mean losses [nat] of every `LINE_STEPS` steps.
+
+    As a context manager it writes what there is, however training ends.
 
     Args:
         run: whose log
@@ -48,6 +52,12 @@ class TrainingLog:
                 ) from error
             self._board = SummaryWriter(str(run.path / "tensorboard"), purge_step=step + 1)
 
+    def __enter__(self) -> TrainingLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def _read(self) -> list[dict[str, Any]]:
         if not self._run.log.exists():
             return []
@@ -60,18 +70,15 @@ class TrainingLog:
         """Count a step's losses in.
 
         Raises:
-            WarpDeformError: their mean is no longer finite.
+            WarpDeformError: a line is due, and the mean loss is not finite.
         """
         for name, value in losses.items():
             self._sums[name] = self._sums.get(name, torch.zeros(())) + value.detach().cpu()
         self._count += 1
-        if step % _EVERY:
+        if step % LINE_STEPS:
             return
+        self.check(step)
         means = {name: float(total) / self._count for name, total in self._sums.items()}
-        if not math.isfinite(means["loss"]):
-            raise WarpDeformError(
-                f"the loss is {means['loss']} at step {step}; lower the step size"
-            )
         seconds = time.perf_counter() - self._since
         self._lines.append({"step": step, **means, "lr": lr, "seconds": round(seconds, 3)})
         if self._board is not None:
@@ -79,18 +86,41 @@ class TrainingLog:
                 self._board.add_scalar(f"train/{name}", value, step)
         self._sums, self._count, self._since = {}, 0, time.perf_counter()
 
+    def check(self, step: int) -> None:
+        """See that the losses since the last line are finite.
+
+        Raises:
+            WarpDeformError: they are not.
+        """
+        mean = float(self._sums["loss"]) / self._count if self._count else 0.0
+        if not math.isfinite(mean):
+            raise WarpDeformError(f"the loss is {mean} at step {step}; lower the step size")
+
     def flush(self) -> None:
-        """Write the lines so far."""
-        if self._enabled:
-            text = "".join(json.dumps(line) + "\n" for line in self._lines)
-            temporary = self._run.log.with_suffix(".tmp")
+        """Write the lines so far, whole or not at all.
+
+        Raises:
+            WarpDeformError: they cannot be written.
+        """
+        if not self._enabled:
+            return
+        text = "".join(json.dumps(line) + "\n" for line in self._lines)
+        temporary = self._run.log.with_name(f".{self._run.log.name}.{os.getpid()}.tmp")
+        try:
             temporary.write_text(text)
             temporary.replace(self._run.log)
+        except OSError as error:
+            raise WarpDeformError(f"{self._run.log} cannot be written: {error.strerror}") from error
+        finally:
+            temporary.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Close TensorBoard's file."""
-        if self._board is not None:
-            self._board.close()
+        """Write the lines so far and close TensorBoard's file."""
+        try:
+            self.flush()
+        finally:
+            if self._board is not None:
+                self._board.close()
 
     def last_loss(self) -> float | None:
         """Mean loss of the last line [nat]; None where nothing was logged."""

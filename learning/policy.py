@@ -5,7 +5,7 @@
 
 An observation is the environment's: `color` and `height`, and `goal_color` and `goal_height` where
 the policy needs a goal that is not handed in. The lift is the network's own choice; the paper's
-privileged rule, which reads the simulator, is `evaluation.Protocol(stage_rule="privileged")`.
+privileged rule, which reads the simulator, is `protocol.Protocol(stage_rule="privileged")`.
 """
 
 from __future__ import annotations
@@ -183,8 +183,8 @@ class RetryingPolicy:
         rng: np.random.Generator | None = None,
     ) -> np.ndarray:
         """See `Policy.act`."""
-        color = np.array(observation.get("color", ()), dtype=np.int16)
-        if self._seen is None or color.shape != self._seen.shape or _changed(color, self._seen):
+        color = _picture(observation, "")[0].astype(np.int16)
+        if self._seen is None or _changed(color, self._seen):
             self._tried = []
         self._seen = color
         action = self.policy.act(observation, goal, avoid=self._tried[-_MOST_TRIED:])
@@ -239,8 +239,8 @@ def load_policy(path: str | Path, *, device: str = "cpu") -> ImagePolicy | State
         description = AgentDescription(**record["agent"])
         agent = make_agent(description)
         agent.load_state_dict(weights)
-    except (KeyError, TypeError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{file} is no snapshot of this release's agents: {reason}") from error
     agent.to(device)
     if isinstance(agent, Transporter):

@@ -1,17 +1,16 @@
 """The paper's tables from run folders: runs pooled over seeds, the paper's numbers beside ours.
 
 A cell is a task, an agent, a number of demonstrations and a variant: preset, steps, who chooses the
-lift, whose goals, which arm. Runs of a cell differ in their seed alone. Their test episodes are
-counted together for the share of successes and its Wilson interval; standard errors are those
-between runs where there are several, else those between episodes. Training runs share their test
-seeds, so the interval speaks of the runs that were made and not of training again.
+lift, whose goals, which arm, who demonstrated. Runs of a cell differ in their seed alone. Their
+test episodes are counted together for the share of successes and its Wilson interval; standard
+errors are those between runs where there are several, else those between episodes. Training runs
+share their test seeds, so the interval speaks of the runs that were made and not of training again.
 
 Source: Wilson, JASA 1927; numbers of Seita et al., ICRA 2021, in `paper_results.json`.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,16 +19,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import TASKS
 
-from .evaluation import PARTIAL_CREDIT, UNCLASSIFIED
-from .snapshots import RunFolder, read_json
+from .evaluation import UNCLASSIFIED, wilson
+from .paper_results import PARTIAL_SCORE, SUCCESS, PaperResults, partial_credit, read_paper
+from .snapshots import RunFolder
 
-__all__ = ["Cell", "PaperResults", "Point", "Report", "RunResult", "pool", "read_paper",
-           "read_runs", "write_report"]  # fmt: skip
+__all__ = ["Cell", "Point", "Report", "RunResult", "pool", "read_runs", "version_notes",
+           "write_report"]  # fmt: skip
+
+_ALIKE = ("agent", "schedule", "augment", "processes", "device", "patience")
+"""Settings that runs of a cell have in common."""
+_VERSIONS = ("warp-deform", "torch")
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ class Cell:
     mean_score: in [0, 1], with its standard_error; mean_actions: of all test episodes
     value, value_error [%]: what the paper's table shows for the task (`measure`), on our test seeds
     paper_protocol [%]: the same by the paper's protocol, which is optimistic; None if not played
+    paper_protocol_stage_rule: who chose the lift there, "action" or "privileged"
     paper [%]: the paper's number; None where it has none
     failures: how often each of `failures.FAILURES` happened, and `evaluation.UNCLASSIFIED`
     validation, test: learning curves; `test` where the paper's protocol was played
@@ -85,25 +89,11 @@ class Cell:
     value_error: float | None
     paper_protocol: float | None
     paper_protocol_runs: int
+    paper_protocol_stage_rule: str | None
     paper: float | None
     failures: dict[str, int]
     validation: tuple[Point, ...]
     test: tuple[Point, ...]
-
-
-@dataclass(frozen=True)
-class PaperResults:
-    """The paper's table. values [%]: by task, agent, number of demonstrations."""
-
-    source: str
-    protocol: str
-    demos: tuple[int, ...]
-    measures: Mapping[str, str]
-    values: Mapping[tuple[str, str, int], float]
-
-    def agents(self, task: str) -> list[str]:
-        """Agents that the table has for a task, in its order."""
-        return list(dict.fromkeys(agent for name, agent, _ in self.values if name == task))
 
 
 @dataclass(frozen=True)
@@ -129,6 +119,7 @@ def write_report(paths: Sequence[Path], out: Path | None) -> Report:
     runs, notes = read_runs(paths)
     paper = read_paper()
     cells = pool(runs, paper)
+    notes += version_notes(runs)
     files: list[Path] = []
     text = markdown_text(cells, paper, notes)
     if out is not None:
@@ -152,24 +143,6 @@ def write_report(paths: Sequence[Path], out: Path | None) -> Report:
         "files": [str(path) for path in files],
     }
     return Report(data, text)
-
-
-def read_paper() -> PaperResults:
-    """The paper's table, from the data file beside this module."""
-    data = json.loads((Path(__file__).parent / "paper_results.json").read_text())
-    values = {
-        (task, agent, demos): value
-        for task, entry in data["tasks"].items()
-        for agent, row in entry["agents"].items()
-        for demos, value in zip(data["demos"], row, strict=True)
-    }
-    return PaperResults(
-        source=data["source"],
-        protocol=data["protocol"],
-        demos=tuple(data["demos"]),
-        measures={task: entry["measure"] for task, entry in data["tasks"].items()},
-        values=values,
-    )
 
 
 def read_runs(paths: Sequence[Path]) -> tuple[list[RunResult], list[str]]:
@@ -205,20 +178,21 @@ def _inside(path: Path) -> Iterable[Path]:
 
 
 def _read(run: RunFolder) -> RunResult:
-    info, settings = read_json(run.report), read_json(run.settings)
+    info, settings = run.read_report(), run.read_settings()
     try:
         result = RunResult(
             path=run.path,
             task=info["task"],
             agent=info["agent"],
-            demos=int(info["demos"]),
-            seed=int(info["seed"]),
+            demos=info["demos"],
+            seed=info["seed"],
             variant=_variant(info, settings),
             info=info,
             settings=settings,
         )
         _cell([result], None)  # all that is needed later is there
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+        _compared(result)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise InputError(
             f"{run.report} is not what this release's `warp-deform eval` writes; evaluate again"
         ) from error
@@ -227,7 +201,7 @@ def _read(run: RunFolder) -> RunResult:
 
 def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     """How a run was trained and played, but for task, agent, demonstrations and seed."""
-    parts = [info["preset"], f"{int(settings['schedule']['steps'])} steps"]
+    parts = [info["preset"], _steps(info, settings)]
     if info["stage_rule"] != "action":
         parts.append(f"{info['stage_rule']} lift")
     if not info.get("retry", True):
@@ -236,7 +210,20 @@ def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
         parts.append(f"goals {info['goals']}")
     if info["robot"] != "ur5":
         parts.append(info["robot"])
+    names = settings.get("demonstrators", ["scripted"])
+    if names != ["scripted"]:
+        parts.append(f"{' and '.join(names)} demonstrations")
     return ", ".join(parts)
+
+
+def _steps(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+    """How long a run was trained; where validation may stop it, as long as that allowed."""
+    planned = int(settings["schedule"]["steps"])
+    if settings.get("patience") is not None:
+        return f"up to {planned} steps, patience {settings['patience']}"
+    played = planned if "rounded" in settings else max(map(int, info["snapshots"]))
+    trained = int(info.get("trained_steps", played))
+    return f"{trained} steps" if trained == planned else f"{trained} of {planned} steps"
 
 
 def pool(runs: Sequence[RunResult], paper: PaperResults) -> list[Cell]:
@@ -245,14 +232,38 @@ def pool(runs: Sequence[RunResult], paper: PaperResults) -> list[Cell]:
     Raises:
         InputError: two runs of a cell have the same seed, or differ in more than the seed.
     """
-    groups: dict[tuple[str, str, str, int], list[RunResult]] = defaultdict(list)
-    for run in runs:
-        groups[run.variant, run.task, run.agent, run.demos].append(run)
+    groups = _grouped(runs)
     for members in groups.values():
         _check_alike(members)
     order = {name: n for n, name in enumerate(TASKS)}
     keys = sorted(groups, key=lambda k: (k[0], order.get(k[1], len(order)), *k[1:]))
     return [_cell(sorted(groups[key], key=lambda run: run.seed), paper) for key in keys]
+
+
+def version_notes(runs: Sequence[RunResult]) -> list[str]:
+    """A line for every cell whose runs were trained by different versions of what decides."""
+    notes = []
+    for members in _grouped(runs).values():
+        for name in _VERSIONS:
+            found = {str(run.settings.get("versions", {}).get(name)) for run in members}
+            if len(found) > 1:
+                first = members[0]
+                notes.append(
+                    f"{first.task}, {first.agent}, {first.demos} demonstrations ({first.variant}): "
+                    f"trained by different versions of {name}, {', '.join(sorted(found))}, and "
+                    "taken together all the same"
+                )
+    return notes
+
+
+def _grouped(
+    runs: Sequence[RunResult],
+) -> dict[tuple[str, str, str, int], list[RunResult]]:
+    """Runs by cell: variant, task, agent, number of demonstrations."""
+    groups: dict[tuple[str, str, str, int], list[RunResult]] = defaultdict(list)
+    for run in runs:
+        groups[run.variant, run.task, run.agent, run.demos].append(run)
+    return groups
 
 
 def _check_alike(members: Sequence[RunResult]) -> None:
@@ -265,27 +276,39 @@ def _check_alike(members: Sequence[RunResult]) -> None:
                 f"{run.agent} and {run.demos} demonstrations; name one of them"
             )
         seen[run.seed] = run.path
-        for key in ("agent", "schedule", "augment", "processes"):
-            mine, theirs = (_compared(each.settings.get(key)) for each in (run, first))
-            if mine != theirs:
+        mine, theirs = _compared(run), _compared(first)
+        for key, value in mine.items():
+            if value is not None and theirs.get(key) is not None and value != theirs[key]:
                 raise InputError(
                     f"{first.path} and {run.path} differ in {key}, so their results are not one; "
                     "report them apart"
                 )
 
 
-def _compared(value: Any) -> Any:
-    """A schedule without its number of snapshots, anything else as it is."""
-    if isinstance(value, Mapping) and "snapshots" in value:
-        return {key: each for key, each in value.items() if key != "snapshots"}
-    return value
+def _compared(run: RunResult) -> dict[str, Any]:
+    """What runs of a cell have in common; None where it is not known."""
+    settings, info, paper = run.settings, run.info, run.info["paper"]
+    compared = {key: settings.get(key) for key in _ALIKE}
+    schedule = settings["schedule"]
+    compared["schedule"] = {key: each for key, each in schedule.items() if key != "snapshots"}
+    compared["test episodes"] = info["test"]["n_episodes"]
+    compared["validation episodes"] = info["snapshots"][str(info["selected"])]["n_episodes"]
+    if settings.get("patience") is not None:
+        compared["validation episodes in training"] = settings.get("validate")
+    if paper is not None:
+        compared["who chooses the lift by the paper's protocol"] = _paper_rule(info)
+    return compared
+
+
+def _paper_rule(info: Mapping[str, Any]) -> str:
+    """Who chose the lift by the paper's protocol; earlier releases let `--stage-rule` say so."""
+    return str(info["paper"].get("stage_rule", info["stage_rule"]))
 
 
 def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
     first, tests = runs[0], [run.info["test"] for run in runs]
     task = first.task
     n, solved = (sum(int(t[key]) for t in tests) for key in ("n_episodes", "n_success"))
-    interval = binomtest(solved, n).proportion_ci(method="wilson")
     failures = Counter[str]()
     for t in tests:
         unknown = {UNCLASSIFIED: t["n_episodes"] - t["n_success"]}
@@ -297,6 +320,7 @@ def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
     value, value_error = _together([_value(t, task) for t in tests])
     played = [run.info["paper"] for run in runs if run.info["paper"] is not None]
     theirs = [p.get("snapshots") or {str(p["snapshot"]): p} for p in played]
+    rules = [_paper_rule(run.info) for run in runs if run.info["paper"] is not None]
     curve = _curve(theirs, task)
     whole = [p for p in curve if p.step and all(str(p.step) in each for each in theirs)]
     if played and not whole:  # results of an earlier release, each run with its own best snapshot
@@ -312,15 +336,16 @@ def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
         n_episodes=n,
         n_success=solved,
         pc_success=100 * solved / n,
-        pc_success_ci95=(100 * float(interval.low), 100 * float(interval.high)),
+        pc_success_ci95=wilson(solved, n),
         mean_score=score,
         standard_error=score_error,
         mean_actions=float(np.average([t["mean_actions"] for t in tests], weights=weights)),
-        measure="mean partial score" if task in PARTIAL_CREDIT else "success",
+        measure=PARTIAL_SCORE if partial_credit(task) else SUCCESS,
         value=value,
         value_error=value_error,
         paper_protocol=best if played else None,
         paper_protocol_runs=len(played),
+        paper_protocol_stage_rule=rules[0] if rules else None,
         paper=paper.values.get((task, first.agent, first.demos)) if paper else None,
         failures=dict(sorted(failures.items())),
         validation=_curve([run.info["snapshots"] for run in runs], task),
@@ -331,7 +356,7 @@ def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
 def _value(summary: Mapping[str, Any], task: str) -> tuple[float, float | None, int]:
     """What the paper's table shows of a result [%], its standard error and number of episodes."""
     n = int(summary["n_episodes"])
-    if task in PARTIAL_CREDIT:
+    if partial_credit(task):
         error = summary["standard_error"]
         return 100 * float(summary["mean_score"]), None if error is None else 100 * error, n
     rate = int(summary["n_success"]) / n

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from .report import Cell, PaperResults, Point
+from .paper_results import PaperResults
+from .report import Cell, Point
 
 __all__ = ["draw_curves"]
 
@@ -47,7 +49,9 @@ def _draw_steps(axes: Axes, cells: Sequence[Cell], paper: PaperResults) -> None:
         color, name = f"C{number % 10}", f"{_name(cell, cells)}, {cell.demos} demos"
         _band(axes, cell.validation, color=color, label=f"{name}: validation", style="-")
         if len(cell.test) > 1:
-            _band(axes, cell.test, color=color, label=f"{name}: paper's protocol", style="--")
+            privileged = cell.paper_protocol_stage_rule == "privileged"
+            rule = "paper's protocol" + (", privileged lift" if privileged else "")
+            _band(axes, cell.test, color=color, label=f"{name}: {rule}", style="--")
 
 
 def _band(axes: Axes, points: Sequence[Point], *, color: str, label: str, style: str) -> None:
@@ -64,7 +68,7 @@ def _draw_demonstrations(axes: Axes, cells: Sequence[Cell], paper: PaperResults)
     agents = list(dict.fromkeys(cell.agent for cell in cells))
     variants = list(dict.fromkeys(cell.variant for cell in cells))
     for color, agent in enumerate(agents):
-        for marker, variant in zip("os^Dv<>", variants, strict=False):
+        for marker, variant in zip(cycle("os^Dv<>"), variants, strict=False):
             mine = [cell for cell in cells if (cell.agent, cell.variant) == (agent, variant)]
             if mine:
                 axes.errorbar(

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import torch
 
-from warp_deform.errors import InputError
-
-from .snapshots import RunFolder, read_json, read_snapshot, write_json
+from .evaluation import trained_steps
+from .interchange.conversion import new_folder
+from .snapshots import RunFolder, read_snapshot, write_json
 
 __all__ = ["share_run"]
 
@@ -21,17 +21,17 @@ def share_run(path: Path, out: Path) -> Path:
     from it.
 
     Raises:
-        InputError: there is no snapshot, or `out` exists.
+        InputError: there is no snapshot, `out` exists, or a file is damaged.
     """
-    run, shared = RunFolder(path), RunFolder(out)
-    file = run.chosen_snapshot()
+    run = RunFolder(path)
+    settings, file = run.read_settings(), run.chosen_snapshot()
     weights, record = read_snapshot(file)
-    if shared.path.exists():
-        raise InputError(f"{shared.path} exists; name a folder to be made")
-    shared.create()
     rounded = {name: each.to(torch.bfloat16) for name, each in weights.items()}
-    written = shared.write_snapshot(record["step"], rounded, {"agent": record["agent"]})
-    settings = read_json(run.settings)
-    settings.pop("data")  # a path of the machine that trained
-    write_json(shared.settings, {**settings, "rounded": "bfloat16"})
-    return written
+    settings.pop("data", None)  # a path of the machine that trained
+    settings |= {"rounded": "bfloat16", "trained_steps": trained_steps(run)}
+    with new_folder(out, description={"share": str(path)}) as partial:
+        shared = RunFolder(partial)
+        shared.create()
+        shared.write_snapshot(record["step"], rounded, {"agent": record["agent"]})
+        write_json(shared.settings, settings)
+    return RunFolder(out).snapshot(record["step"])

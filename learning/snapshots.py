@@ -26,9 +26,25 @@ from torch import Tensor
 
 from warp_deform.errors import InputError, WarpDeformError
 
-__all__ = ["RunFolder", "read_json", "read_snapshot", "write_json"]
+Fields = Mapping[str, type | tuple[type, ...]]
+"""Names that a JSON object has to have, and the Python types that their values may be of."""
+
+__all__ = ["Fields", "RunFolder", "check_fields", "read_json", "read_record", "read_snapshot",
+           "write_json"]  # fmt: skip
 
 _FORMAT = 1
+_KINDS = {
+    str: "a string", int: "a whole number", bool: "true or false", float: "a number",
+    dict: "an object", list: "a list", type(None): "null",
+}  # fmt: skip
+_AGENT: Fields = {"task": str, "agent": str, "config": dict}
+_SETTINGS: Fields = {
+    "agent": dict, "preset": str, "schedule": dict, "seed": int, "demonstrations": dict,
+}  # fmt: skip
+_REPORT: Fields = {
+    "task": str, "agent": str, "preset": str, "demos": int, "seed": int, "stage_rule": str,
+    "robot": str, "snapshots": dict, "selected": int, "test": dict, "paper": (dict, type(None)),
+}  # fmt: skip
 _NAME = re.compile(r"step_(\d{8})\.safetensors")
 
 
@@ -56,16 +72,36 @@ class RunFolder:
             raise InputError(f"--out {self.path} cannot be made: {error.strerror}") from error
 
     def read_settings(self) -> dict[str, Any]:
-        """What `run.json` says.
+        """What `run.json` says: agent, preset, schedule, seed, demonstrations and more.
 
         Raises:
-            InputError: this is no training run's folder.
+            InputError: this is no training run's folder, or the file is damaged.
         """
         if not self.settings.is_file():
             raise InputError(
                 f"{self.path} holds no training run; `warp-deform train` makes one with --out"
             )
-        return read_json(self.settings)
+        found, what = read_json(self.settings), f"{self.settings} is not what training writes"
+        check_fields(found, _SETTINGS, what=what)
+        check_fields(found["agent"], _AGENT, what=what)
+        check_fields(found["schedule"], {"steps": int}, what=what)
+        optional = {"validate": int, "trained_steps": int, "versions": dict, "demonstrators": list}
+        check_fields(found, {k: v for k, v in optional.items() if k in found}, what=what)
+        check_fields({"patience": None, **found}, {"patience": (int, type(None))}, what=what)
+        if not all(seed.isdecimal() for seed in found["demonstrations"]):
+            raise InputError(f"{what}: a demonstration is not named by its seed")
+        return found
+
+    def read_report(self) -> dict[str, Any]:
+        """What `eval_info.json` says, see `report_run.evaluate_run`.
+
+        Raises:
+            InputError: the file is missing or damaged.
+        """
+        found = read_json(self.report)
+        what = f"{self.report} is not what this release's `warp-deform eval` writes, evaluate again"
+        check_fields(found, _REPORT, what=what)
+        return found
 
     def snapshot(self, step: int) -> Path:
         """Path of the weights after so many steps."""
@@ -77,20 +113,23 @@ class RunFolder:
         return sorted(int(match[1]) for match in matches if match)
 
     def chosen_snapshot(self) -> Path:
-        """The snapshot that the evaluation chose, or the last one.
+        """The snapshot that the evaluation chose; the last one before there is an evaluation.
 
         Raises:
-            InputError: there is none.
+            InputError: there is none, or a file is damaged.
         """
         self.read_settings()
         steps = self.steps()
         if not steps:
             raise InputError(f"{self.path} has no snapshot yet; run `warp-deform train` to its end")
-        if self.report.is_file():
-            chosen = read_json(self.report).get("selected")
-            if chosen in steps:
-                return self.snapshot(chosen)
-        return self.snapshot(steps[-1])
+        if not self.report.is_file():
+            return self.snapshot(steps[-1])
+        chosen = self.read_report()["selected"]
+        if chosen not in steps:
+            raise InputError(
+                f"{self.report} chose step {chosen}, of which there is no snapshot; evaluate again"
+            )
+        return self.snapshot(chosen)
 
     def write_snapshot(
         self, step: int, weights: Mapping[str, Tensor], record: Mapping[str, Any]
@@ -128,15 +167,47 @@ def read_snapshot(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         InputError: a file is missing or damaged, or of another format.
     """
+    record = read_record(path)
+    return _read(Path(path))[0], record
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The record beside a snapshot's weights: format, step and agent, see `AgentDescription`.
+
+    Raises:
+        InputError: a file is missing or damaged, or of another format.
+    """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"there is no snapshot {path}; `warp-deform train` makes them")
-    record = read_json(path.with_suffix(".json"))
+    beside = path.with_suffix(".json")
+    record = read_json(beside)
     if record.get("format") != _FORMAT:
         raise InputError(
             f"{path} has format {record.get('format')!r}; this release reads {_FORMAT}"
         )
-    return _read(path)[0], record
+    what = f"{beside} is no record of a snapshot"
+    check_fields(record, {"step": int, "agent": dict}, what=what)
+    check_fields(record["agent"], _AGENT, what=what)
+    return record
+
+
+def check_fields(found: Mapping[str, Any], fields: Fields, *, what: str) -> None:
+    """Refuse an object of a JSON file in which a field is missing or of another type.
+
+    `float` takes whole numbers too; `int` takes no booleans, which are numbers in Python alone.
+
+    Raises:
+        InputError: it begins with `what`.
+    """
+    for name, kinds in fields.items():
+        if name not in found:
+            raise InputError(f"{what}: {name!r} is missing")
+        kinds = kinds if isinstance(kinds, tuple) else (kinds,)
+        allowed = (*kinds, int) if float in kinds else kinds
+        if type(found[name]) not in allowed:
+            names = " or ".join(_KINDS[kind] for kind in kinds)
+            raise InputError(f"{what}: {name!r} must be {names}")
 
 
 def read_json(path: Path) -> dict[str, Any]:

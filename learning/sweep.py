@@ -79,6 +79,7 @@ class SweepConfig:
     """A grid. The fields are the keys of the file; those without a default have to be there.
 
     steps, batch, lr, snapshots: None takes the preset's; untrained: evaluate step 0 too
+    device, validate, patience: see `training.TrainConfig`
     Agents are combined with the tasks that they fit: those that see a goal, with tasks that have
     one.
     """
@@ -94,6 +95,9 @@ class SweepConfig:
     lr: float | None = None
     snapshots: int | None = None
     untrained: bool = False
+    device: str = "cpu"
+    validate: int = 0
+    patience: int | None = None
     demonstrations: Collecting = field(default_factory=Collecting)
     evaluation: Evaluating = field(default_factory=Evaluating)
 
@@ -101,19 +105,24 @@ class SweepConfig:
         for name in ("tasks", "agents", "demos", "seeds"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
-                raise InputError(f"{name} must name at least one, and none twice")
+                raise InputError(
+                    f"{name} is {list(values)}; it must name at least one, and none twice"
+                )
         for task in self.tasks:
             find_task(task)
         for agent in self.agents:
             if agent not in AGENTS:
                 raise InputError(f"there is no agent {agent!r}; there are: {', '.join(AGENTS)}")
-        if min(self.demos) < 1 or min(self.seeds) < 0:
-            raise InputError("demos must be 1 or more, seeds 0 or more")
+        for name, least in (("demos", 1), ("seeds", 0)):
+            _at_least(name, min(getattr(self, name)), least)
         rule = self.evaluation.stage_rule
         if rule not in ("action", "privileged"):
             raise InputError(f"stage_rule is {rule!r}; it must be 'action' or 'privileged'")
-        if self.evaluation.episodes < 1 or self.evaluation.validation_episodes < 1:
-            raise InputError("episodes and validation_episodes must be 1 or more")
+        for name in ("episodes", "validation_episodes"):
+            _at_least(f"evaluation.{name}", getattr(self.evaluation, name), 1)
+        if self.demonstrations.count is not None:
+            _at_least("demonstrations.count", self.demonstrations.count, 1)
+        _at_least("demonstrations.seed", self.demonstrations.seed, 0)
         find_robot(self.evaluation.robot)
         demonstrator(self.demonstrations.demonstrator)
         for task in self.tasks:
@@ -140,6 +149,9 @@ class SweepConfig:
             seed=seed,
             preset=self.preset,
             untrained=self.untrained,
+            device=self.device,
+            validate=self.validate,
+            patience=self.patience,
             progress=False,
         )
         changes: dict[str, Any] = {
@@ -218,6 +230,11 @@ def run_sweep(
     }
 
 
+def _at_least(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise InputError(f"{name} is {value}; it must be {least} or more")
+
+
 def _fits(task: str, agent: str) -> bool:
     """Whether an agent can be trained on a task."""
     try:
@@ -243,10 +260,17 @@ def _done(cell: TrainConfig, config: SweepConfig) -> bool:
 
 
 def _collect(config: SweepConfig, task: str, *, workers: int | None, ray: str | None) -> None:
-    """Collect a task's demonstrations, unless there are enough."""
+    """Collect a task's demonstrations, unless there are enough.
+
+    How many files a folder holds says nothing of one that was being collected into: until the
+    end there may be more than are wanted, and others than are kept. `collect` knows; a folder that
+    the user names may come from anywhere and is taken as it is.
+    """
     folder, wanted = config.data(task), config.demonstrations
     count = wanted.count or max(config.demos)
-    there = len(EpisodeReader(folder)) if any(folder.glob("*.parquet")) else 0
+    there = 0
+    if wanted.folder is not None and any(folder.glob("*.parquet")):
+        there = len(EpisodeReader(folder))
     if there < count:
         collect(
             CollectConfig(
@@ -271,8 +295,9 @@ def _run(job: tuple[TrainConfig, SweepConfig]) -> Iterator[tuple[str, str, str |
         test = evaluate_run(cell.out, workers=1, progress=False, **asdict(config.evaluation))[
             "test"
         ]
-    except WarpDeformError as error:
-        yield cell.out.name, "", " ".join(str(error).split())
+    except Exception as error:  # whatever it is, the other runs go on
+        kind = "" if isinstance(error, WarpDeformError) else f"{type(error).__name__}: "
+        yield cell.out.name, "", kind + " ".join(str(error).split())
         return
     write_json(cell.out / _DONE, _wanted(cell, config))
     minutes = (time.perf_counter() - began) / 60

@@ -1,7 +1,9 @@
-"""Training: one loop, read from top to bottom. The same command gives the same bits.
+"""Training: one loop, read from top to bottom. On a CPU the same command gives the same bits.
 
 Whatever is random in step n is drawn from a generator of (seed, n, rank), so a run that was
-interrupted goes on exactly as it would have, from the last stored state.
+interrupted goes on exactly as it would have, from the last stored state. Bits are promised on the
+CPU only: on CUDA, the gradients of bilinear interpolation and of gathering pixels are sums in no
+fixed order.
 
 Several processes, one a GPU or a core, train together under `torchrun`: each draws its own batch,
 and gradients are averaged (torch's DistributedDataParallel).
@@ -16,7 +18,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,56 +28,26 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from warp_deform.episodes import versions
-from warp_deform.errors import InputError
+from warp_deform.episodes import EpisodeReader, versions
+from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 
-from .batches import image_batch, state_batch, task_lifts
+from .batches import check_lifts, image_batch, state_batch, task_lifts
 from .dataset import Demonstrations
-from .log import TrainingLog
+from .log import LINE_STEPS, TrainingLog
 from .models.adam import KerasAdam
 from .models.gt_state import GtStateConfig
 from .models.transporter import PRESETS, Transporter
-from .place import place
 from .policy import AGENTS, Agent, AgentDescription, make_agent
+from .processes import DEVICES, Process, join_processes
+from .schedules import SCHEDULES, Schedule, preset_schedule
 from .snapshots import RunFolder, read_json, write_json
 
-__all__ = ["SCHEDULES", "Schedule", "TrainConfig", "TrainReport", "train"]
+__all__ = ["TrainConfig", "TrainReport", "train"]
 
 _STREAM = 7
 """Keeps the generators of training apart from those of episodes."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Schedule:
-    """How long and in which steps to train."""
-
-    steps: int
-    """Steps of the optimiser, which the original calls iterations."""
-    batch: int
-    """Moments a step and process."""
-    lr: float
-    """Greatest step size of Adam."""
-    warmup: int = 0
-    """Steps over which the step size grows from 0."""
-    decay: bool = False
-    """Let the step size fall to 0 like a cosine."""
-    ema: float = 0.0
-    """Snapshots hold weights averaged over 1 / (1 - ema) steps or so; 0: weights as they are."""
-    snapshots: int = 10
-    """Snapshots, evenly spread, the last one at the end."""
-
-
-SCHEDULES = {
-    "paper": Schedule(steps=20_000, batch=1, lr=1e-4),
-    "fast": Schedule(steps=4000, batch=1, lr=1e-3, warmup=100, decay=True, ema=0.998, snapshots=4),
-}
-"""By the names of the command line, for agents over pictures."""
-_STATE_SCHEDULES = {
-    "paper": Schedule(steps=20_000, batch=128, lr=2e-4),
-    "fast": Schedule(steps=4000, batch=128, lr=1e-3, warmup=100, decay=True, ema=0.99, snapshots=4),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +56,9 @@ class TrainConfig:
 
     demos: demonstrations to learn from, drawn by `seed`; None takes all that `data` holds
     schedule: None takes the preset's
+    augment: turn and shift what is seen at random
+    exact: compute by the original's operations, several times slower
+    bf16: convolve in bfloat16, agents over pictures alone
     threads: of torch, a process; another number may change the last bits
     validate: validation episodes that every snapshot plays; 0 plays none
     patience: stop when so many snapshots in a row brought no better validation; None never stops
@@ -100,6 +75,8 @@ class TrainConfig:
     preset: str = "paper"
     schedule: Schedule | None = None
     augment: bool = True
+    exact: bool = False
+    bf16: bool = False
     device: str = "cpu"
     threads: int = 1
     validate: int = 0
@@ -114,27 +91,46 @@ class TrainConfig:
             raise InputError(f"there is no agent {self.agent!r}; there are: {', '.join(AGENTS)}")
         if self.preset not in SCHEDULES:
             raise InputError(f"preset is {self.preset!r}; it must be one of {sorted(SCHEDULES)}")
-        if self.seed < 0 or self.threads < 1 or self.validate < 0:
-            raise InputError("seed and validate must be 0 or more, threads 1 or more")
-        if self.patience is not None and (self.patience < 1 or not self.validate):
-            raise InputError("patience must be 1 or more, and needs validation episodes")
-        s = self.plan
-        if s.steps < 1 or s.batch < 1 or not 1 <= s.snapshots <= s.steps:
-            raise InputError("steps, batch and snapshots must be 1 or more, snapshots <= steps")
-        if not (s.lr > 0 and 0 <= s.ema < 1 and s.warmup >= 0):
-            raise InputError("lr must be positive, ema in [0, 1), warmup 0 or more")
+        if self.device not in DEVICES:
+            raise InputError(f"device is {self.device!r}; it must be 'cpu' or 'cuda'")
+        for name, least in (("seed", 0), ("threads", 1), ("validate", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be {least} or more")
+        if self.patience is not None:
+            if self.patience < 1:
+                raise InputError(f"patience is {self.patience}; it must be 1 or more")
+            if not self.validate:
+                raise InputError(
+                    f"patience is {self.patience} and validate 0; stopping early needs validation "
+                    "episodes, 1 or more"
+                )
+        if self.bf16 and self._sees_state:
+            raise InputError(f"bf16 is for agents over pictures; {self.agent} has no convolutions")
+        if self.bf16 and self.exact:
+            raise InputError("bf16 and exact exclude each other: the original computes in float32")
 
     @property
     def plan(self) -> Schedule:
         """The schedule in force."""
-        sees_state = not issubclass(AGENTS[self.agent], Transporter)
-        return self.schedule or (_STATE_SCHEDULES if sees_state else SCHEDULES)[self.preset]
+        if self.schedule is not None:
+            return self.schedule
+        demos = self.demos
+        if demos is None:
+            demos = sum(1 for _ in self.data.glob("episode_*.parquet"))
+        return preset_schedule(
+            self.preset, task=self.task, demos=demos, sees_state=self._sees_state
+        )
+
+    @property
+    def _sees_state(self) -> bool:
+        return not issubclass(AGENTS[self.agent], Transporter)
 
 
 @dataclass(frozen=True)
 class TrainReport:
     """What was trained.
 
+    left_out: recordings of the folder that are no demonstrations, see `dataset.Demonstrations`
     steps: taken in all; snapshots: the steps of which there are snapshots; loss: mean over the last
     logged steps [nat]; seconds: of this call [s]; weights_hash: of the last snapshot's weights
     """
@@ -143,6 +139,7 @@ class TrainReport:
     agent: str
     preset: str
     demos: int
+    left_out: int
     seed: int
     steps: int
     snapshots: tuple[int, ...]
@@ -157,36 +154,36 @@ def train(config: TrainConfig) -> TrainReport:
 
     Raises:
         InputError: the data do not fit, the folder holds another run, or there is no such device.
-        WarpDeformError: the loss is no longer finite.
+        WarpDeformError: loss or weights are no longer finite, or something cannot be written.
     """
     began = time.perf_counter()
     plan, run = config.plan, RunFolder(config.out)
-    with place(config.device, threads=config.threads) as here:
+    with join_processes(config.device, threads=config.threads) as here:
         rank, world, device = here
         # What is trained, and on what
         data = Demonstrations(config.data, task=config.task, count=config.demos, seed=config.seed)
+        check_lifts(data)
         description = _describe(config, data)
         agent = make_agent(description, seed=config.seed).to(device)
         if rank == 0:
-            _claim(run, config, description, data, world)
+            _claim(run, config, plan, description, data, world)
         here.wait()
         names = dict(agent.named_parameters())
         optimizer = KerasAdam(agent.parameters(), lr=plan.lr)
         averaged = {name: each.detach().clone() for name, each in names.items()}
 
-        # Go on where a run was interrupted
+        # Go on where a run was interrupted, perhaps while its last snapshot was validated
         tensors, first = run.read_state()
         if tensors:
             _restore(tensors, first, names, averaged, optimizer)
-        log = TrainingLog(run, first, tensorboard=config.tensorboard, enabled=rank == 0)
+        stopped = _validate(run, config, [k for k in run.steps() if 0 < k <= first], here)
         network: nn.Module = DistributedDataParallel(agent) if world > 1 else agent
-        every = math.ceil(plan.steps / plan.snapshots)
-        store = min(every, max(every // 10, 100))
-        stopped = _stopped(run, config)
+        kept, store = set(plan.snapshot_steps()), _state_steps(plan)
 
         shown = config.progress and rank == 0
         bar = progress_bar(f"train {config.task}", plan.steps, done=first, shown=shown)
-        with bar as advance:
+        log = TrainingLog(run, first, tensorboard=config.tensorboard, enabled=rank == 0)
+        with log, bar as advance:
             for step in range(first + 1, plan.steps + 1):
                 if stopped:
                     break
@@ -195,30 +192,29 @@ def train(config: TrainConfig) -> TrainReport:
                 inputs = _batch(data, agent, plan.batch, config.augment, rng, device)
 
                 # One step of the optimiser
-                optimizer.param_groups[0]["lr"] = _lr(plan, step)
+                lr = optimizer.param_groups[0]["lr"] = plan.lr_at(step)
                 optimizer.zero_grad(set_to_none=True)
                 losses = network(*inputs)
                 loss = losses.total()
                 loss.backward()
                 optimizer.step()
-                _average(averaged, names, _decay(plan.ema, step))
-                log.add(step, {"loss": loss, **losses._asdict()}, lr=_lr(plan, step))
+                _average(averaged, names, plan.kept_at(step))
+                log.add(step, {"loss": loss, **losses._asdict()}, lr=lr)
 
                 # Snapshots, and what an interrupted run goes on from
-                last = step == plan.steps
-                if rank == 0 and (last or step % every == 0):
-                    record = {"agent": asdict(description)}
-                    run.write_snapshot(step, _detached(averaged), record)
-                if rank == 0 and (last or step % store == 0):
-                    log.flush()
-                    run.write_state(_state(names, averaged, optimizer), step)
-                if config.validate and (last or step % every == 0):
-                    if rank == 0:
-                        _validate(run, config, step)
-                    here.wait()
-                    stopped = _stopped(run, config)
+                due, last = step in kept, step == plan.steps
+                if due or last or step % store == 0:
+                    log.check(step)
+                    _check_weights(averaged, step)
+                    if rank == 0 and due:
+                        record = {"agent": asdict(description)}
+                        run.write_snapshot(step, _detached(averaged), record)
+                    if rank == 0 and (last or step % store == 0):
+                        log.flush()
+                        run.write_state(_state(names, averaged, optimizer), step)
+                if due:
+                    stopped = _validate(run, config, [step], here)
                 advance()
-        log.close()
         if config.untrained and rank == 0:
             initial = dict(make_agent(description, seed=config.seed).named_parameters())
             run.write_snapshot(0, _detached(initial), {"agent": asdict(description)})
@@ -229,6 +225,7 @@ def train(config: TrainConfig) -> TrainReport:
             agent=config.agent,
             preset=config.preset,
             demos=len(data),
+            left_out=data.left_out,
             seed=config.seed,
             steps=steps[-1],
             snapshots=tuple(steps),
@@ -249,12 +246,14 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
             lifts=lifts,
             n_rotations_train=max(preset.n_rotations_train, yaws),
             n_rotations_eval=yaws,
+            exact=config.exact or preset.exact,
+            bfloat16=config.bf16 or preset.bfloat16,
         )
         return AgentDescription(task=config.task, agent=config.agent, config=asdict(sizes))
     return AgentDescription(
         task=config.task,
         agent=config.agent,
-        config=asdict(GtStateConfig(lifts=lifts, one_rotation=yaws == 1)),
+        config=asdict(GtStateConfig(lifts=lifts, one_rotation=yaws == 1, exact=config.exact)),
         state_size=data.state_size,
     )
 
@@ -262,6 +261,7 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
 def _claim(
     run: RunFolder,
     config: TrainConfig,
+    plan: Schedule,
     description: AgentDescription,
     data: Demonstrations,
     world: int,
@@ -270,7 +270,7 @@ def _claim(
     deciding = {
         "agent": asdict(description),
         "preset": config.preset,
-        "schedule": asdict(config.plan),
+        "schedule": asdict(plan),
         "seed": config.seed,
         "augment": config.augment,
         "patience": config.patience,
@@ -291,7 +291,10 @@ def _claim(
             )
         return
     run.create()
-    write_json(run.settings, {**wanted, "data": str(config.data)})
+    reader = EpisodeReader(config.data)
+    names = sorted({reader.info(seed).demonstrator for seed in data.seeds})
+    told = {"data": str(config.data), "left_out": data.left_out, "demonstrators": names}
+    write_json(run.settings, {**wanted, **told})
 
 
 def _batch(
@@ -310,16 +313,10 @@ def _batch(
     return tuple(each.to(device) for each in tensors)
 
 
-def _lr(plan: Schedule, step: int) -> float:
-    """Step size at a step, counted from 1."""
-    grown = min(1.0, step / plan.warmup) if plan.warmup else 1.0
-    fallen = 0.5 * (1 + math.cos(math.pi * (step - 1) / plan.steps)) if plan.decay else 1.0
-    return plan.lr * grown * fallen
-
-
-def _decay(ema: float, step: int) -> float:
-    """How much of the average is kept; less at first, so that the initial weights are forgotten."""
-    return min(ema, step / (step + 10.0)) if ema else 0.0
+def _state_steps(plan: Schedule) -> int:
+    """Steps from one stored state to the next: whole lines of the log, so that none is torn."""
+    every = max(plan.steps / plan.snapshots / 10, 100)
+    return LINE_STEPS * math.ceil(every / LINE_STEPS)
 
 
 @torch.no_grad()
@@ -366,25 +363,25 @@ def _restore(
     optimizer.param_groups[0]["steps"] = step
 
 
-def _validate(run: RunFolder, config: TrainConfig, step: int) -> None:
-    from .evaluation import Protocol, evaluate_snapshot
+def _check_weights(averaged: Mapping[str, Tensor], step: int) -> None:
+    """Raise WarpDeformError unless all weights are finite; the average keeps what ever was not."""
+    if not all(bool(each.isfinite().all()) for each in averaged.values()):
+        raise WarpDeformError(f"weights are not finite at step {step}; lower the step size")
 
-    evaluate_snapshot(run, step, Protocol(split="validation", episodes=config.validate))
 
-
-def _stopped(run: RunFolder, config: TrainConfig) -> bool:
-    """Whether validation has brought nothing better for as long as `patience` allows."""
-    if config.patience is None:
+def _validate(run: RunFolder, config: TrainConfig, steps: Sequence[int], here: Process) -> bool:
+    """Validate snapshots, where that is asked for, and say whether training ends with the last."""
+    if not config.validate:
         return False
-    from .evaluation import Protocol, evaluate_snapshot, known
+    from .evaluation import evaluate_snapshot, known, stopped_early  # loads the simulator
+    from .protocol import Protocol
 
     protocol = Protocol(split="validation", episodes=config.validate)
-    scores = [
-        evaluate_snapshot(run, step, protocol).summary["mean_score"]
-        for step in run.steps()
-        if step and known(run, step, protocol)
-    ]
-    return len(scores) - 1 - int(np.argmax(scores or [0])) >= config.patience
+    for step in steps if here.rank == 0 else ():
+        if not known(run, step, protocol):
+            evaluate_snapshot(run, step, protocol)
+    here.wait()
+    return stopped_early(run)
 
 
 def _hash(path: Path) -> str:

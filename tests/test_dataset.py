@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import resource
 import sys
 from pathlib import Path
@@ -12,7 +13,11 @@ from episode_samples import with_info
 from training_samples import block_episode, write_demonstrations
 
 from learning.dataset import Demonstrations, choose
-from warp_deform.episodes import HEIGHT_UNIT, EpisodeReader, EpisodeWriter
+from learning.interchange.deformable_ravens import DEMONSTRATOR
+from learning.schedules import Schedule
+from learning.snapshots import RunFolder
+from learning.training import TrainConfig, train
+from warp_deform.episodes import HEIGHT_UNIT, Episode, EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
 
 TASK = "cable-line-notarget"
@@ -97,6 +102,55 @@ def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
     EpisodeWriter(tmp_path).write(with_info(block_episode(0), success=False))
     with pytest.raises(InputError, match="no successful demonstration"):
         Demonstrations(tmp_path, task=TASK)
+
+
+def imported(seed: int, *, task: str = TASK, **changes: object) -> Episode:
+    """An episode as it is imported from the original code, failed."""
+    info = {"demonstrator": DEMONSTRATOR, "success": False, "task": task, **changes}
+    return with_info(block_episode(seed), **info)
+
+
+def test_the_originals_failures_are_demonstrations_as_there(tmp_path: Path) -> None:
+    """They are kept there, but for those that began solved and so have no action."""
+    writer = EpisodeWriter(tmp_path)
+    writer.write(imported(0))
+    writer.write(imported(1, success=True))
+    still = block_episode(2, actions=0)
+    writer.write(with_info(still, demonstrator=DEMONSTRATOR, success=True))
+    data = Demonstrations(tmp_path, task=TASK)
+    assert data.seeds == (0, 1) and data.left_out == 1
+    one = Demonstrations(tmp_path, task=TASK, count=2)
+    assert one.seeds == (0, 1)
+    with pytest.raises(InputError, match="the data holds 2 demonstrations"):
+        Demonstrations(tmp_path, task=TASK, count=3)
+    schedule = Schedule(steps=1, batch=1, lr=1e-3, snapshots=1)
+    out = tmp_path / "run"
+    report = train(
+        TrainConfig(task=TASK, agent="gt-mlp", data=tmp_path, out=out, schedule=schedule)
+    )
+    assert (report.demos, report.left_out) == (2, 1)
+    assert RunFolder(out).read_settings()["left_out"] == 1
+
+
+def test_of_the_originals_bags_by_color_only_good_ones_count(tmp_path: Path) -> None:
+    task, writer = "bag-color-goal", EpisodeWriter(tmp_path)
+    for seed, score in enumerate((0.5, 0.51, 1.0, 0.0)):
+        writer.write(imported(seed, task=task, score=score))
+    data = Demonstrations(tmp_path, task=task)
+    assert data.seeds == (1, 2) and data.left_out == 2
+    for seed in data.seeds:
+        (tmp_path / f"episode_{seed:09d}.parquet").unlink()
+    with pytest.raises(InputError, match="none of its 2 episodes is a demonstration"):
+        Demonstrations(tmp_path, task=task)
+
+
+def test_what_holds_no_state_trains_no_agent_over_states(tmp_path: Path) -> None:
+    made = block_episode(0)
+    bare = [dataclasses.replace(step, ground_truth=np.zeros(0, np.float32)) for step in made.steps]
+    EpisodeWriter(tmp_path).write(dataclasses.replace(made, steps=tuple(bare)))
+    data = Demonstrations(tmp_path, task=TASK)
+    with pytest.raises(InputError, match="hold no ground truth"):
+        print(data.state_size)
 
 
 def test_pictures_stay_on_the_disk(tmp_path: Path) -> None:

@@ -15,21 +15,15 @@ import torch
 from training_samples import write_demonstrations
 
 from learning import evaluation
-from learning.evaluation import (
-    Evaluation,
-    Played,
-    Protocol,
-    best,
-    evaluate_snapshot,
-    goal_distance,
-    known,
-    summarise,
-)
+from learning.evaluation import Evaluation, best, evaluate_snapshot, known, summarise
 from learning.failures import FAILURES, bag_opening, closed, failure, puts_back
+from learning.playing import Played, goal_distance
 from learning.policy import load_policy
+from learning.protocol import Protocol
 from learning.report_run import evaluate_run
+from learning.schedules import Schedule
 from learning.snapshots import RunFolder
-from learning.training import Schedule, TrainConfig, train
+from learning.training import TrainConfig, train
 from warp_deform.cli import main
 from warp_deform.episode_loop import Run
 from warp_deform.episodes import EpisodeReader, EpisodeWriter

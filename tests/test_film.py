@@ -11,15 +11,18 @@ import numpy as np
 import pytest
 from training_samples import block_episode, write_demonstrations
 
-from learning.evaluation import Protocol, evaluate_snapshot
+from learning.evaluation import evaluate_snapshot
 from learning.film import HeatMaps, Sight, draw, film_episodes, heat_maps
 from learning.models.transporter import PRESETS
 from learning.policy import AgentDescription, ImagePolicy, make_agent
+from learning.protocol import Protocol
+from learning.schedules import Schedule
 from learning.snapshots import RunFolder
-from learning.training import Schedule, TrainConfig, train
+from learning.training import TrainConfig, train
 from warp_deform.cli import main
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.rendering.pixels import SHAPE, world_to_pixel
+from warp_deform.rendering.pixels import SHAPE, TABLE_GRID
+from warp_deform.tasks.registry import task as find_task
 from warp_deform.workers import single_threaded
 
 TASK = "block-notarget"
@@ -44,14 +47,20 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 @pytest.mark.parametrize(
-    ("agent", "rotations"), [("transporter", 1), ("goal-split", 1), ("goal-stack", 4)]
+    ("agent", "task", "rotations"),
+    [
+        ("transporter", "cable-ring", 1),
+        ("goal-split", TASK, 1),
+        ("goal-stack", TASK, 4),
+        ("goal-split", "cable-mask-goal", 1),
+    ],
 )
-def test_the_maximum_is_where_the_policy_acts(agent: str, rotations: int) -> None:
-    task = "cable-ring" if agent == "transporter" else TASK
+def test_the_maximum_is_where_the_policy_acts(agent: str, task: str, rotations: int) -> None:
+    """In the task's own pictures: those of cable-mask-goal show another part of the table."""
     config = replace(PRESETS["fast"], n_rotations_eval=rotations)
     description = AgentDescription(task=task, agent=agent, config=vars(config))
     policy = ImagePolicy(make_agent(description, seed=3), description)
-    step = block_episode(0, task=task).steps[0]
+    step = block_episode(0, task=TASK).steps[0]
     seen = {"color": step.color, "height": step.height}
     seen |= {"goal_color": step.color[::-1].copy(), "goal_height": step.height}
     action = policy.act(seen)
@@ -62,7 +71,7 @@ def test_the_maximum_is_where_the_policy_acts(agent: str, rotations: int) -> Non
     ):
         assert probability.shape == SHAPE, name
         assert 0 < probability.sum() / config.scale**2 <= 1 + 1e-5, name
-        assert probability[tuple(world_to_pixel(xy))] == probability.max(), name
+        assert probability[tuple(find_task(task).grid.to_pixel(xy))] == probability.max(), name
     assert heat.pick.sum() / config.scale**2 == pytest.approx(1.0, rel=1e-4)
 
 
@@ -72,8 +81,8 @@ def test_a_frame_shows_the_action_and_the_heat() -> None:
     pick[100, 60] = 1.0
     sight = Sight(color, color, HeatMaps(pick, pick))
     action = np.array([0.25 + 60 * 0.003125, -0.5 + 100 * 0.003125, 0, 0.6, 0.2, 0, 0.04])
-    plain = draw(sight, None, ("a", "b"), maps=True)
-    marked = draw(sight, action, ("a", "b"), maps=True)
+    plain = draw(sight, None, ("a", "b"), maps=True, grid=TABLE_GRID)
+    marked = draw(sight, action, ("a", "b"), maps=True, grid=TABLE_GRID)
     assert plain.shape == marked.shape and plain.dtype == np.uint8
     changed = (plain != marked).any(axis=(0, 2))
     panels = [changed[8 + n * 328 : 8 + n * 328 + 320] for n in range(4)]
@@ -81,8 +90,23 @@ def test_a_frame_shows_the_action_and_the_heat() -> None:
     top, left = 84 + 200, 8 + 2 * 328 + 120  # of the hot pixel in the third panel
     assert plain[top, left].max() > 200 and plain[top + 20, left].max() < 60
     far = np.array([1e9, -1e9, 0, 0.6, 0.2, 0, 0.04])  # ground-truth agents are not clamped
-    assert draw(sight, far, ("a", "b"), maps=True).shape == plain.shape
-    assert draw(Sight(color, None, None), None, ("a", "b"), maps=False).shape[1] < plain.shape[1]
+    assert draw(sight, far, ("a", "b"), maps=True, grid=TABLE_GRID).shape == plain.shape
+    narrow = draw(Sight(color, None, None), None, ("a", "b"), maps=False, grid=TABLE_GRID)
+    assert narrow.shape[1] < plain.shape[1]
+
+
+def test_marks_stand_where_the_task_sees_the_action() -> None:
+    grid = find_task("cable-mask-goal").grid
+    pick, place = np.array([60, 40]), np.array([250, 120])
+    action = np.array([*grid.to_world(pick), 0, *grid.to_world(place), 0, 0.05])
+    sight = Sight(np.full((*SHAPE, 3), 40, np.uint8), None, None)
+    plain = draw(sight, None, ("a", "b"), maps=True, grid=grid)
+    marked = draw(sight, action, ("a", "b"), maps=True, grid=grid)
+    for panel, pixel in ((1, pick), (2, place)):  # of pick and of place
+        left = 8 + panel * 328
+        changed = (plain != marked).any(axis=2)[84 : 84 + 640, left : left + 320]
+        middle = np.argwhere(changed).mean(axis=0) / 2 - 0.5
+        np.testing.assert_allclose(middle, pixel, atol=0.6)
 
 
 def test_videos_of_evaluated_episodes(run: RunFolder, tmp_path: Path) -> None:

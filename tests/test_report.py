@@ -11,10 +11,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
-from learning.evaluation import Played, summarise
+from learning.evaluation import summarise
+from learning.paper_results import read_paper
+from learning.playing import Played
 from learning.policy import AGENTS
-from learning.report import Point, pool, read_paper, read_runs, write_report
+from learning.report import Point, pool, read_runs, version_notes, write_report
+from learning.report_curves import draw_curves
 from learning.report_tables import compared
 from warp_deform.cli import main
 from warp_deform.errors import InputError
@@ -42,16 +46,27 @@ def write_run(
     seed: int = 0,
     scores: tuple[float, ...] = (1.0, 1.0, 0.5, 0.5),
     schedule: dict[str, Any] | None = None,
+    trained: dict[str, Any] | None = None,
     **info: Any,
 ) -> Path:
-    """A run's folder as training and evaluation leave it, without weights."""
+    """A run's folder as training and evaluation leave it, without weights.
+
+    trained: other settings of `run.json`; info: of `eval_info.json`
+    """
     path.mkdir(parents=True)
     settings = {
-        "agent": {"task": task, "agent": agent},
+        "agent": {"task": task, "agent": agent, "config": {}},
+        "preset": "fast",
         "schedule": schedule or SCHEDULE,
+        "seed": seed,
+        "demonstrations": {str(number): "seal" for number in range(demos)},
         "augment": True,
+        "patience": None,
+        "validate": 0,
         "processes": 1,
-    }
+        "device": "cpu",
+        "versions": {"warp-deform": "1.0.0", "torch": "2.13.0"},
+    } | (trained or {})
     (path / "run.json").write_text(json.dumps(settings))
     snapshots = {"0": [0.0] * 4, "2000": [0.5] * 4, "4000": [1.0, 1.0, 0.5, 0.5]}
     found = {
@@ -139,7 +154,7 @@ def test_results_of_an_earlier_release_are_read(tmp_path: Path) -> None:
 def test_what_differs_stays_apart(tmp_path: Path) -> None:
     write_run(tmp_path / "a")
     write_run(tmp_path / "b", stage_rule="privileged")
-    write_run(tmp_path / "c", schedule={**SCHEDULE, "steps": 100})
+    write_run(tmp_path / "c", schedule={**SCHEDULE, "steps": 100}, trained_steps=100)
     write_run(tmp_path / "d", retry=False, goals="given, 0123")
     write_run(tmp_path / "e", robot="panda", demos=30)
     found = cells(tmp_path)
@@ -169,6 +184,77 @@ def test_runs_that_are_not_one_are_refused(tmp_path: Path) -> None:
         cells(tmp_path / "y")
 
 
+def test_who_demonstrated_and_how_long_is_a_variant(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", trained={"demonstrators": ["scripted"]})
+    write_run(tmp_path / "b", seed=1)  # of a release that did not say
+    write_run(tmp_path / "c", trained={"demonstrators": ["refined"]})
+    write_run(tmp_path / "d", trained={"demonstrators": ["original", "scripted"]})
+    patient = {"patience": 2, "validate": 20}
+    write_run(tmp_path / "e", trained=patient, trained_steps=2000)
+    write_run(tmp_path / "f", seed=1, trained=patient, trained_steps=3000)
+    write_run(tmp_path / "g", schedule={**SCHEDULE, "steps": 8000})
+    write_run(tmp_path / "h", seed=2, trained={"rounded": "bfloat16"}, snapshots={
+        "4000": result(LINE, [1.0, 1.0, 0.5, 0.5])})  # fmt: skip
+    assert {cell.variant: cell.seeds for cell in cells(tmp_path)} == {
+        "fast, 4000 steps": (0, 1, 2),
+        "fast, 4000 steps, refined demonstrations": (0,),
+        "fast, 4000 steps, original and scripted demonstrations": (0,),
+        "fast, up to 4000 steps, patience 2": (0, 1),
+        "fast, 4000 of 8000 steps": (0,),
+    }
+
+
+@pytest.mark.parametrize(
+    ("trained", "info", "told"),
+    [
+        ({"device": "cuda"}, {}, "device"),
+        ({"augment": False}, {}, "augment"),
+        ({}, {"test": result(LINE, [1.0] * 5)}, "test episodes"),
+        ({}, {"snapshots": {"4000": result(LINE, [1.0] * 5)}}, "validation episodes"),
+        ({}, {"paper": {**result(LINE, [1.0] * 4), "snapshot": 4000,
+                        "stage_rule": "privileged"}}, "who chooses the lift"),
+    ],
+)  # fmt: skip
+def test_runs_of_a_cell_are_alike(
+    tmp_path: Path, trained: dict[str, Any], info: dict[str, Any], told: str
+) -> None:
+    paper = {"paper": {**result(LINE, [1.0] * 4), "snapshot": 4000, "stage_rule": "action"}}
+    write_run(tmp_path / "a", **(paper if "paper" in info else {}))
+    write_run(tmp_path / "b", seed=1, trained=trained, **info)
+    with pytest.raises(InputError, match=f"differ in {told}"):
+        cells(tmp_path)
+
+
+def test_other_versions_are_noted(tmp_path: Path) -> None:
+    write_run(tmp_path / "a")
+    newer = {"warp-deform": "1.0.0", "torch": "9.9.9"}
+    write_run(tmp_path / "b", seed=1, trained={"versions": newer})
+    write_run(tmp_path / "c", demos=100, trained={"versions": newer})
+    (note,) = version_notes(read_runs([tmp_path])[0])
+    assert "torch, 2.13.0, 9.9.9" in note and "10 demonstrations" in note
+    found = write_report([tmp_path], None)
+    assert found.data["notes"] == [note] and note in found.text
+
+
+def test_a_privileged_lift_is_labelled(tmp_path: Path) -> None:
+    best = {**result(LINE, [1.0, 0.0]), "snapshot": 4000, "stage_rule": "privileged"}
+    write_run(tmp_path / "a", paper=best)
+    found = write_report([tmp_path / "a"], tmp_path / "out")
+    assert found.data["cells"][0]["paper_protocol_stage_rule"] == "privileged"
+    assert "50.0 (privileged lift)" in found.text
+    (row,) = csv.DictReader((tmp_path / "out" / "report.csv").read_text().splitlines())
+    assert row["paper_protocol_stage_rule"] == "privileged"
+
+
+def test_every_variant_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(9):
+        write_run(tmp_path / str(number), goals=f"given, {number}")
+    drawn = []
+    monkeypatch.setattr(Axes, "errorbar", lambda axes, *_, label, **__: drawn.append(label))
+    draw_curves(cells(tmp_path), read_paper(), tmp_path)
+    assert len(set(drawn)) == 9
+
+
 def test_folders_without_results(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no folder"):
         read_runs([tmp_path / "none"])
@@ -181,9 +267,12 @@ def test_folders_without_results(tmp_path: Path) -> None:
     write_run(tmp_path / "b")
     runs, notes = read_runs([tmp_path])
     assert [each.path.name for each in runs] == ["b"] and "not evaluated" in notes[0]
-    (run / "eval_info.json").write_text('{"task": "cable-ring"}')
-    with pytest.raises(InputError, match="evaluate again"):
-        read_runs([tmp_path])
+    for changes in (None, {"snapshots": {"a": 1}}, {"paper": {}}, {"test": {"n_episodes": 0}}):
+        whole = json.loads((tmp_path / "b" / "eval_info.json").read_text())
+        spoilt = {"task": "cable-ring"} if changes is None else whole | changes
+        (run / "eval_info.json").write_text(json.dumps(spoilt))
+        with pytest.raises(InputError, match="evaluate again"):
+            read_runs([tmp_path])
 
 
 def test_the_command_writes_tables_and_curves(

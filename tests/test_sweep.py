@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from training_samples import write_demonstrations
+from training_samples import block_episode, write_demonstrations
 
 from learning import sweep
 from learning.snapshots import RunFolder
 from learning.sweep import Collecting, Evaluating, read_sweep, run_sweep
 from warp_deform.cli import main
+from warp_deform.episodes import EpisodeWriter
 from warp_deform.errors import InputError, WarpDeformError
 
 TASK = "block-notarget"
@@ -112,6 +113,54 @@ def test_a_run_that_fails_stops_no_other(
     assert "| 0 | 0/1 |" in Path(found["report"]).read_text()
 
 
+def test_a_run_that_breaks_stops_no_other(grid: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error that nobody foresaw is named by its type, on one line."""
+    train = sweep.train
+
+    def broken(config: Any) -> Any:
+        if config.seed == 1:
+            raise RuntimeError("out of memory:\n  tried to allocate 2 GiB")
+        return train(config)
+
+    monkeypatch.setattr(sweep, "train", broken)
+    found = run_sweep(read_sweep(grid), workers=1)
+    said = [each["error"] for each in found["failed"]]
+    assert said == ["RuntimeError: out of memory: tried to allocate 2 GiB"] * 2
+
+
+def test_what_files_are_there_does_not_tell_that_a_collection_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A killed collection holds enough episodes, and not yet those that it would keep."""
+    asked = []
+
+    def collect(config: Any) -> None:
+        asked.append(config.episodes)
+        for seed in 0, 1:  # the first two successes; seed 2 had come in before seed 0
+            writer.write(block_episode(seed, task=TASK))
+        (config.out / "episode_000000002.parquet").unlink()
+
+    monkeypatch.setattr(sweep, "collect", collect)
+    path = tmp_path / "grid.toml"
+    own = GRID.format(root=tmp_path, more="").replace(f'folder = "{tmp_path}/data"', "count = 2")
+    path.write_text(own.replace("demos = [1, 2]", "demos = [2]").replace("[0, 1]", "[0]"))
+    config = read_sweep(path)
+    writer = EpisodeWriter(config.data(TASK), overwrite=True)
+    for seed in 1, 2:
+        writer.write(block_episode(seed, task=TASK))
+    found = run_sweep(config, workers=1)
+    assert asked == [2] and not found["failed"]
+    settings = RunFolder(config.cells()[0].out).read_settings()
+    assert set(settings["demonstrations"]) == {"0", "1"}
+
+
+def test_device_and_validation_reach_the_runs(tmp_path: Path) -> None:
+    path = tmp_path / "grid.toml"
+    path.write_text(GRID.format(root=tmp_path, more='device = "cuda"\nvalidate = 3\npatience = 2'))
+    cells = read_sweep(path).cells()
+    assert {(cell.device, cell.validate, cell.patience) for cell in cells} == {("cuda", 3, 2)}
+
+
 def test_demonstrations_are_collected_where_they_are_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -166,12 +215,17 @@ def test_agents_go_with_the_tasks_that_they_fit(tmp_path: Path) -> None:
         ('"gt-mlp"', '"transporter"', "none of the agents transporter fits block-notarget"),
         ("demos = [1, 2]", "", "'demos' is missing"),
         ("demos = [1, 2]", "demos = 1", "it must be a list, as in"),
-        ("demos = [1, 2]", "demos = [0]", "demos must be 1 or more"),
-        ("demos = [1, 2]", "demos = []", "demos must name at least one"),
-        ("seeds = [0, 1]", "seeds = [0, 0]", "none twice"),
+        ("demos = [1, 2]", "demos = [0]", "demos is 0; it must be 1 or more"),
+        ("demos = [1, 2]", "demos = []", "demos is []; it must name at least one"),
+        ("seeds = [0, 1]", "seeds = [0, 0]", "seeds is [0, 0]; it must name at least one, and"),
+        ("seeds = [0, 1]", "seeds = [0, -1]", "seeds is -1; it must be 0 or more"),
+        ("\nepisodes = 1", "\nepisodes = 0", "evaluation.episodes is 0; it must be 1 or more"),
+        ("[evaluation]", "count = 0\n[evaluation]", "demonstrations.count is 0; it must be 1"),
+        ("batch = 4", 'device = "tpu"', "device is 'tpu'; it must be 'cpu' or 'cuda'"),
+        ("batch = 4", "patience = 2", "patience is 2 and validate 0"),
         ("seeds = [0, 1]", "seeds = [true]", "it must be a whole number"),
         ("steps = 2", "steps = 1.5", "it must be a whole number"),
-        ("snapshots = 1", "snapshots = 9", "snapshots <= steps"),
+        ("snapshots = 1", "snapshots = 9", "snapshots is 9; with steps = 2 it must be 1 to 2"),
         ("untrained = true", "untrained = 1", "it must be true or false"),
         ("batch = 4", 'preset = "quick"', "preset is 'quick'"),
         ("[evaluation]", '[evaluation]\nstage_rule = "none"', "stage_rule is 'none'"),

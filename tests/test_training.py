@@ -1,11 +1,8 @@
-"""Training: the same bits twice and after an interruption, and one line for what cannot be."""
+"""Training: the same bits twice, what agents come to, and one line for what cannot be."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,19 +10,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from training_samples import write_demonstrations
+from episode_samples import with_step
+from training_samples import block_episode, write_demonstrations
 
-from learning import training
+from learning.batches import check_lifts, state_batch
+from learning.dataset import Demonstrations
 from learning.policy import ImagePolicy, RetryingPolicy, StatePolicy, load_policy
+from learning.schedules import Schedule
 from learning.snapshots import RunFolder, read_snapshot
-from learning.training import SCHEDULES, Schedule, TrainConfig, TrainReport, train
+from learning.training import TrainConfig, TrainReport, train
 from warp_deform.cli import main
-from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.episodes import Episode, EpisodeWriter
+from warp_deform.errors import InputError
 
 TASK = "cable-line-notarget"
 SHORT = Schedule(steps=4, batch=1, lr=1e-3, warmup=2, decay=True, ema=0.9, snapshots=2)
 STATES = replace(SHORT, steps=60, batch=16, lr=3e-3)
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")
@@ -56,31 +56,6 @@ def test_the_same_command_gives_the_same_bits(
         assert files[0] == files[1]
     other = train(config(folder, tmp_path / "other", seed=1))
     assert other.weights_hash != report.weights_hash
-
-
-@pytest.mark.parametrize("agent", ["goal-stack", "gt-mlp"])
-def test_an_interrupted_run_goes_on_to_the_same_bits(
-    agent: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = train(config(folder, tmp_path / "whole", agent=agent))
-    calls: list[int] = []
-    name = "image_batch" if agent == "goal-stack" else "state_batch"
-    original = getattr(training, name)
-
-    def interrupted(*args: Any, **options: Any) -> Any:
-        calls.append(1)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return original(*args, **options)
-
-    monkeypatch.setattr(training, name, interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        train(config(folder, tmp_path / "cut", agent=agent))
-    resumed = train(config(folder, tmp_path / "cut", agent=agent))
-    assert len(calls) == 4 + 2, "steps 3 and 4 alone are done again"
-    assert resumed.weights_hash == whole.weights_hash
-    ended = train(config(folder, tmp_path / "cut", agent=agent))
-    assert len(calls) == 6 and ended.weights_hash == whole.weights_hash
 
 
 def test_a_folder_with_another_run_is_refused(
@@ -160,10 +135,69 @@ def test_snapshots_hold_averaged_weights(folder: Path, tmp_path: Path) -> None:
     assert all(torch.equal(each, state[f"weights.{name}"]) for name, each in weights.items())
 
 
-def test_a_loss_that_is_not_finite_ends_the_run(folder: Path, tmp_path: Path) -> None:
-    wild = replace(STATES, lr=1e30, warmup=0)
-    with pytest.raises(WarpDeformError, match="lower the step size"):
-        train(config(folder, tmp_path, agent="gt-mlp", schedule=wild))
+@pytest.mark.parametrize(
+    ("agent", "flags", "expected"),
+    [
+        ("goal-stack", ["--bf16", "--no-augment"], {"exact": False, "bfloat16": True}),
+        ("goal-stack", ["--exact"], {"exact": True, "bfloat16": False}),
+        ("gt-mlp", ["--exact"], {"exact": True}),
+    ],
+)
+def test_switches_reach_the_agent(
+    agent: str, flags: list[str], expected: dict[str, bool], folder: Path, tmp_path: Path
+) -> None:
+    command = ["train", TASK, "--agent", agent, "--data", str(folder), "--out", str(tmp_path)]
+    schedule = ["--preset", "fast", "--steps", "1", "--snapshots", "1"]
+    assert main([*command, *schedule, *flags]) == 0
+    settings = RunFolder(tmp_path).read_settings()
+    made = load_policy(tmp_path).description.config
+    assert {name: made[name] for name in expected} == expected
+    assert settings["augment"] is ("--no-augment" not in flags)
+    policy = load_policy(tmp_path)
+    if isinstance(policy, ImagePolicy):
+        attention = policy.agent.attention
+        assert (attention.exact, attention.network.bfloat16) == tuple(expected.values())
+
+
+def test_without_augmentation_nothing_is_moved(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: Any, **__: Any) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("learning.batches.draw_transform", never)
+    for agent in "goal-stack", "gt-mlp":
+        out = tmp_path / agent
+        one = replace(SHORT, steps=1, snapshots=1)
+        train(config(folder, out, agent=agent, schedule=one, augment=False))
+        with pytest.raises(AssertionError):
+            train(config(folder, tmp_path / f"{agent}-moved", agent=agent, schedule=one))
+
+
+def lifted(lift: float) -> Episode:
+    """An episode whose second action is carried at a height [m]; the stage's is 0.04 m."""
+    made = block_episode(1)
+    return with_step(made, 1, action=np.array([*made.steps[1].action[:6], lift]))
+
+
+def test_a_lift_of_no_stage_is_refused(tmp_path: Path) -> None:
+    writer = EpisodeWriter(tmp_path / "data")
+    writer.write(block_episode(0))
+    writer.write(lifted(0.12))
+    with pytest.raises(InputError) as caught:
+        train(TrainConfig(task=TASK, agent="gt-mlp", data=tmp_path / "data", out=tmp_path / "run"))
+    said = str(caught.value)
+    assert "episode_000000001.parquet lifts to 0.12 m" in said and "stages lift to 0.04 m" in said
+    assert not (tmp_path / "run").exists(), "before anything is trained"
+
+
+def test_a_lift_that_a_robot_makes_of_a_stage_s_is_taken(tmp_path: Path) -> None:
+    EpisodeWriter(tmp_path).write(lifted(0.05))
+    data = Demonstrations(tmp_path, task=TASK)
+    check_lifts(data)
+    assert state_batch(data, (0.04,), count=8, rng=np.random.default_rng(0))[2].tolist() == [0] * 8
+    with pytest.raises(InputError, match=r"lifts to 0\.0[45] m"):
+        state_batch(data, (0.1, 0.3), count=1, rng=np.random.default_rng(0))
 
 
 def test_damaged_and_foreign_snapshots_are_refused(
@@ -195,11 +229,14 @@ def test_damaged_and_foreign_snapshots_are_refused(
         ({"agent": "transporter"}, "does not see; use --agent goal-split"),
         ({"agent": "resnet"}, "there is no agent"),
         ({"preset": "slow"}, "preset is 'slow'"),
-        ({"seed": -1}, "seed"),
-        ({"patience": 2}, "needs validation"),
-        ({"schedule": replace(SHORT, steps=0)}, "1 or more"),
-        ({"schedule": replace(SHORT, lr=0.0)}, "lr must be positive"),
-        ({"device": "tpu"}, "must be 'cpu' or 'cuda'"),
+        ({"seed": -1}, "seed is -1; it must be 0 or more"),
+        ({"threads": 0}, "threads is 0; it must be 1 or more"),
+        ({"validate": -3}, "validate is -3; it must be 0 or more"),
+        ({"patience": 2}, "patience is 2 and validate 0; .* needs validation episodes, 1 or more"),
+        ({"patience": 0, "validate": 1}, "patience is 0; it must be 1 or more"),
+        ({"device": "tpu"}, "device is 'tpu'; it must be 'cpu' or 'cuda'"),
+        ({"agent": "gt-mlp", "bf16": True}, "bf16 is for agents over pictures; gt-mlp has no"),
+        ({"exact": True, "bf16": True}, "bf16 and exact exclude each other"),
     ],
 )
 def test_bad_settings(folder: Path, tmp_path: Path, changes: dict[str, Any], match: str) -> None:
@@ -240,12 +277,6 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert out == "" and len(err.splitlines()) == 1
 
 
-def test_presets_are_the_papers_and_ours() -> None:
-    paper = SCHEDULES["paper"]
-    assert (paper.steps, paper.batch, paper.lr, paper.snapshots) == (20_000, 1, 1e-4, 10)
-    assert (paper.ema, paper.decay, paper.warmup) == (0.0, False, 0)
-
-
 def test_place_yaws_are_chosen_where_they_matter(
     folder: Path, straight: tuple[Path, TrainReport], tmp_path: Path
 ) -> None:
@@ -259,18 +290,3 @@ def test_place_yaws_are_chosen_where_they_matter(
     assert not load_policy(tmp_path / "gt-mlp").description.config["one_rotation"]
     elsewhere = load_policy(straight[0]).description.config
     assert (elsewhere["n_rotations_train"], elsewhere["n_rotations_eval"]) == (1, 1)
-
-
-def test_two_processes_train_together(folder: Path, tmp_path: Path) -> None:
-    """Under torchrun the gradients are averaged, so both end with one set of weights."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2",
-               "-m", "warp_deform", "train", TASK, "--agent", "gt-mlp", "--data", str(folder),
-               "--preset", "fast", "--steps", "4", "--snapshots", "1", "--batch", "4"]  # fmt: skip
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    hashes = []
-    for name in ("first", "second"):
-        out = tmp_path / name
-        subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, env=env)
-        assert json.loads((out / "run.json").read_text())["processes"] == 2
-        hashes.append(RunFolder(out).snapshot(4).read_bytes())
-    assert hashes[0] == hashes[1]

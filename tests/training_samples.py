@@ -10,6 +10,7 @@ from episode_samples import make_episode, with_info
 
 from warp_deform.episodes import Episode, EpisodeWriter
 from warp_deform.rendering.pixels import SHAPE, pixel_to_world
+from warp_deform.tasks.registry import task as find_task
 
 STATE_SIZE = {"cable-ring": 192, "cable-line-notarget": 144, "block-notarget": 6}
 
@@ -22,6 +23,7 @@ def block_episode(seed: int, *, task: str = "cable-line-notarget", actions: int 
     rng = np.random.default_rng(seed)
     middles = rng.integers([60, 40], [260, 120], size=(actions + 1, 2))
     made = make_episode(seed, actions=actions, size=SHAPE, goal=task.endswith("notarget"))
+    lift = find_task(task).stages[0].lift
     steps = []
     for t, step in enumerate(made.steps):
         row, column = middles[t]
@@ -32,7 +34,7 @@ def block_episode(seed: int, *, task: str = "cable-line-notarget", actions: int 
         action = None
         if t < actions:
             pick, place = pixel_to_world(middles[t]), pixel_to_world(middles[t + 1])
-            action = np.array([*pick, 0.0, *place, 0.0, 0.04])
+            action = np.array([*pick, 0.0, *place, 0.0, lift])
         truth = np.zeros(STATE_SIZE[task], np.float32)
         truth[:2] = pixel_to_world(middles[t])
         steps.append(

@@ -1,0 +1,97 @@
+"""How long and in which steps to train: the paper's schedules, and ours for two CPU cores.
+
+Source: Seita et al., ICRA 2021, appendix on training.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from warp_deform.errors import InputError
+
+__all__ = ["SCHEDULES", "STATE_SCHEDULES", "Schedule", "preset_schedule"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """How long and in which steps to train."""
+
+    steps: int
+    """Steps of the optimiser, which the original calls iterations."""
+    batch: int
+    """Moments a step and process."""
+    lr: float
+    """Greatest step size of Adam."""
+    warmup: int = 0
+    """Steps over which the step size grows from 0."""
+    decay: bool = False
+    """Let the step size fall to 0 like a cosine."""
+    ema: float = 0.0
+    """Snapshots hold weights averaged over 1 / (1 - ema) steps or so; 0: weights as they are."""
+    snapshots: int = 10
+    """Snapshots, evenly spread, the last one at the end."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 1), ("batch", 1), ("snapshots", 1), ("warmup", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be {least} or more")
+        if self.snapshots > self.steps:
+            raise InputError(
+                f"snapshots is {self.snapshots}; with steps = {self.steps} it must be 1 to "
+                f"{self.steps}"
+            )
+        if not 0 < self.lr < math.inf:
+            raise InputError(f"lr is {self.lr}; it must be a positive number")
+        if not 0 <= self.ema < 1:
+            raise InputError(f"ema is {self.ema}; it must be 0 or more and less than 1")
+
+    def snapshot_steps(self) -> tuple[int, ...]:
+        """Steps after which a snapshot is kept.
+
+        >>> Schedule(steps=10, batch=1, lr=1.0, snapshots=4).snapshot_steps()
+        (2, 5, 8, 10)
+        """
+        n = self.snapshots
+        return tuple(round(k * self.steps / n) for k in range(1, n + 1))
+
+    def lr_at(self, step: int) -> float:
+        """Step size at a step, counted from 1."""
+        grown = min(1.0, step / self.warmup) if self.warmup else 1.0
+        fallen = 0.5 * (1 + math.cos(math.pi * (step - 1) / self.steps)) if self.decay else 1.0
+        return self.lr * grown * fallen
+
+    def kept_at(self, step: int) -> float:
+        """How much of the average of the weights is kept at a step.
+
+        It is less at first, so that the initial weights are forgotten.
+        """
+        return min(self.ema, step / (step + 10.0)) if self.ema else 0.0
+
+
+SCHEDULES = {
+    "paper": Schedule(steps=20_000, batch=1, lr=1e-4),
+    "fast": Schedule(steps=4000, batch=1, lr=1e-3, warmup=100, decay=True, ema=0.998, snapshots=4),
+}
+"""By the names of the command line, for agents over pictures."""
+STATE_SCHEDULES = {
+    "paper": Schedule(steps=20_000, batch=128, lr=2e-4),
+    "fast": Schedule(steps=4000, batch=128, lr=1e-3, warmup=100, decay=True, ema=0.99, snapshots=4),
+}
+"""The same for the ground-truth baselines."""
+
+_LONGER = Schedule(steps=40_000, batch=1, lr=1e-4)
+_LONGER_TASK, _LONGER_FROM = "bag-color-goal", 100
+
+
+def preset_schedule(preset: str, *, task: str, demos: int, sees_state: bool) -> Schedule:
+    """A preset's schedule for a task and a number of demonstrations.
+
+    The paper's agents over pictures train for twice as long on bag-color-goal with 100
+    demonstrations or more.
+    """
+    if sees_state:
+        return STATE_SCHEDULES[preset]
+    if preset == "paper" and task == _LONGER_TASK and demos >= _LONGER_FROM:
+        return _LONGER
+    return SCHEDULES[preset]

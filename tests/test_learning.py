@@ -1,0 +1,56 @@
+"""Three minutes from nothing: demonstrations, training, and places that were never shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from learning.dataset import Demonstrations
+from learning.policy import ImagePolicy, load_policy
+from learning.schedules import SCHEDULES
+from learning.snapshots import RunFolder
+from learning.training import TrainConfig, train
+from warp_deform.collect import CollectConfig, collect
+
+TASK = "cable-shape"
+
+
+def place_errors(snapshot: Path, held_out: Demonstrations) -> np.ndarray:
+    """Distances [m] of the most probable places, given the demonstrator's picks, from its own."""
+    policy = load_policy(snapshot)
+    assert isinstance(policy, ImagePolicy)
+    agent, grid = policy.agent, held_out.task.grid
+    errors = []
+    for episode, length in enumerate(held_out.lengths()):
+        for t in range(length):
+            moment = held_out.moment(episode, t)
+            image = agent.image((moment.color, moment.height))
+            pick = agent.config.to_network(grid.to_pixel(moment.action[:2]))
+            with torch.no_grad():
+                heat = agent.transport(image[None], torch.from_numpy(pick)[None])[0, 0].numpy()
+            best = np.array(np.unravel_index(heat.argmax(), heat.shape))
+            place = grid.to_world(agent.config.to_camera(best))
+            errors.append(np.linalg.norm(place - moment.action[3:5]))
+    return np.array(errors)
+
+
+@pytest.mark.timeout(900)
+def test_held_out_places_are_learnt_in_three_minutes(tmp_path: Path) -> None:
+    collect(CollectConfig(task=TASK, episodes=10, out=tmp_path / "demos"))
+    collect(CollectConfig(task=TASK, episodes=10, seed=50_000, out=tmp_path / "held-out"))
+    schedule = replace(SCHEDULES["fast"], steps=400, snapshots=1)
+    out = tmp_path / "run"
+    train(
+        TrainConfig(
+            task=TASK, agent="transporter", data=tmp_path / "demos", out=out, preset="fast",
+            schedule=schedule, untrained=True,
+        )
+    )  # fmt: skip
+    held_out = Demonstrations(tmp_path / "held-out", task=TASK)
+    before, after = (place_errors(RunFolder(out).snapshot(step), held_out) for step in (0, 400))
+    assert len(before) > 30
+    assert np.median(after) < np.median(before) / 3

@@ -1,0 +1,83 @@
+"""How long to train: the paper's numbers, snapshots, and one line for what cannot be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from learning.schedules import SCHEDULES, STATE_SCHEDULES, Schedule, preset_schedule
+from learning.training import TrainConfig
+from warp_deform.errors import InputError
+
+
+def test_presets_are_the_papers_and_ours() -> None:
+    paper = SCHEDULES["paper"]
+    assert (paper.steps, paper.batch, paper.lr, paper.snapshots) == (20_000, 1, 1e-4, 10)
+    assert (paper.ema, paper.decay, paper.warmup) == (0.0, False, 0)
+    assert SCHEDULES["fast"].snapshot_steps() == (1000, 2000, 3000, 4000)
+
+
+@pytest.mark.parametrize(
+    ("task", "demos", "preset", "sees_state", "steps"),
+    [
+        ("bag-color-goal", 100, "paper", False, 40_000),
+        ("bag-color-goal", 1000, "paper", False, 40_000),
+        ("bag-color-goal", 10, "paper", False, 20_000),
+        ("bag-color-goal", 100, "fast", False, 4000),
+        ("bag-color-goal", 100, "paper", True, 20_000),
+        ("bag-items-1", 1000, "paper", False, 20_000),
+    ],
+)
+def test_bags_by_color_train_for_longer(
+    task: str, demos: int, preset: str, sees_state: bool, steps: int
+) -> None:
+    found = preset_schedule(preset, task=task, demos=demos, sees_state=sees_state)
+    assert found.steps == steps
+    agent = "gt-mlp" if sees_state else "goal-split" if "goal" in task else "transporter"
+    config = TrainConfig(
+        task=task, agent=agent, data=Path("none"), out=Path("none"), demos=demos, preset=preset
+    )
+    assert config.plan == found
+    if sees_state:
+        assert found == STATE_SCHEDULES[preset]
+
+
+def test_without_a_number_the_demonstrations_of_the_folder_count(tmp_path: Path) -> None:
+    config = TrainConfig(task="bag-color-goal", agent="goal-stack", data=tmp_path, out=tmp_path)
+    assert config.plan.steps == 20_000
+    for seed in range(100):
+        (tmp_path / f"episode_{seed:09d}.parquet").touch()
+    assert config.plan.steps == 40_000
+
+
+@settings(derandomize=True, deadline=None, max_examples=200)
+@given(st.integers(1, 400).flatmap(lambda n: st.tuples(st.just(n), st.integers(n, 5000))))
+def test_snapshots_are_as_many_as_asked_for_and_evenly_spread(numbers: tuple[int, int]) -> None:
+    n, steps = numbers
+    found = Schedule(steps=steps, batch=1, lr=1.0, snapshots=n).snapshot_steps()
+    assert len(set(found)) == n and found[-1] == steps and found[0] >= 1
+    assert all(abs(step - k * steps / n) <= 0.5 for k, step in enumerate(found, start=1))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 0}, "steps is 0; it must be 1 or more"),
+        ({"batch": -2}, "batch is -2; it must be 1 or more"),
+        ({"snapshots": 0}, "snapshots is 0; it must be 1 or more"),
+        ({"snapshots": 9}, "snapshots is 9; with steps = 4 it must be 1 to 4"),
+        ({"warmup": -1}, "warmup is -1; it must be 0 or more"),
+        ({"lr": 0.0}, "lr is 0.0; it must be a positive number"),
+        ({"lr": float("nan")}, "lr is nan; it must be a positive number"),
+        ({"ema": 1.0}, "ema is 1.0; it must be 0 or more and less than 1"),
+    ],
+)
+def test_what_is_out_of_range_is_named(changes: dict[str, Any], message: str) -> None:
+    values: dict[str, Any] = {"steps": 4, "batch": 1, "lr": 1e-3, "snapshots": 2} | changes
+    with pytest.raises(InputError) as caught:
+        Schedule(**values)
+    assert str(caught.value) == message
