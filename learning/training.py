@@ -38,7 +38,7 @@ from .dataset import Demonstrations
 from .log import LINE_STEPS, TrainingLog
 from .models.adam import KerasAdam
 from .models.gt_state import GtStateConfig
-from .models.transporter import PRESETS, Transporter
+from .models.transporter import PRESETS, Transporter, TransporterConfig
 from .policy import AGENTS, Agent, AgentDescription, make_agent
 from .processes import DEVICES, Process, join_processes
 from .schedules import SCHEDULES, Schedule, preset_schedule
@@ -56,6 +56,7 @@ class TrainConfig:
 
     demos: demonstrations to learn from, drawn by `seed`; None takes all that `data` holds
     schedule: None takes the preset's
+    network: None takes the preset's; rotations and lifts are the task's in any case
     augment: turn and shift what is seen at random
     exact: compute by the original's operations, several times slower
     bf16: convolve in bfloat16, agents over pictures alone
@@ -74,6 +75,7 @@ class TrainConfig:
     seed: int = 0
     preset: str = "paper"
     schedule: Schedule | None = None
+    network: TransporterConfig | None = None
     augment: bool = True
     exact: bool = False
     bf16: bool = False
@@ -104,8 +106,9 @@ class TrainConfig:
                     f"patience is {self.patience} and validate 0; stopping early needs validation "
                     "episodes, 1 or more"
                 )
-        if self.bf16 and self._sees_state:
-            raise InputError(f"bf16 is for agents over pictures; {self.agent} has no convolutions")
+        for name in ("bf16", "network"):
+            if getattr(self, name) and self._sees_state:
+                raise InputError(f"{name} is for agents over pictures; {self.agent} has its own")
         if self.bf16 and self.exact:
             raise InputError("bf16 and exact exclude each other: the original computes in float32")
 
@@ -240,14 +243,14 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
     """The agent for a task at a preset."""
     lifts, yaws = task_lifts(data.task), data.task.place_yaws
     if issubclass(AGENTS[config.agent], Transporter):
-        preset = PRESETS[config.preset]
+        chosen = config.network or PRESETS[config.preset]
         sizes = replace(
-            preset,
+            chosen,
             lifts=lifts,
-            n_rotations_train=max(preset.n_rotations_train, yaws),
+            n_rotations_train=max(chosen.n_rotations_train, yaws),
             n_rotations_eval=yaws,
-            exact=config.exact or preset.exact,
-            bfloat16=config.bf16 or preset.bfloat16,
+            exact=config.exact or chosen.exact,
+            bfloat16=config.bf16 or chosen.bfloat16,
         )
         return AgentDescription(task=config.task, agent=config.agent, config=asdict(sizes))
     return AgentDescription(

@@ -1,0 +1,162 @@
+"""What makes `fast` learn from few demonstrations: variants, trained alike, on unseen ones.
+
+    python benchmarks/ablation.py [--task cable-shape] [--variants fast "no skips" ...]
+
+Every variant differs from `fast` in one thing, and sees the same demonstrations for as many steps
+(as many pictures where the batch is larger). It is judged on demonstrations of validation seeds: by
+the mean negative log-likelihood of the demonstrator's pick and place [nat], and by the distance of
+the most probable place from the demonstrator's, given the pick: its median [mm] and the share below
+20 mm. With --episodes also by how it plays validation seeds, without retries. Rows are added to
+--out; those that it has are not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from learning.dataset import Demonstrations
+from learning.evaluation import evaluate_snapshot
+from learning.models.transporter import PRESETS
+from learning.policy import ImagePolicy, load_policy
+from learning.protocol import Protocol
+from learning.schedules import SCHEDULES
+from learning.snapshots import RunFolder
+from learning.training import TrainConfig, train
+from warp_deform.collect import CollectConfig, collect
+from warp_deform.quiet import quiet_warp
+from warp_deform.tasks.registry import task as find_task
+
+FAST = PRESETS["fast"]
+PLAN = SCHEDULES["fast"]
+VARIANTS: dict[str, dict[str, Any]] = {
+    "fast": {},
+    "no skips": {"network": replace(FAST, skips=False)},
+    "no gain": {"network": replace(FAST, gain=1.0)},
+    "no goal bias": {"network": replace(FAST, goal_bias=0.0)},
+    "half width": {"network": replace(FAST, width=0.5)},
+    "crop of 64": {"network": replace(FAST, crop=64)},
+    "no augmentation": {"augment": False},
+    "no averaging": {"schedule": replace(PLAN, ema=0.0)},
+    "no decay": {"schedule": replace(PLAN, decay=False)},
+    "half the step size": {"schedule": replace(PLAN, lr=PLAN.lr / 2)},
+    "twice the step size": {"schedule": replace(PLAN, lr=PLAN.lr * 2)},
+    "batch of 4": {"schedule": replace(PLAN, batch=4)},
+}
+VALIDATION_SEED = 50_000
+NEAR_MM = 20.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--task", default="cable-shape")
+    parser.add_argument("--demos", type=int, default=10)
+    parser.add_argument("--held-out", type=int, default=30, help="demonstrations to be judged on")
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--episodes", type=int, default=0, help="validation episodes to play")
+    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS)
+    parser.add_argument("--folder", type=Path, default=Path("runs/ablation"))
+    parser.add_argument("--out", type=Path, default=Path("runs/ablation.jsonl"))
+    options = parser.parse_args()
+    quiet_warp()
+    for name in options.variants:
+        row = judge(name, options)
+        print(json.dumps(row), flush=True)
+
+
+def judge(name: str, options: argparse.Namespace) -> dict[str, Any]:
+    """The variant's row: from the file, or made now."""
+    what = {"task": options.task, "demos": options.demos, "steps": options.steps,
+            "seed": options.seed, "variant": name, "episodes": options.episodes}  # fmt: skip
+    if options.out.exists():
+        for line in options.out.read_text().splitlines():
+            row: dict[str, Any] = json.loads(line)
+            if all(row[key] == value for key, value in what.items()):
+                return row
+    data = {
+        split: options.folder / f"{options.task}-{split}" for split in ("training", "validation")
+    }
+    collect(CollectConfig(task=options.task, episodes=options.demos, out=data["training"]))
+    collect(
+        CollectConfig(
+            task=options.task, episodes=options.held_out, seed=VALIDATION_SEED,
+            out=data["validation"],
+        )
+    )  # fmt: skip
+    changes = dict(VARIANTS[name])
+    plan = changes.pop("schedule", PLAN)
+    plan = replace(plan, steps=options.steps // plan.batch, snapshots=1)
+    agent = "goal-split" if find_task(options.task).goal_conditioned else "transporter"
+    label = "-".join(str(value) for value in what.values()).replace(" ", "_")
+    run = RunFolder(options.folder / label)
+    began = time.process_time()
+    train(
+        TrainConfig(
+            task=options.task, agent=agent, data=data["training"], out=run.path,
+            seed=options.seed, preset="fast", schedule=plan, **changes,
+        )
+    )  # fmt: skip
+    row = {**what, "agent": agent, "cpu_s": time.process_time() - began}
+    row |= held_out(run, Demonstrations(data["validation"], task=options.task))
+    if options.episodes:
+        protocol = Protocol(split="validation", episodes=options.episodes, retry=False)
+        found = evaluate_snapshot(run, plan.steps, protocol).summary
+        row |= {key: found[key] for key in ("mean_score", "standard_error", "pc_success")}
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with options.out.open("a") as file:
+        file.write(json.dumps(row) + "\n")
+    return row
+
+
+@torch.no_grad()
+def held_out(run: RunFolder, data: Demonstrations) -> dict[str, float]:
+    """Likelihoods and distances over every moment of demonstrations that were not trained on."""
+    policy = load_policy(run.path)
+    assert isinstance(policy, ImagePolicy)
+    agent, grid = policy.agent, data.task.grid
+    config = agent.config
+    moments = [(e, t) for e, length in enumerate(data.lengths()) for t in range(length)]
+    likelihoods, distances = [], []
+    for moment in (data.moment(*each) for each in moments):
+        goal = (moment.goal_color, moment.goal_height) if agent.pictures == 2 else None
+        image = agent.image((moment.color, moment.height), goal)[None]
+        pick, place = (
+            torch.from_numpy(config.to_network(grid.to_pixel(xy)))[None]
+            for xy in (moment.action[:2], moment.action[3:5])
+        )
+        turn = moment.action[2] - moment.action[5]
+        n = config.n_rotations_eval
+        heats = agent.attention(image), agent.transport(image, pick, n_rotations=n)[0]
+        row = [
+            -torch.log_softmax(heat.flatten(), 0)
+            .unflatten(0, heat.shape)[k, pixel[0, 0], pixel[0, 1]]
+            .item()
+            for heat, pixel, k in zip(
+                heats, (pick, place), (0, round(turn * n / (2 * np.pi)) % n), strict=True
+            )
+        ]
+        likelihoods.append(row)
+        best = int(heats[1].argmax()) % (config.shape[0] * config.shape[1])
+        at = np.array([best // config.shape[1], best % config.shape[1]])
+        distances.append(np.linalg.norm(grid.to_world(config.to_camera(at)) - moment.action[3:5]))
+    millimetres = 1e3 * np.array(distances)
+    picks, places = np.mean(likelihoods, axis=0)
+    return {
+        "moments": len(moments),
+        "pick_nat": float(picks),
+        "place_nat": float(places),
+        "place_mm": float(np.median(millimetres)),
+        "near": float((millimetres < NEAR_MM).mean()),
+    }
+
+
+if __name__ == "__main__":
+    main()
