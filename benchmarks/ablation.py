@@ -44,6 +44,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "half width": {"network": replace(FAST, width=0.5)},
     "crop of 64": {"network": replace(FAST, crop=64)},
     "no augmentation": {"augment": False},
+    "no mirror images": {"schedule": replace(PLAN, mirror=False)},
     "no averaging": {"schedule": replace(PLAN, ema=0.0)},
     "no decay": {"schedule": replace(PLAN, decay=False)},
     "half the step size": {"schedule": replace(PLAN, lr=PLAN.lr / 2)},

@@ -53,21 +53,28 @@ displacements x, y, -yaw / 15; or something that does not move, as colours."""
 
 @dataclass(frozen=True)
 class RigidTransform:
-    """A turn about the middle of the picture, then a shift.
+    """A mirror image or not, a turn about the middle of the picture, then a shift.
 
     turn: [rad], from x to y, which is from columns to rows in a picture too
     shift: along x (columns) and y (rows) [pixels]
     grid: where on the table the pixels are
+    mirror: swap left and right, which are rows, first
     """
 
     turn: float
     shift: tuple[float, float]
     grid: PixelGrid = TABLE_GRID
+    mirror: bool = False
+
+    @property
+    def handed(self) -> float:
+        """What angles are multiplied by: 1, or -1 in a mirror image."""
+        return -1.0 if self.mirror else 1.0
 
     def matrix(self) -> np.ndarray:
         """(2, 3) float64, of column and row [pixels]."""
         c, s = math.cos(self.turn), math.sin(self.turn)
-        linear = np.array([[c, -s], [s, c]])
+        linear = np.array([[c, -s], [s, c]]) @ np.diag([1.0, self.handed])
         return np.column_stack([linear, _PIVOT + self.shift - linear @ _PIVOT])
 
     def of_pixels(self, pixels: np.ndarray) -> np.ndarray:
@@ -89,22 +96,25 @@ def draw_transform(
     rng: np.random.Generator,
     grid: PixelGrid = TABLE_GRID,
     copies: int | None = None,
+    mirror: bool = False,
 ) -> RigidTransform:
     """A random transform that keeps pick and place of `action` (7,) within the picture.
 
     copies: turn by one of so many even parts of a circle; None: by any angle, small ones more often
+    mirror: every second one is a mirror image
 
     Raises:
         InputError: pick and place lie too far apart for one picture.
     """
     pixels = grid.to_pixel(np.stack([action[:2], action[3:5]]))
+    mirrored = mirror and rng.random() < 0.5
     for _ in range(_MOST_DRAWS):
         if copies is None:
             turn = float(rng.normal(0.0, _TURN))
         else:
             turn = 2 * math.pi * int(rng.integers(copies)) / copies
         x, y = rng.normal(0.0, _SHIFT, size=2)
-        drawn = RigidTransform(turn, (float(x), float(y)), grid)
+        drawn = RigidTransform(turn, (float(x), float(y)), grid, mirrored)
         moved = np.round(drawn.of_pixels(pixels))
         if ((moved >= 0) & (moved < SHAPE)).all():
             return drawn
@@ -128,8 +138,9 @@ def move_picture(
 
 
 def move_action(action: np.ndarray, transform: RigidTransform) -> np.ndarray:
-    """An action (7,) with pick and place moved; yaws stay, as in the original."""
+    """An action (7,) with pick and place moved; yaws stay, as in the original, or are mirrored."""
     moved = np.array(action, dtype=float)
+    moved[[2, 5]] *= transform.handed
     moved[[0, 1]], moved[[3, 4]] = transform.of_world(np.stack([action[:2], action[3:5]]))
     return moved
 
@@ -148,6 +159,6 @@ def move_state(task: str, state: np.ndarray, transform: RigidTransform) -> np.nd
     placed, turned = (kind == _POSE) | (kind == _POINT), kind == _POSE
     rows[placed, :2] = transform.of_world(rows[placed, :2])
     rows[kind == _VECTOR, :2] = rows[kind == _VECTOR, :2] @ transform.matrix()[:, :2].T
-    yaw = -YAW_SCALE * rows[turned, 2] + transform.turn
+    yaw = -YAW_SCALE * rows[turned, 2] * transform.handed + transform.turn
     rows[turned, 2] = -np.array([wrap_angle(each) for each in yaw]) / YAW_SCALE
     return rows.ravel().astype(np.float32)

@@ -53,22 +53,29 @@ def image_batch(
     count: int,
     rng: np.random.Generator,
     augment: bool = True,
+    mirror: bool = False,
 ) -> Batch:
     """`count` moments, drawn and moved by `rng`, as an agent over pictures sees them.
+
+    mirror: show every second one mirrored, where mirror images are scenes of the task
 
     Raises:
         InputError: a pick or place is out of view, or a lift is no stage's.
     """
     images, picks, places, thetas, lifts = [], [], [], [], []
-    grid, copies = data.task.grid, data.task.rotated_copies
+    grid, copies, mirrors = data.task.grid, data.task.rotated_copies, data.task.mirrors
     for _ in range(count):
         moment = data.moment(*data.draw(rng))
         pictures = [(moment.color, moment.height)]
         if agent.pictures == 2:
             pictures.append((moment.goal_color, moment.goal_height))
         pixels = grid.to_pixel(np.stack([moment.action[:2], moment.action[3:5]]))
+        turn = moment.action[2] - moment.action[5]
         if augment:
-            moved = draw_transform(moment.action, rng=rng, grid=grid, copies=copies)
+            moved = draw_transform(
+                moment.action, rng=rng, grid=grid, copies=copies, mirror=mirror and mirrors
+            )
+            turn *= moved.handed
             pictures = [move_picture(*picture, moved) for picture in pictures]
             pixels = np.round(moved.of_pixels(pixels)).astype(np.int64)
         if not ((pixels >= 0) & (pixels < SHAPE)).all():
@@ -77,7 +84,7 @@ def image_batch(
         pick, place = agent.config.to_network(pixels)
         picks.append(pick)
         places.append(place)
-        thetas.append(moment.action[2] - moment.action[5])
+        thetas.append(turn)
         lifts.append(_lift_index(moment.action, agent.config.lifts))
     return Batch(
         torch.stack(images),

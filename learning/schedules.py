@@ -29,6 +29,8 @@ class Schedule:
     """Let the step size fall to 0 like a cosine."""
     ema: float = 0.0
     """Snapshots hold weights averaged over 1 / (1 - ema) steps or so; 0: weights as they are."""
+    mirror: bool = False
+    """Learn from mirror images, too, where the task has them."""
     snapshots: int = 10
     """Snapshots, evenly spread, the last one at the end."""
 
@@ -71,7 +73,9 @@ class Schedule:
 
 SCHEDULES = {
     "paper": Schedule(steps=20_000, batch=1, lr=1e-4),
-    "fast": Schedule(steps=4000, batch=1, lr=1e-3, warmup=100, decay=True, ema=0.998, snapshots=4),
+    "fast": Schedule(
+        steps=4000, batch=1, lr=1e-3, warmup=100, decay=True, ema=0.998, mirror=True, snapshots=4
+    ),
 }
 """By the names of the command line, for agents over pictures."""
 STATE_SCHEDULES = {

@@ -192,7 +192,7 @@ def train(config: TrainConfig) -> TrainReport:
                     break
                 # A batch that depends on nothing but seed, step and rank
                 rng = np.random.default_rng([_STREAM, config.seed, step, rank])
-                inputs = _batch(data, agent, plan.batch, config.augment, rng, device)
+                inputs = _batch(data, agent, plan, config.augment, rng, device)
 
                 # One step of the optimiser
                 lr = optimizer.param_groups[0]["lr"] = plan.lr_at(step)
@@ -303,16 +303,18 @@ def _claim(
 def _batch(
     data: Demonstrations,
     agent: Agent,
-    count: int,
+    plan: Schedule,
     augment: bool,
     rng: np.random.Generator,
     device: torch.device,
 ) -> tuple[Any, ...]:
     """Arguments of the agent's losses."""
     if isinstance(agent, Transporter):
-        batch = image_batch(data, agent, count=count, rng=rng, augment=augment)
+        batch = image_batch(
+            data, agent, count=plan.batch, rng=rng, augment=augment, mirror=plan.mirror
+        )
         return (batch._replace(image=batch.image.to(device)),)
-    tensors = state_batch(data, agent.config.lifts, count=count, rng=rng, augment=augment)
+    tensors = state_batch(data, agent.config.lifts, count=plan.batch, rng=rng, augment=augment)
     return tuple(each.to(device) for each in tensors)
 
 

@@ -64,6 +64,39 @@ def test_drawn_transforms_keep_both_pixels_in_view_and_have_the_papers_spread() 
         assert ((moved >= 0) & (moved < SHAPE)).all()
 
 
+@settings(derandomize=True, deadline=None, max_examples=30)
+@given(turns, shifts)
+def test_a_mirror_image_moves_pictures_actions_and_states_alike(
+    turn: float, shift: tuple[float, float]
+) -> None:
+    moved = RigidTransform(turn, shift, mirror=True)
+    assert np.linalg.det(moved.matrix()[:, :2]) == pytest.approx(-1.0)
+    color, height = np.zeros((*SHAPE, 3), np.uint8), np.zeros(SHAPE, np.float32)
+    height[149:152, 89:92] = 0.1
+    _, seen = move_picture(color, height, moved)
+    row, column = moved.of_pixels(np.array([[150, 90]]))[0]
+    assert np.argwhere(seen).mean(axis=0) == pytest.approx([row, column], abs=1.0)
+    # A body that turns with the place: its mirror image turns the other way.
+    heading = np.array([math.cos(ACTION[5]), math.sin(ACTION[5])])
+    ahead = moved.of_world(np.stack([ACTION[3:5], ACTION[3:5] + 0.1 * heading]))
+    action = move_action(ACTION, moved)
+    assert action[3:5] == pytest.approx(ahead[0]) and action[5] == -ACTION[5]
+    state = np.zeros(6, np.float32)
+    state[:3] = pose_rows(np.array([*ACTION[3:5], 0.02]), ACTION[5])
+    pointed = move_state("block-notarget", state, moved)
+    yaw = -15.0 * pointed[2]
+    assert np.array([math.cos(yaw), math.sin(yaw)]) == pytest.approx(
+        (ahead[1] - ahead[0]) / 0.1, abs=1e-5
+    )
+
+
+def test_every_second_one_is_mirrored_where_wanted() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [draw_transform(ACTION, rng=rng, mirror=True).mirror for _ in range(400)]
+    assert 160 < sum(drawn) < 240
+    assert not any(draw_transform(ACTION, rng=rng).mirror for _ in range(50))
+
+
 def test_what_fits_no_picture_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(augmentation, "_MOST_DRAWS", 20)
     far = np.array([0.3, -3.0, 0.0, 0.6, 3.0, 0.0, 0.04])

@@ -127,6 +127,8 @@ class Task(abc.ABC):
     """Which point of the table every pixel of an observation is."""
     rotated_copies: ClassVar[int | None] = None
     """Into how many turns of a circle augmentation turns a picture; None: by any angle."""
+    mirrors: ClassVar[bool] = True
+    """Whether mirror images of scenes and actions are scenes and actions of the task, too."""
     place_yaws: ClassVar[int] = 1
     """Place yaws to choose among, evenly spread; 1 where the yaw does not matter."""
 
