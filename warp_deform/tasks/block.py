@@ -43,7 +43,6 @@ class BlockNotarget(Task):
     goal_conditioned = True
     max_actions = 2
     stages = (Stage(lift=0.30, speed=0.5),)
-    mirrors = False  # an L with arms of two lengths is no mirror image of itself turned
     place_yaws = 24
     success_score = 1.0
     ground_truth_size = 6
