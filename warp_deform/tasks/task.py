@@ -128,7 +128,7 @@ class Task(abc.ABC):
     rotated_copies: ClassVar[int | None] = None
     """Into how many turns of a circle augmentation turns a picture; None: by any angle."""
     mirrors: ClassVar[bool] = True
-    """Whether mirror images of scenes and actions are the task's, too; an L of equal arms is its own."""
+    """Whether mirror images of scenes and actions are the task's, too."""
     place_yaws: ClassVar[int] = 1
     """Place yaws to choose among, evenly spread; 1 where the yaw does not matter."""
 
