@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from .env import PickPlaceEnv
 from .errors import InputError
-from .rendering.pixels import SHAPE, world_to_pixel
+from .rendering.pixels import SHAPE
 from .spaces import action_space
 from .tasks.task import Stage, Task
 from .vector_env import PickPlaceVectorEnv
@@ -108,7 +108,7 @@ def stage_at(worlds: Worlds, slot: int, pose: np.ndarray, previous: Stage | None
     snapshot = worlds.episodes[slot].snapshot
     segment = 0
     if np.isfinite(pose[:2]).all():  # what is not finite is for the environment to refuse
-        row, column = world_to_pixel(pose[:2])
+        row, column = task.grid.to_pixel(pose[:2])
         if 0 <= row < SHAPE[0] and 0 <= column < SHAPE[1]:
             segment = int(snapshot.images.segmentation[row, column])
     return task.privileged_stage(segment, snapshot, previous)
