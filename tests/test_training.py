@@ -235,7 +235,7 @@ def test_damaged_and_foreign_snapshots_are_refused(
         ({"patience": 2}, "patience is 2 and validate 0; .* needs validation episodes, 1 or more"),
         ({"patience": 0, "validate": 1}, "patience is 0; it must be 1 or more"),
         ({"device": "tpu"}, "device is 'tpu'; it must be 'cpu' or 'cuda'"),
-        ({"agent": "gt-mlp", "bf16": True}, "bf16 is for agents over pictures; gt-mlp has no"),
+        ({"agent": "gt-mlp", "bf16": True}, "bf16 is for agents over pictures; gt-mlp has its own"),
         ({"exact": True, "bf16": True}, "bf16 and exact exclude each other"),
     ],
 )
