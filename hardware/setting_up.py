@@ -102,14 +102,13 @@ def measure_table(
         raise InputError(
             "give --table-z, a height [m] in the base frame that is 1 to 3 cm below the foam's top"
         )
-    if config.robot not in REAL_ROBOTS or not config.execute:
-        raise InputError("touching the table moves an arm: give --robot panda and --execute")
-    limits = SafetyLimits(table=TablePlane(provisional_z), max_joint_speed=config.joint_speed)
+    arm = _arm(config, TablePlane(provisional_z))
+    limits = arm.limits
     (x0, x1), (y0, y1) = limits.x, limits.y
     corners = [(x, y) for x, y in ((x0, y0), (x0, y1), (x1, y1), (x1, y0), ((x0 + x1) / 2, 0.0))]
     middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
     inside = [tuple(np.add(c, _INSET * np.sign(middle - c)).tolist()) for c in corners]
-    with SafeRobot(open_robot(config), limits) as robot:
+    with arm as robot:
         robot.home()
         points = touch(robot, inside)
         robot.home()
@@ -148,11 +147,8 @@ def measure_camera(
     """
     operator = operator or Terminal()
     table = _table(config.setup / "table.json")
-    if robot is None and (config.robot not in REAL_ROBOTS or not config.execute):
-        raise InputError("calibrating the camera moves an arm: give --robot panda and --execute")
-    limits = SafetyLimits(table=table, max_joint_speed=config.joint_speed)
-    lens = read_intrinsics(config.setup / "lens.json") if config.camera == "uvc" else None
-    with robot or SafeRobot(open_robot(config), limits) as arm:
+    lens = _lens(config)
+    with robot or _arm(config, table) as arm:
         if not operator.wait("lay the board flat into the workspace; the arm then goes home"):
             raise InputError("stopped; nothing was written")
         arm.home()
@@ -205,14 +201,11 @@ def measure_hand_eye(
     """
     operator = operator or Terminal()
     table = _table(config.setup / "table.json")
-    if robot is None and (config.robot not in REAL_ROBOTS or not config.execute):
-        raise InputError("calibrating the hand moves an arm: give --robot panda and --execute")
-    limits = SafetyLimits(table=table, max_joint_speed=config.joint_speed)
-    lens = read_intrinsics(config.setup / "lens.json") if config.camera == "uvc" else None
+    lens = _lens(config)
     hands: list[np.ndarray] = []
     seen: list[np.ndarray] = []
     with (
-        robot or SafeRobot(open_robot(config), limits) as arm,
+        robot or _arm(config, table) as arm,
         camera or open_camera(config, lens) as device,
     ):
         while len(seen) < views:
@@ -267,6 +260,23 @@ def photograph_empty(config: RigConfig) -> dict[str, Any]:
     path = config.setup / "empty_view.png"
     write_picture(path, view)
     return {"empty": path}
+
+
+def _arm(config: RigConfig, table: TablePlane) -> SafeRobot:
+    """The arm that a calibration moves, kept above a table.
+
+    Raises:
+        InputError: it is none, or may not move
+    """
+    if config.robot not in REAL_ROBOTS or not config.execute:
+        raise InputError("this calibration moves an arm: give --robot panda and --execute")
+    limits = SafetyLimits(table=table, max_joint_speed=config.joint_speed)
+    return SafeRobot(open_robot(config), limits)
+
+
+def _lens(config: RigConfig) -> CameraIntrinsics | None:
+    """Intrinsics of a video device; other cameras tell their own."""
+    return read_intrinsics(config.setup / "lens.json") if config.camera == "uvc" else None
 
 
 def _calibration(

@@ -1,5 +1,6 @@
 """What holds for every test, and fixtures that several files use; it imports nothing heavy."""
 
+import shutil
 import signal
 
 import pytest
@@ -57,3 +58,20 @@ def connection(emulator):
 
     with PandaRobot(NetworkedConfig(host=emulator.host)) as robot:
         yield robot
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The folder of a run that took seconds, see `short_runs`."""
+    from short_runs import train_shortly
+
+    return train_shortly(tmp_path_factory.mktemp("trained"))
+
+
+@pytest.fixture
+def run(trained, tmp_path):
+    """A copy of it to spoil."""
+    from learning.snapshots import RunFolder
+
+    shutil.copytree(trained, tmp_path / "run")
+    return RunFolder(tmp_path / "run")

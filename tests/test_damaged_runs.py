@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from short_runs import SHORT, TASK, said, settle, train_shortly
+from short_runs import SHORT, TASK, said, settle
 
 from learning.evaluation import evaluate_snapshot
 from learning.policy import load_policy
@@ -18,19 +17,6 @@ from learning.report_run import evaluate_run
 from learning.share import share_run
 from learning.snapshots import RunFolder, read_json, write_json
 from warp_deform.errors import InputError
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train_shortly(tmp_path_factory.mktemp("trained"))
-
-
-@pytest.fixture
-def run(trained: Path, tmp_path: Path) -> RunFolder:
-    """A copy to spoil."""
-    shutil.copytree(trained, tmp_path / "run")
-    return RunFolder(tmp_path / "run")
-
 
 SPOILT_RECORDS: list[Any] = [
     {},

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from short_runs import SHORT, TASK, said, settle, train_shortly
+from short_runs import SHORT, TASK, said, settle
 from training_samples import block_episode
 
 from learning import evaluation, protocol, share
@@ -24,18 +24,6 @@ from learning.share import share_run
 from learning.snapshots import RunFolder, read_json
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train_shortly(tmp_path_factory.mktemp("trained"))
-
-
-@pytest.fixture
-def run(trained: Path, tmp_path: Path) -> RunFolder:
-    """A copy to spoil."""
-    shutil.copytree(trained, tmp_path / "run")
-    return RunFolder(tmp_path / "run")
 
 
 def plan(run: RunFolder, steps: int) -> dict[str, Any]:
