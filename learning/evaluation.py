@@ -33,11 +33,9 @@ from .policy import ImagePolicy, StatePolicy, load_policy
 from .protocol import Protocol, goals_for, goals_of
 from .snapshots import Fields, RunFolder, check_fields, read_json, read_record, write_json
 
-__all__ = ["UNCLASSIFIED", "Evaluation", "best", "evaluate_snapshot", "known", "measure",
-           "stopped_early", "summarise", "trained_steps", "wilson"]  # fmt: skip
+__all__ = ["Evaluation", "best", "evaluate_snapshot", "known", "measure", "stopped_early",
+           "summarise", "trained_steps", "wilson"]  # fmt: skip
 
-UNCLASSIFIED = "unclassified"
-"""Failures of results that an earlier release stored, which did not say why."""
 _CHUNK = 2 * SLOTS
 """Episodes that a process is given at a time: what a kill loses, against idle lanes at the end."""
 
@@ -143,13 +141,13 @@ def summarise(episodes: Sequence[Played], *, task: str) -> dict[str, Any]:
     n_episodes, n_success, pc_success [%], pc_success_ci95: Wilson's interval [%], mean_score in
     [0, 1] with its standard_error, mean_actions, mean_actions_solved (of successes, None without),
     paper_value [%]: what the paper's table calls success, see `partial_credit`
-    failures: how often each of `failures.FAILURES` happened, and `UNCLASSIFIED`
+    failures: how often each of `failures.FAILURES` happened
     goal_l2: mean of the last states' `goal_distance`, None where there is no goal
     """
     n, solved = len(episodes), [e for e in episodes if e.success]
     scores = np.array([e.score for e in episodes])
     mean, rate = float(scores.mean()), 100 * len(solved) / n
-    failed = Counter(e.failure or UNCLASSIFIED for e in episodes if not e.success)
+    failed = Counter(e.failure for e in episodes if e.failure is not None)
     distances = [e.goal_l2[-1] for e in episodes if e.goal_l2]
     return {
         "n_episodes": n,
@@ -255,10 +253,10 @@ class _Kept:
 
 def _described(protocol: Protocol, task: str) -> dict[str, Any]:
     """A protocol as JSON, without what changes no episode of it."""
-    described = {**asdict(protocol), "episodes": None}
+    described = asdict(protocol)
     if not protocol.makes_goals(task):
         described["n_goals"] = None
-    del described["goal_folder"]
+    del described["episodes"], described["goal_folder"]
     if protocol.given is not None:
         # goals count by what they are, not by where they lie
         shown = (info.state_hash for info in EpisodeReader(protocol.given).infos())
@@ -282,11 +280,10 @@ def _read_played(path: Path) -> dict[int, Played]:
     found = {}
     for entry in record["episodes"]:
         check_fields({"episode": entry}, {"episode": dict}, what=what)
-        values = {"failure": None, "goal_l2": None, **entry}  # earlier releases lack them
-        check_fields(values, _PLAYED, what=what)
-        for distance in values["goal_l2"] or ():
+        check_fields(entry, _PLAYED, what=what)
+        distances = entry["goal_l2"]
+        for distance in distances or ():
             check_fields({"goal_l2": distance}, {"goal_l2": float}, what=what)
-        if values["goal_l2"] is not None:
-            values["goal_l2"] = tuple(values["goal_l2"])
+        values = {**entry, "goal_l2": None if distances is None else tuple(distances)}
         found[entry["seed"]] = Played(**{name: values[name] for name in _PLAYED})
     return found

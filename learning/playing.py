@@ -25,7 +25,7 @@ __all__ = ["Measured", "Played", "goal_distance", "play_policy"]
 class Played:
     """One episode. score: at its end, 0 if its physics cannot be trusted; reason: why it ended.
 
-    failure: which of `failures.FAILURES` it is; None if solved, or stored by an earlier release
+    failure: which of `failures.FAILURES` it is; None if solved
     goal_l2: for goal-conditioned tasks, `goal_distance` at the start and after every action
     """
 

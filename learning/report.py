@@ -23,7 +23,7 @@ import numpy as np
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import TASKS
 
-from .evaluation import UNCLASSIFIED, wilson
+from .evaluation import wilson
 from .paper_results import PARTIAL_SCORE, SUCCESS, PaperResults, partial_credit, read_paper
 from .snapshots import RunFolder
 
@@ -68,7 +68,7 @@ class Cell:
     paper_protocol [%]: the same by the paper's protocol, which is optimistic; None if not played
     paper_protocol_stage_rule: who chose the lift there, "action" or "privileged"
     paper [%]: the paper's number; None where it has none
-    failures: how often each of `failures.FAILURES` happened, and `evaluation.UNCLASSIFIED`
+    failures: how often each of `failures.FAILURES` happened
     validation, test: learning curves; `test` where the paper's protocol was played
     """
 
@@ -204,13 +204,13 @@ def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     parts = [info["preset"], _steps(info, settings)]
     if info["stage_rule"] != "action":
         parts.append(f"{info['stage_rule']} lift")
-    if not info.get("retry", True):
+    if not info["retry"]:
         parts.append("no retries")
-    if info.get("goals", "constructed") != "constructed":
+    if info["goals"] != "constructed":
         parts.append(f"goals {info['goals']}")
     if info["robot"] != "ur5":
         parts.append(info["robot"])
-    names = settings.get("demonstrators", ["scripted"])
+    names = settings["demonstrators"]
     if names != ["scripted"]:
         parts.append(f"{' and '.join(names)} demonstrations")
     return ", ".join(parts)
@@ -221,8 +221,7 @@ def _steps(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     planned = int(settings["schedule"]["steps"])
     if settings.get("patience") is not None:
         return f"up to {planned} steps, patience {settings['patience']}"
-    played = planned if "rounded" in settings else max(map(int, info["snapshots"]))
-    trained = int(info.get("trained_steps", played))
+    trained = int(info["trained_steps"])
     return f"{trained} steps" if trained == planned else f"{trained} of {planned} steps"
 
 
@@ -296,13 +295,8 @@ def _compared(run: RunResult) -> dict[str, Any]:
     if settings.get("patience") is not None:
         compared["validation episodes in training"] = settings.get("validate")
     if paper is not None:
-        compared["who chooses the lift by the paper's protocol"] = _paper_rule(info)
+        compared["who chooses the lift by the paper's protocol"] = paper["stage_rule"]
     return compared
-
-
-def _paper_rule(info: Mapping[str, Any]) -> str:
-    """Who chose the lift by the paper's protocol; earlier releases let `--stage-rule` say so."""
-    return str(info["paper"].get("stage_rule", info["stage_rule"]))
 
 
 def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
@@ -311,22 +305,16 @@ def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
     n, solved = (sum(int(t[key]) for t in tests) for key in ("n_episodes", "n_success"))
     failures = Counter[str]()
     for t in tests:
-        unknown = {UNCLASSIFIED: t["n_episodes"] - t["n_success"]}
-        failures.update({k: v for k, v in t.get("failures", unknown).items() if v})
+        failures.update(t["failures"])
     weights = [t["n_episodes"] for t in tests]
     score, score_error = _together(
         [(t["mean_score"], t["standard_error"], t["n_episodes"]) for t in tests]
     )
     value, value_error = _together([_value(t, task) for t in tests])
     played = [run.info["paper"] for run in runs if run.info["paper"] is not None]
-    theirs = [p.get("snapshots") or {str(p["snapshot"]): p} for p in played]
-    rules = [_paper_rule(run.info) for run in runs if run.info["paper"] is not None]
+    theirs = [p["snapshots"] for p in played]
     curve = _curve(theirs, task)
-    whole = [p for p in curve if p.step and all(str(p.step) in each for each in theirs)]
-    if played and not whole:  # results of an earlier release, each run with its own best snapshot
-        best = float(np.mean([_value(p, task)[0] for p in played]))
-    else:
-        best = max((p.value for p in whole), default=math.nan)
+    whole = [p.value for p in curve if p.step and all(str(p.step) in each for each in theirs)]
     return Cell(
         task=task,
         agent=first.agent,
@@ -343,9 +331,9 @@ def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
         measure=PARTIAL_SCORE if partial_credit(task) else SUCCESS,
         value=value,
         value_error=value_error,
-        paper_protocol=best if played else None,
+        paper_protocol=max(whole) if played else None,
         paper_protocol_runs=len(played),
-        paper_protocol_stage_rule=rules[0] if rules else None,
+        paper_protocol_stage_rule=played[0]["stage_rule"] if played else None,
         paper=paper.values.get((task, first.agent, first.demos)) if paper else None,
         failures=dict(sorted(failures.items())),
         validation=_curve([run.info["snapshots"] for run in runs], task),

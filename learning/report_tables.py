@@ -81,7 +81,6 @@ def csv_text(cells: Sequence[Cell]) -> str:
         "paper_protocol_stage_rule": lambda c: c.paper_protocol_stage_rule,
         "paper_percent": lambda c: c.paper,
         **{f"failures_{name.replace(' ', '_')}": _count(name) for name in FAILURES},
-        "failures_unclassified": _count("unclassified"),
     }
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -138,11 +137,10 @@ def details(cells: Sequence[Cell]) -> Rows:
 
 def failed(cells: Sequence[Cell]) -> Rows:
     """How often every kind of failure happened."""
-    names = [*FAILURES, "unclassified"]
-    rows = [["task", "agent", "demos", "variant", "failed", *names]]
+    rows = [["task", "agent", "demos", "variant", "failed", *FAILURES]]
     for c in cells:
         total = str(c.n_episodes - c.n_success)
-        counts = [str(c.failures.get(name, 0)) for name in names]
+        counts = [str(c.failures.get(name, 0)) for name in FAILURES]
         rows.append([c.task, c.agent, str(c.demos), c.variant, total, *counts])
     return rows
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -111,14 +110,3 @@ def test_a_damaged_report_is_not_taken_for_none(run: RunFolder) -> None:
         write_json(run.report, {**whole, **changes})
         with pytest.raises(InputError, match=told):
             load_policy(run.path)
-
-
-def test_results_of_an_earlier_release_lack_fields(run: RunFolder) -> None:
-    found = evaluate_snapshot(run, 1, Protocol(split="validation", episodes=2))
-    (path,) = run.evaluations.iterdir()
-    record = read_json(path)
-    for entry in record["episodes"]:
-        del entry["failure"], entry["goal_l2"]
-    write_json(path, record)
-    again = evaluate_snapshot(run, 1, Protocol(split="validation", episodes=2))
-    assert again.episodes == tuple(replace(e, failure=None, goal_l2=None) for e in found.episodes)
