@@ -40,6 +40,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "fast": {},
     "no skips": {"network": replace(FAST, skips=False)},
     "no gain": {"network": replace(FAST, gain=1.0)},
+    "no focus": {"network": replace(FAST, focus=0.0)},
+    "coarse image": {"network": replace(FAST, fine=False)},
     "no goal bias": {"network": replace(FAST, goal_bias=0.0)},
     "half width": {"network": replace(FAST, width=0.5)},
     "crop of 64": {"network": replace(FAST, crop=64)},

@@ -26,7 +26,8 @@ class Attention(nn.Module):
     9,833,203 parameters for one image at width 1.
 
     Args:
-        images: k, 2 where the goal's image is stacked below the current one
+        images: k, what the current picture becomes (see `images.image_tensor`), and twice as many
+            where the goal's are stacked below
         width: channels relative to the original's
         skips: see `ResNet43`
         exact: pad to a square, as the original does

@@ -20,15 +20,20 @@ _COLOR_MEAN, _COLOR_STD = 0.18877631, 0.07276466
 _HEIGHT_MEAN, _HEIGHT_STD = 0.00509261, 0.00903967
 
 
-def image_tensor(color: np.ndarray, height: np.ndarray, *, scale: int = 1) -> Tensor:
+def image_tensor(
+    color: np.ndarray, height: np.ndarray, *, scale: int = 1, fine: bool = False
+) -> Tensor:
     """Raw image (4, H / scale, W / scale) float32: colour 0 to 255, then height [m].
 
-    A pixel of a coarser image is the mean of the `scale` x `scale` pixels that it covers.
+    A pixel of a coarser image is the mean of the `scale` x `scale` pixels that it covers. With
+    `fine` they stand side by side instead, as `scale`^2 images: every pixel of the first has the
+    first of the pixels that it covers, row by row, and so on; (4 scale^2, H / scale, W / scale).
 
     Args:
         color: (H, W, 3) uint8
         height: (H, W) float32 [m]
         scale: camera pixels along the side of an image pixel
+        fine: keep the pixels that a coarser one covers
 
     Raises:
         InputError: shapes that do not belong together, or that `scale` does not divide.
@@ -41,7 +46,10 @@ def image_tensor(color: np.ndarray, height: np.ndarray, *, scale: int = 1) -> Te
     image = np.concatenate([color.transpose(2, 0, 1), height[None]], dtype=np.float32)
     if scale > 1:
         blocks = image.reshape(CHANNELS, rows // scale, scale, columns // scale, scale)
-        image = blocks.mean(axis=(2, 4))
+        if fine:
+            image = blocks.transpose(2, 4, 0, 1, 3).reshape(-1, rows // scale, columns // scale)
+        else:
+            image = blocks.mean(axis=(2, 4))
     return torch.from_numpy(image)
 
 

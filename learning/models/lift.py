@@ -32,6 +32,7 @@ class LiftHead(nn.Module):
 
     Args:
         n_lifts: lifts to choose from, 2 or more
+        images: what the current picture becomes, see `images.image_tensor`
         crop: side of the crop [pixels], 4 times a power of two, 8 to 64
         generator: draws the initial weights
 
@@ -39,7 +40,9 @@ class LiftHead(nn.Module):
         InputError: fewer than two lifts, or another crop.
     """
 
-    def __init__(self, n_lifts: int, *, crop: int = 64, generator: torch.Generator) -> None:
+    def __init__(
+        self, n_lifts: int, *, images: int = 1, crop: int = 64, generator: torch.Generator
+    ) -> None:
         super().__init__()
         halvings = round(math.log2(max(crop, 1) / _GRID))
         if crop != _GRID * 2**halvings or not 1 <= halvings <= len(_CHANNELS):
@@ -49,7 +52,8 @@ class LiftHead(nn.Module):
         if n_lifts < 2:
             raise InputError(f"n_lifts: nothing to choose among {n_lifts}")
         self.crop = crop
-        widths = (6, *_CHANNELS[-halvings:])
+        self.channels = CHANNELS * images
+        widths = (6 * images, *_CHANNELS[-halvings:])
         self.convolutions = nn.ModuleList(
             nn.utils.skip_init(nn.Conv2d, before, after, 3, stride=2, padding=1)
             for before, after in pairwise(widths)
@@ -62,7 +66,7 @@ class LiftHead(nn.Module):
     def forward(self, image: Tensor, pick: Tensor) -> Tensor:
         """Logits (B, n_lifts); `pick` (B, 2) int64 row and column within the image."""
         half = self.crop // 2
-        x = normalise(functional.pad(image[:, :CHANNELS], (half, half, half, half)))
+        x = normalise(functional.pad(image[:, : self.channels], (half, half, half, half)))
         x = rotated_crops(x, pick.cpu() + half, size=self.crop, n_rotations=1)[:, 0]
         for convolution in self.convolutions:
             x = functional.relu(convolution(x), inplace=True)

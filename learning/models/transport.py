@@ -17,12 +17,14 @@ from torch.nn import functional
 
 from .correlation import correlate_direct, correlate_fft
 from .crops import crop_reach, rotated_crops
-from .images import CHANNELS, normalise
+from .images import normalise
 from .resnet import STRIDE, ResNet43, receptive_span
 
 __all__ = ["Transport", "TransportGoalSplit"]
 
 _FEATURES = 3
+_FOCUS_SPREAD = 1.5
+"""What is close to the pick: standard deviation of a Gaussian [pixels]."""
 
 
 class Transport(nn.Module):
@@ -32,13 +34,15 @@ class Transport(nn.Module):
     width 1.
 
     Args:
-        images: k, 2 where the goal's image is stacked below the current one
+        images: k, what the current picture becomes (see `images.image_tensor`), and twice as many
+            where the goal's are stacked below
         crop: side of the crop around the pick [pixels], 64 at 320 x 160
         crop_before_query: run the query network on rotated crops of the image, as the first
             Transporters did; else rotate and crop its features, as the paper's
         width: channels relative to the original's
         skips: see `ResNet43`
         gain: what place logits are multiplied by
+        focus: weight of the mean close to the pick, where that over the whole crop weighs 1
         exact: correlate directly, as the original does
         bfloat16: convolve in bfloat16; the correlation stays float32
         generator: draws the initial weights
@@ -53,6 +57,7 @@ class Transport(nn.Module):
         width: float = 1.0,
         skips: bool = False,
         gain: float = 1.0,
+        focus: float = 0.0,
         exact: bool = False,
         bfloat16: bool = False,
         generator: torch.Generator,
@@ -60,7 +65,7 @@ class Transport(nn.Module):
         super().__init__()
         self.crop = crop
         self.crop_before_query = crop_before_query
-        self.gain = gain
+        self.gain, self.focus = gain, focus
         self.exact = exact
         self.key, self.query = (
             ResNet43(
@@ -84,11 +89,11 @@ class Transport(nn.Module):
         else:
             window = _Window(x, centres, crop=self.crop, n_rotations=n_rotations)
             kernels = window.crops(self.query(window.of(x)))
-        return _correlate(key, kernels, gain=self.gain, exact=self.exact)
+        return _correlate(key, kernels, gain=self.gain, focus=self.focus, exact=self.exact)
 
 
 class TransportGoalSplit(nn.Module):
-    """Raw images (B, 8, H, W), current and goal, and picks (B, 2) -> place logits (B, R, H, W).
+    """Raw images (B, 8 k, H, W), current and goal, and picks (B, 2) -> place logits (B, R, H, W).
 
     A third network sees the goal; its features multiply those of key and query before the crop,
     so the kernel holds the goal's features at the pick. The crop is always after the query.
@@ -101,10 +106,12 @@ class TransportGoalSplit(nn.Module):
     def __init__(
         self,
         *,
+        images: int = 1,
         crop: int = 64,
         width: float = 1.0,
         skips: bool = False,
         gain: float = 1.0,
+        focus: float = 0.0,
         goal_bias: float = 0.0,
         exact: bool = False,
         bfloat16: bool = False,
@@ -112,22 +119,29 @@ class TransportGoalSplit(nn.Module):
     ) -> None:
         super().__init__()
         self.crop = crop
-        self.gain, self.goal_bias = gain, goal_bias
+        self.gain, self.focus, self.goal_bias = gain, focus, goal_bias
         self.exact = exact
         self.key, self.query, self.goal = (
-            ResNet43(6, _FEATURES, width=width, skips=skips, bfloat16=bfloat16, generator=generator)
+            ResNet43(
+                6 * images,
+                _FEATURES,
+                width=width,
+                skips=skips,
+                bfloat16=bfloat16,
+                generator=generator,
+            )
             for _ in range(3)
         )
 
     def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
         """Place logits (B, R, H, W); `pick` (B, 2) int64 row and column within the image."""
-        current, centres = _pad(image[:, :CHANNELS], pick, self.crop)
-        goal = self.goal(_pad(image[:, CHANNELS:], pick, self.crop)[0])
+        current, centres = _pad(image[:, : image.shape[1] // 2], pick, self.crop)
+        goal = self.goal(_pad(image[:, image.shape[1] // 2 :], pick, self.crop)[0])
         goal = goal + self.goal_bias if self.goal_bias else goal
         window = _Window(current, centres, crop=self.crop, n_rotations=n_rotations)
         kernels = window.crops(self.query(window.of(current)) * window.of(goal))
         key = self.key(current) * goal
-        return _correlate(key, kernels, gain=self.gain, exact=self.exact)
+        return _correlate(key, kernels, gain=self.gain, focus=self.focus, exact=self.exact)
 
 
 def _pad(image: Tensor, pick: Tensor, crop: int) -> tuple[Tensor, Tensor]:
@@ -136,9 +150,19 @@ def _pad(image: Tensor, pick: Tensor, crop: int) -> tuple[Tensor, Tensor]:
     return normalise(functional.pad(image, (half, half, half, half))), pick.cpu() + half
 
 
-def _correlate(key: Tensor, kernels: Tensor, *, gain: float, exact: bool) -> Tensor:
+def _correlate(key: Tensor, kernels: Tensor, *, gain: float, focus: float, exact: bool) -> Tensor:
+    if focus:
+        kernels = kernels * _around_pick(kernels.shape[-1], focus).to(kernels.device)
     logits = (correlate_direct if exact else correlate_fft)(key, kernels)
     return logits if gain == 1.0 else gain * logits
+
+
+def _around_pick(size: int, focus: float) -> Tensor:
+    """Weights (size, size) of a crop's pixels, 1 on the average plus `focus` close to the pick."""
+    steps = torch.arange(size) - size // 2
+    bell = torch.exp(-(steps**2) / (2 * _FOCUS_SPREAD**2))
+    near = bell[:, None] * bell
+    return 1 + focus * size**2 * near / near.sum()
 
 
 class _Window:

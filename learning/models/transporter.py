@@ -49,6 +49,9 @@ class TransporterConfig:
     """Channels relative to the original's."""
     skips: bool = False
     """Finer features join the coarse ones that grow, see `ResNet43`: picks become sharp."""
+    fine: bool = False
+    """Show networks every camera pixel: those that a network pixel covers are channels of their
+    own, in place of their mean."""
     crop: int = 64
     """Side of the crop around the pick [network pixels]; 64 are 0.2 m at scale 1."""
     crop_before_query: bool | None = None
@@ -56,6 +59,10 @@ class TransporterConfig:
     gain: float = 1.0
     """What place logits are multiplied by. The original's, means over a crop of products of small
     features, start within 0.001 of each other, and learning where to place begins late."""
+    focus: float = 0.0
+    """Weight of the mean close to the pick, where that over the whole crop weighs 1. There the
+    picked thing is a few pixels of a thousand: with 0.1, where it belongs is learnt in a quarter of
+    the steps (benchmarks/ablation.py)."""
     goal_bias: float = 0.0
     """Added to the goal's features in Goal-Split: with 1 they multiply by about 1 at first."""
     n_rotations_train: int = 24
@@ -86,6 +93,11 @@ class TransporterConfig:
         """Height and width of the network's image [pixels]."""
         return SHAPE[0] // self.scale, SHAPE[1] // self.scale
 
+    @property
+    def images(self) -> int:
+        """What a picture becomes, see `images.image_tensor`."""
+        return self.scale**2 if self.fine else 1
+
     def to_network(self, pixel: np.ndarray) -> np.ndarray:
         """Network pixels (..., 2) int64 that hold camera pixels (..., 2) int."""
         return np.asarray(pixel, dtype=np.int64) // self.scale
@@ -99,7 +111,15 @@ PRESETS = {
     "paper": TransporterConfig(),
     # A step costs nearly 30 times less CPU time than the paper's (benchmarks/models.py).
     "fast": TransporterConfig(
-        scale=2, width=0.25, skips=True, crop=32, gain=100.0, goal_bias=1.0, n_rotations_train=1
+        scale=2,
+        fine=True,
+        width=0.25,
+        skips=True,
+        crop=32,
+        gain=100.0,
+        focus=0.1,
+        goal_bias=1.0,
+        n_rotations_train=1,
     ),
 }
 
@@ -172,7 +192,7 @@ class Transporter(nn.Module):
         self.config = config
         generator = torch.Generator().manual_seed(seed)
         self.attention = Attention(
-            images=self.pictures,
+            images=self.pictures * config.images,
             width=config.width,
             skips=config.skips,
             exact=config.exact,
@@ -182,19 +202,22 @@ class Transporter(nn.Module):
         self.transport = self._transport(generator)
         n_lifts = len(config.lifts)
         self.lift = (
-            LiftHead(n_lifts, crop=config.crop, generator=generator) if n_lifts > 1 else None
+            LiftHead(n_lifts, images=config.images, crop=config.crop, generator=generator)
+            if n_lifts > 1
+            else None
         )
 
     def _transport(self, generator: torch.Generator) -> nn.Module:
         config = self.config
         before = config.crop_before_query
         return Transport(
-            images=self.pictures,
+            images=self.pictures * config.images,
             crop=config.crop,
             crop_before_query=self.crop_before_query if before is None else before,
             width=config.width,
             skips=config.skips,
             gain=config.gain,
+            focus=config.focus,
             exact=config.exact,
             bfloat16=config.bfloat16,
             generator=generator,
@@ -209,7 +232,12 @@ class Transporter(nn.Module):
         if (goal is not None) != (self.pictures == 2):
             raise InputError(f"{self.name}: {self.pictures - 1} goal pictures are needed")
         pictures = [current] if goal is None else [current, goal]
-        return torch.cat([image_tensor(*each, scale=self.config.scale) for each in pictures])
+        return torch.cat(
+            [
+                image_tensor(*each, scale=self.config.scale, fine=self.config.fine)
+                for each in pictures
+            ]
+        )
 
     def forward(self, batch: Batch) -> Losses:
         """Losses of a batch.
@@ -270,7 +298,7 @@ class Transporter(nn.Module):
         )
 
     def _check(self, image: Tensor) -> None:
-        shape = (CHANNELS * self.pictures, *self.config.shape)
+        shape = (CHANNELS * self.pictures * self.config.images, *self.config.shape)
         if image.ndim != 4 or image.shape[1:] != shape:
             raise InputError(f"image: shape (B, {shape}) is needed, got {tuple(image.shape)}")
 
@@ -289,10 +317,12 @@ class GoalSplit(Transporter):
         if config.crop_before_query:
             raise InputError("crop_before_query: Goal-Split multiplies features before it crops")
         return TransportGoalSplit(
+            images=config.images,
             crop=config.crop,
             width=config.width,
             skips=config.skips,
             gain=config.gain,
+            focus=config.focus,
             goal_bias=config.goal_bias,
             exact=config.exact,
             bfloat16=config.bfloat16,
