@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.nn import functional
 
 from learning.models.adam import KerasAdam
 from learning.models.attention import Attention
@@ -143,6 +145,19 @@ def test_coarse_image_is_the_mean_of_its_pixels() -> None:
         image_tensor(color, height, scale=4)
 
 
+def test_fine_image_holds_every_pixel() -> None:
+    rng = np.random.default_rng(0)
+    color = rng.integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    height = rng.uniform(size=(4, 6)).astype(np.float32)
+    image = image_tensor(color, height, scale=2, fine=True)
+    assert image.shape == (16, 2, 3)
+    whole = image_tensor(color, height)
+    for k, (row, column) in enumerate([(0, 0), (0, 1), (1, 0), (1, 1)]):
+        assert torch.equal(image[4 * k : 4 * k + 4], whole[:, row::2, column::2])
+    mean = image.reshape(4, 4, 2, 3).mean(dim=0)
+    assert torch.allclose(mean, image_tensor(color, height, scale=2), rtol=1e-5)
+
+
 @settings(derandomize=True, deadline=None, max_examples=20)
 @given(
     half=st.integers(1, 4),
@@ -223,6 +238,28 @@ def test_window_of_the_query_changes_nothing(picks: list[list[int]], n_rotations
         whole = correlate_direct(transport.key(x), kernels)
     assert ours.shape == (2, n_rotations, 320, 80)
     assert (ours - whole).abs().max() < 1e-5 * whole.abs().max()
+
+
+def test_focus_adds_a_mean_close_to_the_pick() -> None:
+    """By the definition: products at equal distances from pick and place, in a bell around them."""
+    image = 50 * torch.rand(1, 4, 40, 32, generator=generator(1))
+    pick, place, crop = torch.tensor([[21, 9]]), (30, 14), 16
+    plain, focused = (
+        Transport(crop=crop, width=0.01, gain=3.0, focus=focus, generator=generator())
+        for focus in (0.0, 0.2)
+    )
+    with torch.no_grad():
+        difference = focused(image, pick)[0, 0] - plain(image, pick)[0, 0]
+        x = normalise(functional.pad(image, (8, 8, 8, 8)))
+        key, query = plain.key(x)[0].double(), plain.query(x)[0].double()
+    expected = total = 0.0
+    for row, column in itertools.product(range(-8, 8), repeat=2):
+        weight = math.exp(-(row**2 + column**2) / (2 * 1.5**2))
+        at_place = key[:, place[0] + 8 + row, place[1] + 8 + column]
+        at_pick = query[:, pick[0, 0] + 8 + row, pick[0, 1] + 8 + column]
+        expected += weight * float(at_place @ at_pick)
+        total += weight
+    assert float(difference[place]) == pytest.approx(3.0 * 0.2 * expected / total, rel=1e-3)
 
 
 def test_exact_attention_pads_to_a_square() -> None:
