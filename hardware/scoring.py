@@ -72,7 +72,7 @@ def score_masks(masks: Sequence[np.ndarray], goal: np.ndarray) -> EpisodeScore:
 def score_recording(folder: Path) -> EpisodeScore:
     """Return the score of a recorded episode, computed anew from its pictures.
 
-    A recorded overlap that disagrees with the pictures is a warning, not a score.
+    A recorded overlap that disagrees with the pictures is a warning, not a score; so is a dry run.
 
     Raises:
         InputError: no recording, one without a goal, or damaged
@@ -81,6 +81,9 @@ def score_recording(folder: Path) -> EpisodeScore:
     goal = recording.goal_mask()
     if goal is None:
         raise InputError(f"{folder} was recorded without a goal; there is nothing to score")
+    still: tuple[str, ...] = ()
+    if recording.meta.get("config", {}).get("executed") is False:
+        still = ("a dry run: nothing moved, so its score says nothing of its actions",)
     masks = [recording.mask(i) for i in range(len(recording.observations))]
     score = score_masks(masks, goal)
     disagree = tuple(
@@ -94,5 +97,5 @@ def score_recording(folder: Path) -> EpisodeScore:
         score.best,
         score.success,
         score.actions_to_success,
-        (*score.warnings, *recording.warnings, *disagree),
+        (*score.warnings, *still, *recording.warnings, *disagree),
     )

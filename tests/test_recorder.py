@@ -88,6 +88,14 @@ def test_scores_are_computed_from_the_files(tmp_path: Path) -> None:
     assert again.warnings == (f"picture 1: recorded 0.9000, its files give {score.iou[1]:.4f}",)
 
 
+def test_a_dry_run_is_said_to_be_one(tmp_path: Path) -> None:
+    record(tmp_path / "a")
+    path = tmp_path / "a" / "episode.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "config": {"executed": False}}))
+    (warning,) = score_recording(tmp_path / "a").warnings
+    assert "nothing moved" in warning
+
+
 def test_scores_of_masks() -> None:
     goal, far = mask(0), np.zeros((40, 20), bool)
     assert score_masks([mask(3)], goal).iou[0] < SUCCESS_IOU
