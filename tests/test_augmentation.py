@@ -18,9 +18,11 @@ from learning.augmentation import (
     move_state,
 )
 from warp_deform.errors import InputError
+from warp_deform.objects.cable import CableConfig
 from warp_deform.rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world, world_to_pixel
 from warp_deform.tasks.ground_truth import pose_rows
 from warp_deform.tasks.registry import TASKS
+from warp_deform.tasks.shapes import sample_shape
 
 ACTION = np.array([0.45, -0.1, 0.0, 0.55, 0.2, 0.7, 0.04])
 turns = st.floats(-math.pi, math.pi)
@@ -88,6 +90,17 @@ def test_a_mirror_image_moves_pictures_actions_and_states_alike(
     assert np.array([math.cos(yaw), math.sin(yaw)]) == pytest.approx(
         (ahead[1] - ahead[0]) / 0.1, abs=1e-5
     )
+
+
+def test_targets_that_tell_ends_apart_by_their_turning_sense_are_not_mirrored() -> None:
+    """Of the targets of cable-shape, whose order is part of the task, none is another mirrored."""
+    rng, cable = np.random.default_rng(0), CableConfig()
+    for _ in range(200):
+        steps = np.diff(sample_shape(rng, (2, 3, 4), cable.beads).outline(cable), axis=0)
+        turned = steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0]
+        assert (turned <= 0).all()
+    mirrored = {name for name, task in TASKS.items() if not task.mirrors}
+    assert mirrored == {"cable-shape", "block-notarget"}
 
 
 def test_every_second_one_is_mirrored_where_wanted() -> None:

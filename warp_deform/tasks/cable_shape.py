@@ -52,6 +52,8 @@ class CableShape(Task):
     success_score = 1.0
     ground_truth_size = 147
     objects = ("cable",)
+    # From the white end on, every target turns to the same side: that says which end goes where.
+    mirrors = False
 
     cable: ClassVar[CableConfig] = CableConfig()
     sides: ClassVar[tuple[int, ...]] = (2, 3, 4)
@@ -175,6 +177,7 @@ class CableShapeNotarget(CableShape):
     goal_conditioned = True
     ground_truth_size = 144
     visible = False
+    mirrors = True  # the goal's picture shows both ends
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(144,): x, y, -yaw / 15 of every bead, then the same of the goal's beads."""
