@@ -331,7 +331,7 @@ def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
         measure=PARTIAL_SCORE if partial_credit(task) else SUCCESS,
         value=value,
         value_error=value_error,
-        paper_protocol=max(whole) if played else None,
+        paper_protocol=max(whole, default=None),
         paper_protocol_runs=len(played),
         paper_protocol_stage_rule=played[0]["stage_rule"] if played else None,
         paper=paper.values.get((task, first.agent, first.demos)) if paper else None,

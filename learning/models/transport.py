@@ -67,16 +67,8 @@ class Transport(nn.Module):
         self.crop_before_query = crop_before_query
         self.gain, self.focus = gain, focus
         self.exact = exact
-        self.key, self.query = (
-            ResNet43(
-                6 * images,
-                _FEATURES,
-                width=width,
-                skips=skips,
-                bfloat16=bfloat16,
-                generator=generator,
-            )
-            for _ in range(2)
+        self.key, self.query = _networks(
+            2, images, width=width, skips=skips, bfloat16=bfloat16, generator=generator
         )
 
     def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
@@ -121,27 +113,38 @@ class TransportGoalSplit(nn.Module):
         self.crop = crop
         self.gain, self.focus, self.goal_bias = gain, focus, goal_bias
         self.exact = exact
-        self.key, self.query, self.goal = (
-            ResNet43(
-                6 * images,
-                _FEATURES,
-                width=width,
-                skips=skips,
-                bfloat16=bfloat16,
-                generator=generator,
-            )
-            for _ in range(3)
+        self.key, self.query, self.goal = _networks(
+            3, images, width=width, skips=skips, bfloat16=bfloat16, generator=generator
         )
 
     def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
         """Place logits (B, R, H, W); `pick` (B, 2) int64 row and column within the image."""
-        current, centres = _pad(image[:, : image.shape[1] // 2], pick, self.crop)
-        goal = self.goal(_pad(image[:, image.shape[1] // 2 :], pick, self.crop)[0])
+        before, after = image.chunk(2, dim=1)
+        current, centres = _pad(before, pick, self.crop)
+        goal = self.goal(_pad(after, pick, self.crop)[0])
         goal = goal + self.goal_bias if self.goal_bias else goal
         window = _Window(current, centres, crop=self.crop, n_rotations=n_rotations)
         kernels = window.crops(self.query(window.of(current)) * window.of(goal))
         key = self.key(current) * goal
         return _correlate(key, kernels, gain=self.gain, focus=self.focus, exact=self.exact)
+
+
+def _networks(
+    count: int,
+    images: int,
+    *,
+    width: float,
+    skips: bool,
+    bfloat16: bool,
+    generator: torch.Generator,
+) -> list[ResNet43]:
+    """Networks of one shape, drawn one after the other."""
+    return [
+        ResNet43(
+            6 * images, _FEATURES, width=width, skips=skips, bfloat16=bfloat16, generator=generator
+        )
+        for _ in range(count)
+    ]
 
 
 def _pad(image: Tensor, pick: Tensor, crop: int) -> tuple[Tensor, Tensor]:

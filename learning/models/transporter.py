@@ -61,8 +61,8 @@ class TransporterConfig:
     features, start within 0.001 of each other, and learning where to place begins late."""
     focus: float = 0.0
     """Weight of the mean close to the pick, where that over the whole crop weighs 1. There the
-    picked thing is a few pixels of a thousand: with 0.1, where it belongs is learnt in a quarter of
-    the steps (benchmarks/ablation.py)."""
+    picked thing is a few pixels of a thousand; with 0.1, where it belongs is learnt in far fewer
+    steps."""
     goal_bias: float = 0.0
     """Added to the goal's features in Goal-Split: with 1 they multiply by about 1 at first."""
     n_rotations_train: int = 24

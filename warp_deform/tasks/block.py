@@ -44,7 +44,6 @@ class BlockNotarget(Task):
     max_actions = 2
     stages = (Stage(lift=0.30, speed=0.5),)
     place_yaws = 24
-    mirrors = False  # no turn makes an L of its mirror image
     success_score = 1.0
     ground_truth_size = 6
     objects = ("block",)
