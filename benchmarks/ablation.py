@@ -39,11 +39,12 @@ PLAN = SCHEDULES["fast"]
 VARIANTS: dict[str, dict[str, Any]] = {
     "fast": {},
     "no skips": {"network": replace(FAST, skips=False)},
+    "not equivariant": {"network": replace(FAST, equivariant=False)},
     "no gain": {"network": replace(FAST, gain=1.0)},
     "no focus": {"network": replace(FAST, focus=0.0)},
     "coarse image": {"network": replace(FAST, fine=False)},
     "no goal bias": {"network": replace(FAST, goal_bias=0.0)},
-    "half width": {"network": replace(FAST, width=0.5)},
+    "width of 1/2": {"network": replace(FAST, width=0.5)},
     "crop of 64": {"network": replace(FAST, crop=64)},
     "no augmentation": {"augment": False},
     "no mirror images": {"schedule": replace(PLAN, mirror=False)},

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from learning.models.attention import Attention
 from learning.models.correlation import correlate_direct, correlate_fft
 from learning.models.crops import rotated_crops
+from learning.models.resnet import NetworkConfig
 from learning.models.transport import Transport, TransportGoalSplit
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -20,6 +21,7 @@ SIDE = 256
 REACH = 80
 """An output depends on fewer pixels to either side; see `resnet.receptive_span`."""
 CROP = 16
+NARROW = NetworkConfig(width=0.125)
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -49,7 +51,7 @@ def gap(found: Tensor, expected: Tensor) -> float:
 @pytest.mark.parametrize("pictures", [1, 2])
 @pytest.mark.parametrize("shift", [(8, 0), (0, -16), (-24, 8)])
 def test_attention_moves_with_the_scene(pictures: int, shift: tuple[int, int]) -> None:
-    network = Attention(images=pictures, width=0.125, generator=generator())
+    network = Attention(pictures=pictures, config=NARROW, generator=generator())
     image = scene(pictures)
     with torch.no_grad():
         still = network(image).roll(shift, dims=(-2, -1))[0]
@@ -60,12 +62,12 @@ def test_attention_moves_with_the_scene(pictures: int, shift: tuple[int, int]) -
 
 
 TRANSPORTS: dict[str, Callable[[], nn.Module]] = {
-    "transporter": lambda: Transport(crop=CROP, width=0.125, generator=generator()),
+    "transporter": lambda: Transport(crop=CROP, config=NARROW, generator=generator()),
     "crop before": lambda: Transport(
-        crop=CROP, width=0.125, crop_before_query=True, generator=generator()
+        crop=CROP, config=NARROW, crop_before_query=True, generator=generator()
     ),
     "goal-split": lambda: TransportGoalSplit(
-        crop=CROP, width=0.125, goal_bias=1.0, generator=generator()
+        crop=CROP, config=NARROW, goal_bias=1.0, generator=generator()
     ),
 }
 

@@ -25,11 +25,11 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread")
 GOLDEN = Path(__file__).parent / "data" / "transporter_tf.npz"
 MODULES = {
     "attention": lambda g: Attention(exact=True, generator=g),
-    "attention_goal": lambda g: Attention(images=2, exact=True, generator=g),
+    "attention_goal": lambda g: Attention(pictures=2, exact=True, generator=g),
     "transport_crop_after": lambda g: Transport(exact=True, generator=g),
     "transport_crop_before": lambda g: Transport(exact=True, crop_before_query=True, generator=g),
     "transport_goal_stack": lambda g: Transport(
-        images=2, exact=True, crop_before_query=True, generator=g
+        pictures=2, exact=True, crop_before_query=True, generator=g
     ),
     "transport_goal_split": lambda g: TransportGoalSplit(exact=True, generator=g),
 }

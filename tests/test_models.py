@@ -18,7 +18,7 @@ from learning.models.correlation import correlate_direct, correlate_fft
 from learning.models.crops import crop_reach, rotated_crops
 from learning.models.images import image_tensor, normalise
 from learning.models.lift import LiftHead
-from learning.models.resnet import ResNet43, receptive_span
+from learning.models.resnet import NetworkConfig, ResNet43, receptive_span
 from learning.models.transport import Transport, TransportGoalSplit
 from warp_deform.errors import InputError
 
@@ -38,15 +38,15 @@ def test_parameter_counts_are_the_original_s() -> None:
     attention = Attention(generator=g)
     assert count(attention) == 9_833_203
     assert len(attention.network.convolutions()) == 57
-    assert count(Attention(images=2, generator=g)) == 9_836_659
+    assert count(Attention(pictures=2, generator=g)) == 9_836_659
     assert count(Transport(generator=g)) == 19_666_866
-    assert count(Transport(images=2, generator=g)) == 19_673_778
+    assert count(Transport(pictures=2, generator=g)) == 19_673_778
     assert count(TransportGoalSplit(generator=g)) == 29_500_299
 
 
 def test_weights_start_glorot_uniform_and_leave_the_global_generator_alone() -> None:
     before = torch.get_rng_state()
-    first, again, other = (ResNet43(6, 1, generator=generator(s)) for s in (0, 0, 1))
+    first, again, other = (ResNet43(1, generator=generator(s)) for s in (0, 0, 1))
     assert torch.equal(before, torch.get_rng_state())
     for ours, same, different in zip(
         first.convolutions(), again.convolutions(), other.convolutions(), strict=True
@@ -66,7 +66,8 @@ def test_weights_start_glorot_uniform_and_leave_the_global_generator_alone() -> 
 def test_single_precision_gradients_agree_with_double() -> None:
     """A width whose few channels made a strided convolution corrupt memory."""
     x = torch.randn(2, 6, 96, 56, generator=generator(1))
-    single, double = (ResNet43(6, 1, width=0.125, generator=generator()) for _ in range(2))
+    config = NetworkConfig(width=0.125)
+    single, double = (ResNet43(1, config=config, generator=generator()) for _ in range(2))
     single(x).square().mean().backward()
     double.double()(x.double()).square().mean().backward()
     for ours, exact in zip(single.parameters(), double.parameters(), strict=True):
@@ -74,24 +75,33 @@ def test_single_precision_gradients_agree_with_double() -> None:
         assert (ours.grad - exact.grad).abs().max() <= 1e-4 * exact.grad.abs().max()
 
 
+@pytest.mark.parametrize("equivariant", [False, True])
 @pytest.mark.parametrize("skips", [False, True])
-def test_receptive_span_is_what_gradients_reach(skips: bool) -> None:
-    network = ResNet43(1, 1, width=0.01, skips=skips, generator=generator())
+def test_receptive_span_is_what_gradients_reach(skips: bool, equivariant: bool) -> None:
+    config = NetworkConfig(width=0.01, skips=skips, equivariant=equivariant)
+    network = ResNet43(1, config=config, generator=generator())
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.abs_()  # no ReLU stops a gradient
-    x = torch.ones(1, 1, 256, 8, requires_grad=True)
+    x = torch.ones(1, 6, 256, 8, requires_grad=True)
     y = network(x)
     for row in range(120, 128):
         (gradient,) = torch.autograd.grad(y[0, 0, row].sum(), x, retain_graph=True)
         reached = torch.nonzero(gradient[0, 0].sum(dim=1)).flatten()
-        assert (int(reached[0]), int(reached[-1]) + 1) == receptive_span(row, row + 1)
+        span = receptive_span(row, row + 1, equivariant=equivariant)
+        assert (int(reached[0]), int(reached[-1]) + 1) == span
 
 
-def test_skips_leave_the_rest_as_it_was() -> None:
+@pytest.mark.parametrize("equivariant", [False, True])
+def test_skips_leave_the_rest_as_it_was(equivariant: bool) -> None:
     """Laterals are drawn last, so networks with and without begin with the same weights."""
     plain, skipping = (
-        ResNet43(6, 1, width=0.25, skips=each, generator=generator()) for each in (False, True)
+        ResNet43(
+            1,
+            config=NetworkConfig(width=0.25, skips=each, equivariant=equivariant),
+            generator=generator(),
+        )
+        for each in (False, True)
     )
     for before, after in zip(plain.convolutions(), skipping.convolutions(), strict=False):
         assert torch.equal(before.weight, after.weight)
@@ -105,15 +115,18 @@ def test_skips_leave_the_rest_as_it_was() -> None:
 
 def test_image_sides_must_be_multiples_of_eight() -> None:
     with pytest.raises(InputError, match="12 x 16"):
-        ResNet43(1, 1, width=0.1, generator=generator())(torch.zeros(1, 1, 12, 16))
+        ResNet43(1, config=NetworkConfig(width=0.1), generator=generator())(
+            torch.zeros(1, 6, 12, 16)
+        )
     with pytest.raises(InputError, match="width"):
-        ResNet43(1, 1, width=0.0, generator=generator())
+        NetworkConfig(width=0.0)
 
 
 def test_bfloat16_is_near_float32() -> None:
     x = torch.randn(1, 6, 64, 32, generator=generator())
     exact, rounded = (
-        ResNet43(6, 1, width=0.25, bfloat16=b, generator=generator(1))(x) for b in (False, True)
+        ResNet43(1, config=NetworkConfig(width=0.25, bfloat16=b), generator=generator(1))(x)
+        for b in (False, True)
     )
     assert rounded.dtype == torch.float32
     assert 0 < (exact - rounded).abs().max() < 0.05 * exact.abs().max()
@@ -220,13 +233,17 @@ def test_crop_reach_bounds_what_is_sampled() -> None:
     assert crop_reach(32, 24) - 1 <= seen.abs().max() <= crop_reach(32, 24)
 
 
+@pytest.mark.parametrize("equivariant", [False, True])
 @pytest.mark.parametrize("n_rotations", [1, 5])
 @pytest.mark.parametrize(
     "picks", [[[0, 0], [150, 3]], [[159, 79], [150, 60]], [[80, 40], [81, 40]]]
 )
-def test_window_of_the_query_changes_nothing(picks: list[list[int]], n_rotations: int) -> None:
+def test_window_of_the_query_changes_nothing(
+    picks: list[list[int]], n_rotations: int, equivariant: bool
+) -> None:
     g = generator(3)
-    transport = Transport(crop=16, width=0.125, skips=n_rotations == 5, exact=True, generator=g)
+    config = NetworkConfig(width=0.125, skips=n_rotations == 5, equivariant=equivariant)
+    transport = Transport(crop=16, config=config, exact=True, generator=g)
     image = (
         torch.rand(2, 4, 320, 80, generator=g) * torch.tensor([255, 255, 255, 0.1])[:, None, None]
     )
@@ -245,7 +262,13 @@ def test_focus_adds_a_mean_close_to_the_pick() -> None:
     image = 50 * torch.rand(1, 4, 40, 32, generator=generator(1))
     pick, place, crop = torch.tensor([[21, 9]]), (30, 14), 16
     plain, focused = (
-        Transport(crop=crop, width=0.01, gain=3.0, focus=focus, generator=generator())
+        Transport(
+            crop=crop,
+            config=NetworkConfig(width=0.01),
+            gain=3.0,
+            focus=focus,
+            generator=generator(),
+        )
         for focus in (0.0, 0.2)
     )
     with torch.no_grad():
@@ -264,7 +287,10 @@ def test_focus_adds_a_mean_close_to_the_pick() -> None:
 
 def test_exact_attention_pads_to_a_square() -> None:
     image = torch.rand(1, 4, 80, 40, generator=generator()) * 50
-    plain, exact = (Attention(width=0.125, exact=e, generator=generator(1)) for e in (False, True))
+    config = NetworkConfig(width=0.125)
+    plain, exact = (
+        Attention(config=config, exact=e, generator=generator(1)) for e in (False, True)
+    )
     padded = torch.nn.functional.pad(image, (20, 20))
     assert torch.equal(exact(image), plain(padded)[:, :, 20:60])
     assert not torch.allclose(exact(image), plain(image))

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from .images import normalise
-from .resnet import ResNet43
+from .resnet import NetworkConfig, ResNet43
 
 __all__ = ["Attention"]
 
@@ -23,33 +23,26 @@ __all__ = ["Attention"]
 class Attention(nn.Module):
     """Raw images (B, 4 k, H, W) -> pick logits (B, H, W), before any softmax.
 
-    9,833,203 parameters for one image at width 1.
+    9,833,203 parameters for one picture at width 1.
 
     Args:
-        images: k, what the current picture becomes (see `images.image_tensor`), and twice as many
-            where the goal's are stacked below
-        width: channels relative to the original's
-        skips: see `ResNet43`
+        pictures: 1, or 2 where the goal is stacked below the current one
+        config: the network
         exact: pad to a square, as the original does
-        bfloat16: convolve in bfloat16
         generator: draws the initial weights
     """
 
     def __init__(
         self,
         *,
-        images: int = 1,
-        width: float = 1.0,
-        skips: bool = False,
+        pictures: int = 1,
+        config: NetworkConfig = NetworkConfig(),  # noqa: B008 (frozen)
         exact: bool = False,
-        bfloat16: bool = False,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.exact = exact
-        self.network = ResNet43(
-            6 * images, 1, width=width, skips=skips, bfloat16=bfloat16, generator=generator
-        )
+        self.network = ResNet43(1, pictures=pictures, config=config, generator=generator)
 
     def forward(self, image: Tensor) -> Tensor:
         """Pick logits (B, H, W) of raw images (B, 4 k, H, W)."""

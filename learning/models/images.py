@@ -11,10 +11,12 @@ from torch import Tensor
 
 from warp_deform.errors import InputError
 
-__all__ = ["CHANNELS", "image_tensor", "normalise"]
+__all__ = ["CHANNELS", "NETWORK_CHANNELS", "image_tensor", "normalise"]
 
 CHANNELS = 4
 """Channels of one image: red, green, blue (0 to 255) and height [m]."""
+NETWORK_CHANNELS = 6
+"""What a network sees of one image: colour, and the height three times."""
 # Means and standard deviations of the original's data: colour in [0, 1], height in m.
 _COLOR_MEAN, _COLOR_STD = 0.18877631, 0.07276466
 _HEIGHT_MEAN, _HEIGHT_STD = 0.00509261, 0.00903967

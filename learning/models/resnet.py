@@ -9,6 +9,9 @@ What their code does, and this file keeps:
 - weights start Glorot-uniform, biases at zero;
 - maps grow by bilinear interpolation with half-pixel centres.
 
+Ours, and off by default: fewer channels, skip connections, and features that turn with the picture
+(quarter_turns.py), for which means of four pixels take the place of every second one.
+
 One rewriting, which changes rounding only: a 1x1 convolution and bilinear interpolation commute
 (the weights of interpolation sum to 1), so the decoder convolves first and interpolates the fewer
 channels of the smaller result.
@@ -17,6 +20,7 @@ channels of the smaller result.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +28,10 @@ from torch.nn import functional
 
 from warp_deform.errors import InputError
 
-__all__ = ["STRIDE", "ResNet43", "receptive_span"]
+from .images import NETWORK_CHANNELS
+from .quarter_turns import TURNS, Field, QuarterTurnConvolution
+
+__all__ = ["STRIDE", "NetworkConfig", "ResNet43", "receptive_span"]
 
 STRIDE = 8
 """Height and width of an input are multiples of this [pixels]: the smallest map has 1/8 of them."""
@@ -34,65 +41,94 @@ _GROWING = 3
 """Stages at the end that double the map; as many at the beginning halve it or keep it whole."""
 
 
-class ResNet43(nn.Module):
-    """Image (B, C, H, W) -> map (B, out, H, W) float32 of the same height and width.
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """What the networks of an agent have in common; the defaults are the paper's."""
 
-    57 convolutions; 9,833,203 parameters for 6 channels -> 1 at width 1. `width` scales the 64,
-    128, 256 and 512 channels of the stages, 8 at least; the last stage keeps its 16.
+    width: float = 1.0
+    """Channels of the stages relative to the original's 64 to 512, 8 at least."""
+    skips: bool = False
+    """Finer features join the coarse ones that grow, as in U-Nets."""
+    equivariant: bool = False
+    """When the picture makes quarter turns, so does the map, exactly; see quarter_turns.py."""
+    subpixels: int = 1
+    """Side of the square of camera pixels that stand in a pixel's channels."""
+    bfloat16: bool = False
+    """Convolve in bfloat16; weights, gradients and the returned map stay float32."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.width) and self.width > 0):
+            raise InputError(f"width: a positive number is needed, got {self.width!r}")
+
+    @property
+    def channels(self) -> list[int]:
+        """Channels of the stages, from the finest to the coarsest."""
+        step = TURNS if self.equivariant else 1
+        return [max(8, round(full * self.width / step) * step) for full in _CHANNELS]
+
+
+class ResNet43(nn.Module):
+    """Pictures (B, C, H, W) -> map (B, out, H, W) float32 of the same height and width.
+
+    57 convolutions; 9,833,203 parameters for one picture -> 1 by default.
 
     Args:
-        in_channels: channels of the image
         out_channels: channels of the map
-        width: channels relative to the original's
-        skips: join finer features to the coarse ones that grow, as U-Nets do (ours)
-        bfloat16: convolve in bfloat16 (weights, gradients and the returned map stay float32)
+        pictures: seen by the network, each `NETWORK_CHANNELS` channels, times `subpixels` squared
+        config: width and kind
         generator: draws the initial weights
 
     Raises:
-        InputError: a width that is not positive; in `forward`, a side that is no multiple of 8.
+        InputError: in `forward`, a side that is no multiple of 8.
     """
 
     def __init__(
         self,
-        in_channels: int,
         out_channels: int,
         *,
-        width: float = 1.0,
-        skips: bool = False,
-        bfloat16: bool = False,
+        pictures: int = 1,
+        config: NetworkConfig = NetworkConfig(),
         generator: torch.Generator,
     ) -> None:
         super().__init__()
-        if not (math.isfinite(width) and width > 0):
-            raise InputError(f"width: a positive number is needed, got {width!r}")
-        c1, c2, c3, c4 = (max(8, round(channels * width)) for channels in _CHANNELS)
-        self.bfloat16 = bfloat16
-        self.stem = _convolution(in_channels, c1, 3)
+        c1, c2, c3, c4 = config.channels
+        turns, seen = config.equivariant, NETWORK_CHANNELS * pictures * config.subpixels**2
+        self.bfloat16 = config.bfloat16
+        self.stem: nn.Module = (
+            QuarterTurnConvolution(
+                seen, c1, 3, reads="plain", pictures=pictures, subpixels=config.subpixels
+            )
+            if turns
+            else _convolution(seen, c1, 3)
+        )
         self.stages = nn.ModuleList(
             [
-                _Stage(c1, c1, c1),
-                _Stage(c1, c2, c2, stride=2),
-                _Stage(c2, c3, c3, stride=2),
-                _Stage(c3, c4, c4, stride=2),
-                _Stage(c4, c3, c3),
-                _Stage(c3, c2, c2, upsample=True),
-                _Stage(c2, c1, c1, upsample=True),
-                _Stage(c1, _HEAD_CHANNELS, out_channels, upsample=True, activate=False),
+                _Stage(c1, c1, c1, turns=turns),
+                _Stage(c1, c2, c2, turns=turns, stride=2),
+                _Stage(c2, c3, c3, turns=turns, stride=2),
+                _Stage(c3, c4, c4, turns=turns, stride=2),
+                _Stage(c4, c3, c3, turns=turns),
+                _Stage(c3, c2, c2, turns=turns, upsample=True),
+                _Stage(c2, c1, c1, turns=turns, upsample=True),
+                _Stage(c1, _HEAD_CHANNELS, out_channels, turns=turns, upsample=True, last=True),
             ]
         )
-        self.laterals = nn.ModuleList(
-            [_convolution(*c, 1) for c in ((c3, c2), (c2, c1), (c1, _HEAD_CHANNELS)) if skips]
-        )
+        joined = ((c3, c2), (c2, c1), (c1, _HEAD_CHANNELS)) if config.skips else ()
+        self.laterals = nn.ModuleList([_convolution(*each, 1, turns=turns) for each in joined])
         for convolution in self.convolutions():
-            nn.init.xavier_uniform_(convolution.weight, generator=generator)
-            nn.init.zeros_(convolution.bias)
+            if isinstance(convolution, QuarterTurnConvolution):
+                convolution.draw(generator)
+            else:
+                nn.init.xavier_uniform_(convolution.weight, generator=generator)
+                nn.init.zeros_(convolution.bias)
 
-    def convolutions(self) -> list[nn.Conv2d]:
+    def convolutions(self) -> list[nn.Conv2d | QuarterTurnConvolution]:
         """In order: the stem; for every stage 1x1, 3x3, 1x1, shortcut, then 1x1, 3x3, 1x1.
 
         With `skips`, three 1x1 come last.
         """
-        return [module for module in self.modules() if isinstance(module, nn.Conv2d)]
+        kinds = (nn.Conv2d, QuarterTurnConvolution)
+        return [module for module in self.modules() if isinstance(module, kinds)]
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, out, H, W) float32 of an image (B, C, H, W)."""
@@ -116,7 +152,7 @@ class ResNet43(nn.Module):
 
 
 class _Stage(nn.Module):
-    """A projection block, then an identity block."""
+    """A projection block, then an identity block; `last` returns a map that is unbounded."""
 
     def __init__(
         self,
@@ -124,21 +160,26 @@ class _Stage(nn.Module):
         middle: int,
         out_channels: int,
         *,
+        turns: bool = False,
         stride: int = 1,
         upsample: bool = False,
-        activate: bool = True,
+        last: bool = False,
     ) -> None:
         super().__init__()
         self.project = _Block(
             in_channels,
             middle,
             out_channels,
+            turns=turns,
             shortcut=True,
             stride=stride,
             upsample=upsample,
-            activate=activate,
+            gives="plain" if last else "regular",
         )
-        self.identity = _Block(out_channels, middle, out_channels, activate=activate)
+        field: Field = "plain" if last else "regular"
+        self.identity = _Block(
+            out_channels, middle, out_channels, turns=turns, reads=field, gives=field
+        )
 
     def forward(self, x: Tensor, lateral: Tensor | None = None) -> Tensor:
         y: Tensor = self.identity(self.project(x, lateral))
@@ -146,7 +187,8 @@ class _Stage(nn.Module):
 
 
 class _Block(nn.Module):
-    """Bottleneck: 1x1, ReLU, 3x3, ReLU, 1x1, plus the shortcut, then (if `activate`) ReLU.
+    """Bottleneck: 1x1, ReLU, 3x3, ReLU, 1x1, plus the shortcut, then ReLU unless what it gives is
+    plain.
 
     The modules are registered in the order in which `ResNet43.convolutions` promises them.
     """
@@ -157,23 +199,32 @@ class _Block(nn.Module):
         middle: int,
         out_channels: int,
         *,
+        turns: bool,
         shortcut: bool = False,
         stride: int = 1,
         upsample: bool = False,
-        activate: bool,
+        reads: Field = "regular",
+        gives: Field = "regular",
     ) -> None:
         super().__init__()
-        self.reduce = _convolution(in_channels, middle, 1)
-        self.spatial = _convolution(middle, middle, 3)
-        self.expand = _convolution(middle, out_channels, 1)
-        self.shortcut = _convolution(in_channels, out_channels, 1) if shortcut else None
+        self.reduce = _convolution(in_channels, middle, 1, turns=turns, reads=reads)
+        self.spatial = _convolution(middle, middle, 3, turns=turns)
+        self.expand = _convolution(middle, out_channels, 1, turns=turns, gives=gives)
+        self.shortcut = (
+            _convolution(in_channels, out_channels, 1, turns=turns, reads=reads, gives=gives)
+            if shortcut
+            else None
+        )
+        self.turns = turns
         self.stride = stride
         self.upsample = upsample
-        self.activate = activate
+        self.activate = gives == "regular"
 
     def forward(self, x: Tensor, lateral: Tensor | None = None) -> Tensor:
         """`lateral` (B, middle, H, W) joins the bottleneck before its 3x3 convolution."""
-        if self.stride > 1:
+        if self.stride > 1 and self.turns:
+            x = functional.avg_pool2d(x, self.stride)  # every second pixel turns into another one
+        elif self.stride > 1:
             # In place of convolutions with a stride: for fewer than 16 channels stored last, their
             # weight gradient writes out of bounds (uxlfoundation/oneDNN issue 6035, torch 2.13).
             x = x[:, :, :: self.stride, :: self.stride]
@@ -190,8 +241,18 @@ class _Block(nn.Module):
         return functional.relu(y, inplace=True) if self.activate else y
 
 
-def _convolution(in_channels: int, out_channels: int, size: int) -> nn.Conv2d:
+def _convolution(
+    in_channels: int,
+    out_channels: int,
+    size: int,
+    *,
+    turns: bool = False,
+    reads: Field = "regular",
+    gives: Field = "regular",
+) -> nn.Module:
     """A convolution whose weights are still unset, so that no global generator draws them."""
+    if turns:
+        return QuarterTurnConvolution(in_channels, out_channels, size, reads=reads, gives=gives)
     convolution: nn.Conv2d = nn.utils.skip_init(
         nn.Conv2d, in_channels, out_channels, size, padding=size // 2
     )
@@ -202,10 +263,11 @@ def _twice(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
 
 
-def receptive_span(start: int, stop: int) -> tuple[int, int]:
+def receptive_span(start: int, stop: int, *, equivariant: bool = False) -> tuple[int, int]:
     """Input rows [start, stop) on which output rows [start, stop) of a `ResNet43` depend.
 
-    The result may reach outside of the image, where the network sees its own zero padding.
+    An `equivariant` one takes means of two rows where others take the first of two. The result may
+    reach outside of the image, where the network sees its own zero padding.
 
     >>> receptive_span(160, 161)
     (89, 224)
@@ -216,5 +278,5 @@ def receptive_span(start: int, stop: int) -> tuple[int, int]:
         first, last = first // 2, last // 2
     first, last = first - 4, last + 4  # the stages of 512 and 256 channels at 1/8
     for _ in range(3):  # every second pixel, then two 3x3 convolutions
-        first, last = 2 * first - 2, 2 * last + 2
+        first, last = 2 * first - 2, 2 * last + 2 + int(equivariant)
     return first - 1, last + 2

@@ -11,6 +11,8 @@ three change rounding only.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -18,7 +20,7 @@ from torch.nn import functional
 from .correlation import correlate_direct, correlate_fft
 from .crops import crop_reach, rotated_crops
 from .images import normalise
-from .resnet import STRIDE, ResNet43, receptive_span
+from .resnet import STRIDE, NetworkConfig, ResNet43, receptive_span
 
 __all__ = ["Transport", "TransportGoalSplit"]
 
@@ -30,36 +32,31 @@ _FOCUS_SPREAD = 1.5
 class Transport(nn.Module):
     """Raw images (B, 4 k, H, W) and picked pixels (B, 2) -> place logits (B, R, H, W).
 
-    The i-th of R rotations turns the crop by 2 pi i / R. 19,666,866 parameters for one image at
+    The i-th of R rotations turns the crop by 2 pi i / R. 19,666,866 parameters for one picture at
     width 1.
 
     Args:
-        images: k, what the current picture becomes (see `images.image_tensor`), and twice as many
-            where the goal's are stacked below
+        pictures: 1, or 2 where the goal is stacked below the current one
+        config: the networks
         crop: side of the crop around the pick [pixels], 64 at 320 x 160
         crop_before_query: run the query network on rotated crops of the image, as the first
             Transporters did; else rotate and crop its features, as the paper's
-        width: channels relative to the original's
-        skips: see `ResNet43`
         gain: what place logits are multiplied by
         focus: weight of the mean close to the pick, where that over the whole crop weighs 1
         exact: correlate directly, as the original does
-        bfloat16: convolve in bfloat16; the correlation stays float32
         generator: draws the initial weights
     """
 
     def __init__(
         self,
         *,
-        images: int = 1,
+        pictures: int = 1,
+        config: NetworkConfig = NetworkConfig(),  # noqa: B008 (frozen)
         crop: int = 64,
         crop_before_query: bool = False,
-        width: float = 1.0,
-        skips: bool = False,
         gain: float = 1.0,
         focus: float = 0.0,
         exact: bool = False,
-        bfloat16: bool = False,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
@@ -67,8 +64,10 @@ class Transport(nn.Module):
         self.crop_before_query = crop_before_query
         self.gain, self.focus = gain, focus
         self.exact = exact
-        self.key, self.query = _networks(
-            2, images, width=width, skips=skips, bfloat16=bfloat16, generator=generator
+        self.equivariant = config.equivariant
+        self.key, self.query = (
+            ResNet43(_FEATURES, pictures=pictures, config=config, generator=generator)
+            for _ in range(2)
         )
 
     def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
@@ -79,7 +78,9 @@ class Transport(nn.Module):
             crops = rotated_crops(x, centres, size=self.crop, n_rotations=n_rotations)
             kernels = self.query(crops.flatten(0, 1)).unflatten(0, crops.shape[:2])
         else:
-            window = _Window(x, centres, crop=self.crop, n_rotations=n_rotations)
+            window = _Window(
+                x, centres, crop=self.crop, n_rotations=n_rotations, equivariant=self.equivariant
+            )
             kernels = window.crops(self.query(window.of(x)))
         return _correlate(key, kernels, gain=self.gain, focus=self.focus, exact=self.exact)
 
@@ -98,23 +99,21 @@ class TransportGoalSplit(nn.Module):
     def __init__(
         self,
         *,
-        images: int = 1,
+        config: NetworkConfig = NetworkConfig(),  # noqa: B008 (frozen)
         crop: int = 64,
-        width: float = 1.0,
-        skips: bool = False,
         gain: float = 1.0,
         focus: float = 0.0,
         goal_bias: float = 0.0,
         exact: bool = False,
-        bfloat16: bool = False,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.crop = crop
         self.gain, self.focus, self.goal_bias = gain, focus, goal_bias
         self.exact = exact
-        self.key, self.query, self.goal = _networks(
-            3, images, width=width, skips=skips, bfloat16=bfloat16, generator=generator
+        self.equivariant = config.equivariant
+        self.key, self.query, self.goal = (
+            ResNet43(_FEATURES, config=config, generator=generator) for _ in range(3)
         )
 
     def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
@@ -123,28 +122,12 @@ class TransportGoalSplit(nn.Module):
         current, centres = _pad(before, pick, self.crop)
         goal = self.goal(_pad(after, pick, self.crop)[0])
         goal = goal + self.goal_bias if self.goal_bias else goal
-        window = _Window(current, centres, crop=self.crop, n_rotations=n_rotations)
+        window = _Window(
+            current, centres, crop=self.crop, n_rotations=n_rotations, equivariant=self.equivariant
+        )
         kernels = window.crops(self.query(window.of(current)) * window.of(goal))
         key = self.key(current) * goal
         return _correlate(key, kernels, gain=self.gain, focus=self.focus, exact=self.exact)
-
-
-def _networks(
-    count: int,
-    images: int,
-    *,
-    width: float,
-    skips: bool,
-    bfloat16: bool,
-    generator: torch.Generator,
-) -> list[ResNet43]:
-    """Networks of one shape, drawn one after the other."""
-    return [
-        ResNet43(
-            6 * images, _FEATURES, width=width, skips=skips, bfloat16=bfloat16, generator=generator
-        )
-        for _ in range(count)
-    ]
 
 
 def _pad(image: Tensor, pick: Tensor, crop: int) -> tuple[Tensor, Tensor]:
@@ -175,16 +158,19 @@ class _Window:
     prepared once per size.
     """
 
-    def __init__(self, x: Tensor, centres: Tensor, *, crop: int, n_rotations: int) -> None:
+    def __init__(
+        self, x: Tensor, centres: Tensor, *, crop: int, n_rotations: int, equivariant: bool
+    ) -> None:
         self.size, self.n_rotations = crop, n_rotations
         self.shape = (x.shape[-2], x.shape[-1])
         reach = crop_reach(crop, n_rotations)
-        widest = max(_needed(phase, phase, reach)[1] for phase in range(STRIDE))
+        needed = partial(_needed, reach=reach, equivariant=equivariant)
+        widest = max(needed(phase, phase)[1] for phase in range(STRIDE))
         lowest, highest = centres.min(dim=0).values.tolist(), centres.max(dim=0).values.tolist()
         spans = []
         for length, low, high in zip(self.shape, lowest, highest, strict=True):
             extent = min(length, _round_up(high - low + widest + STRIDE))
-            start = _needed(low, high, reach)[0] // STRIDE * STRIDE
+            start = needed(low, high)[0] // STRIDE * STRIDE
             start = max(0, min(start, length - extent))
             spans.append(slice(start, start + extent))
         self.rows, self.columns = spans
@@ -206,9 +192,9 @@ class _Window:
         )
 
 
-def _needed(low: int, high: int, reach: int) -> tuple[int, int]:
+def _needed(low: int, high: int, *, reach: int, equivariant: bool) -> tuple[int, int]:
     """First input row, and number of rows, behind features within `reach` of rows low to high."""
-    start, stop = receptive_span(low - reach, high + reach + 1)
+    start, stop = receptive_span(low - reach, high + reach + 1, equivariant=equivariant)
     return start, stop - start
 
 

@@ -29,7 +29,7 @@ from warp_deform.rendering.pixels import SHAPE
 from .attention import Attention
 from .images import CHANNELS, image_tensor
 from .lift import LiftHead
-from .resnet import STRIDE
+from .resnet import STRIDE, NetworkConfig
 from .transport import Transport, TransportGoalSplit
 
 __all__ = ["PRESETS", "Batch", "GoalSplit", "GoalStack", "Losses", "Picture", "PixelActions",
@@ -48,7 +48,9 @@ class TransporterConfig:
     width: float = 1.0
     """Channels relative to the original's."""
     skips: bool = False
-    """Finer features join the coarse ones that grow, see `ResNet43`: picks become sharp."""
+    """Finer features join the coarse ones that grow, as in U-Nets: picks become sharp."""
+    equivariant: bool = False
+    """What networks say turns with the picture by quarter turns, exactly (quarter_turns.py)."""
     fine: bool = False
     """Show networks every camera pixel: those that a network pixel covers are channels of their
     own, in place of their mean."""
@@ -87,6 +89,7 @@ class TransporterConfig:
                 raise InputError(f"{name}: at least 1 is needed, got {getattr(self, name)}")
         if not self.lifts:
             raise InputError("lifts: at least one is needed")
+        _ = self.network  # refuses what it cannot be built from
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -97,6 +100,17 @@ class TransporterConfig:
     def images(self) -> int:
         """What a picture becomes, see `images.image_tensor`."""
         return self.scale**2 if self.fine else 1
+
+    @property
+    def network(self) -> NetworkConfig:
+        """What the agent's networks have in common."""
+        return NetworkConfig(
+            width=self.width,
+            skips=self.skips,
+            equivariant=self.equivariant,
+            subpixels=self.scale if self.fine else 1,
+            bfloat16=self.bfloat16,
+        )
 
     def to_network(self, pixel: np.ndarray) -> np.ndarray:
         """Network pixels (..., 2) int64 that hold camera pixels (..., 2) int."""
@@ -115,6 +129,7 @@ PRESETS = {
         fine=True,
         width=0.25,
         skips=True,
+        equivariant=True,
         crop=32,
         gain=100.0,
         focus=0.1,
@@ -192,11 +207,9 @@ class Transporter(nn.Module):
         self.config = config
         generator = torch.Generator().manual_seed(seed)
         self.attention = Attention(
-            images=self.pictures * config.images,
-            width=config.width,
-            skips=config.skips,
+            pictures=self.pictures,
+            config=config.network,
             exact=config.exact,
-            bfloat16=config.bfloat16,
             generator=generator,
         )
         self.transport = self._transport(generator)
@@ -211,15 +224,13 @@ class Transporter(nn.Module):
         config = self.config
         before = config.crop_before_query
         return Transport(
-            images=self.pictures * config.images,
+            pictures=self.pictures,
+            config=config.network,
             crop=config.crop,
             crop_before_query=self.crop_before_query if before is None else before,
-            width=config.width,
-            skips=config.skips,
             gain=config.gain,
             focus=config.focus,
             exact=config.exact,
-            bfloat16=config.bfloat16,
             generator=generator,
         )
 
@@ -317,15 +328,12 @@ class GoalSplit(Transporter):
         if config.crop_before_query:
             raise InputError("crop_before_query: Goal-Split multiplies features before it crops")
         return TransportGoalSplit(
-            images=config.images,
+            config=config.network,
             crop=config.crop,
-            width=config.width,
-            skips=config.skips,
             gain=config.gain,
             focus=config.focus,
             goal_bias=config.goal_bias,
             exact=config.exact,
-            bfloat16=config.bfloat16,
             generator=generator,
         )
 

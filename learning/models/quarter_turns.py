@@ -1,0 +1,113 @@
+"""Convolutions whose maps turn with the picture by quarter turns (the group C4).
+
+Source: Cohen and Welling, Group Equivariant Convolutional Networks, ICML 2016; Huang et al.,
+Equivariant Transporter Network, RSS 2022, which shows what it brings to picking and placing.
+
+A regular field is four maps side by side, one per quarter turn: when the picture turns, each of
+them turns and takes the next one's place. A plain field only turns. The weights of one map of four
+are learnt; those of the other three are the same ones, turned.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from warp_deform.errors import InputError
+
+__all__ = ["TURNS", "Field", "QuarterTurnConvolution"]
+
+Field = Literal["regular", "plain"]
+TURNS = 4
+
+
+class QuarterTurnConvolution(nn.Module):
+    """Maps (B, C, H, W) -> (B, out, H, W), zeros around, so that turned maps give turned ones.
+
+    Args:
+        in_channels: of a regular field, all four maps counted
+        out_channels: as `in_channels`
+        size: side of the kernel [pixels]; 1 where a plain field is returned
+        reads: the field that comes in
+        gives: the field that is returned
+        pictures: that make up a plain field which comes in
+        subpixels: the pixels that a pixel of such a picture covers, `subpixels` x `subpixels`, are
+            images of their own (`images.image_tensor` with `fine`) and change places when it turns
+
+    Raises:
+        InputError: channels that do not make up the fields.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        size: int,
+        *,
+        reads: Field = "regular",
+        gives: Field = "regular",
+        pictures: int = 1,
+        subpixels: int = 1,
+    ) -> None:
+        super().__init__()
+        for field, channels in ((reads, in_channels), (gives, out_channels)):
+            if field == "regular" and channels % TURNS:
+                raise InputError(f"channels of quarter turns come in fours, got {channels}")
+        images = pictures * subpixels**2
+        if reads == "plain" and in_channels % images:
+            raise InputError(f"{in_channels} channels do not make up {images} images")
+        if gives == "plain" and size != 1:
+            raise InputError(f"a kernel of side 1 gives a plain field, got {size}")
+        self.reads, self.gives = reads, gives
+        self.size, self.pictures, self.subpixels = size, pictures, subpixels
+        self.channels = in_channels, out_channels
+        own = out_channels // TURNS if gives == "regular" else out_channels
+        read = [in_channels]
+        if reads == "regular":  # a plain field reads the four maps alike
+            read = [in_channels // TURNS, TURNS if gives == "regular" else 1]
+        self.weight = nn.Parameter(torch.zeros(own, *read, size, size))
+        self.bias = nn.Parameter(torch.zeros(own))
+
+    def draw(self, generator: torch.Generator) -> None:
+        """Initial weights: Glorot-uniform by the channels that meet, biases zero.
+
+        A plain field out of a regular one is a sum over four maps that resemble each other: its
+        weights are half as large.
+        """
+        bound = math.sqrt(6 / (self.size**2 * sum(self.channels)))
+        if (self.reads, self.gives) == ("regular", "plain"):
+            bound /= math.sqrt(TURNS)
+        nn.init.uniform_(self.weight, -bound, bound, generator=generator)
+        nn.init.zeros_(self.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, out, H, W) of a map (B, C, H, W)."""
+        bias = self.bias
+        if self.gives == "regular":
+            bias = bias.repeat_interleave(TURNS)
+        return functional.conv2d(x, self.kernel(), bias, padding=self.size // 2)
+
+    def kernel(self) -> Tensor:
+        """The whole kernel (out, C, size, size), with the turned copies of what is learnt."""
+        if self.gives == "plain" and self.reads == "plain":
+            return self.weight
+        if self.gives == "plain":
+            return self.weight.expand(-1, -1, TURNS, -1, -1).flatten(1, 2)
+        turned = [self._turned(turn) for turn in range(TURNS)]
+        return torch.stack(turned, dim=1).flatten(0, 1)
+
+    def _turned(self, turn: int) -> Tensor:
+        """The learnt weights (out / 4, C, size, size), `turn` quarter turns on."""
+        weight = self.weight
+        if self.reads == "regular":
+            moved = weight.roll(turn, dims=2).flatten(1, 2)
+            return moved.rot90(turn, dims=(-2, -1))
+        own, side, sub = len(weight), self.size, self.subpixels
+        fine = weight.reshape(own, self.pictures, sub, sub, -1, side, side)
+        fine = fine.permute(0, 1, 4, 5, 2, 6, 3).flatten(5, 6).flatten(3, 4)
+        fine = fine.rot90(turn, dims=(-2, -1)).unflatten(4, (side, sub)).unflatten(3, (side, sub))
+        return fine.permute(0, 1, 4, 6, 2, 3, 5).reshape(weight.shape)
