@@ -257,6 +257,36 @@ def test_window_of_the_query_changes_nothing(
     assert (ours - whole).abs().max() < 1e-5 * whole.abs().max()
 
 
+@pytest.mark.parametrize("n_rotations", [1, 4])
+@pytest.mark.parametrize("pick", [[0, 0], [39, 5], [20, 16]])
+def test_features_may_be_framed_in_place_of_the_picture(pick: list[int], n_rotations: int) -> None:
+    """By the definition: features of the bare picture, zeros around, then crops and correlation."""
+    image = 50 * torch.rand(1, 8, 40, 32, generator=generator(1))
+    framed, config = (8, 8, 8, 8), NetworkConfig(width=0.01)
+    where = torch.tensor([pick])
+    x, goal = normalise(image).chunk(2, dim=1)
+    single = Transport(crop=16, config=config, pad_features=True, generator=generator())
+    split = TransportGoalSplit(
+        crop=16, config=config, pad_features=True, goal_bias=1.0, generator=generator()
+    )
+    with torch.no_grad():
+        factor = split.goal(goal) + 1
+        for module, seen, by in ((single, image[:, :4], torch.ones(())), (split, image, factor)):
+            key, query = (
+                functional.pad(network(x) * by, framed) for network in (module.key, module.query)
+            )
+            crops = rotated_crops(query, where + 8, size=16, n_rotations=n_rotations)
+            found = module(seen, where, n_rotations=n_rotations)
+            torch.testing.assert_close(found, correlate_direct(key, crops), atol=1e-5, rtol=1e-4)
+        single.crop_before_query = True  # crops reach beyond the picture still
+        edge = normalise(functional.pad(image[:, :4], framed))
+        crops = rotated_crops(edge, where + 8, size=16, n_rotations=n_rotations)
+        kernels = single.query(crops[0])[None]
+        key = functional.pad(single.key(x), framed)
+        found = single(image[:, :4], where, n_rotations=n_rotations)
+        torch.testing.assert_close(found, correlate_direct(key, kernels), atol=1e-5, rtol=1e-4)
+
+
 def test_focus_adds_a_mean_close_to_the_pick() -> None:
     """By the definition: products at equal distances from pick and place, in a bell around them."""
     image = 50 * torch.rand(1, 4, 40, 32, generator=generator(1))

@@ -43,6 +43,8 @@ class Transport(nn.Module):
             Transporters did; else rotate and crop its features, as the paper's
         gain: what place logits are multiplied by
         focus: weight of the mean close to the pick, where that over the whole crop weighs 1
+        pad_features: put zeros around features in place of the image's, so that networks see fewer
+            pixels: half a crop less on every side
         exact: correlate directly, as the original does
         generator: draws the initial weights
     """
@@ -56,6 +58,7 @@ class Transport(nn.Module):
         crop_before_query: bool = False,
         gain: float = 1.0,
         focus: float = 0.0,
+        pad_features: bool = False,
         exact: bool = False,
         generator: torch.Generator,
     ) -> None:
@@ -63,7 +66,7 @@ class Transport(nn.Module):
         self.crop = crop
         self.crop_before_query = crop_before_query
         self.gain, self.focus = gain, focus
-        self.exact = exact
+        self.pad_features, self.exact = pad_features, exact
         self.equivariant = config.equivariant
         self.key, self.query = (
             ResNet43(_FEATURES, pictures=pictures, config=config, generator=generator)
@@ -73,10 +76,16 @@ class Transport(nn.Module):
     def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
         """Place logits (B, R, H, W); `pick` (B, 2) int64 row and column within the image."""
         x, centres = _pad(image, pick, self.crop)
-        key = self.key(x)
+        seen = normalise(image) if self.pad_features else x
+        key = self.key(seen)
+        if self.pad_features:
+            key = _framed(key, self.crop)
         if self.crop_before_query:
             crops = rotated_crops(x, centres, size=self.crop, n_rotations=n_rotations)
             kernels = self.query(crops.flatten(0, 1)).unflatten(0, crops.shape[:2])
+        elif self.pad_features:
+            query = _framed(self.query(seen), self.crop)
+            kernels = rotated_crops(query, centres, size=self.crop, n_rotations=n_rotations)
         else:
             window = _Window(
                 x, centres, crop=self.crop, n_rotations=n_rotations, equivariant=self.equivariant
@@ -104,13 +113,14 @@ class TransportGoalSplit(nn.Module):
         gain: float = 1.0,
         focus: float = 0.0,
         goal_bias: float = 0.0,
+        pad_features: bool = False,
         exact: bool = False,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.crop = crop
         self.gain, self.focus, self.goal_bias = gain, focus, goal_bias
-        self.exact = exact
+        self.pad_features, self.exact = pad_features, exact
         self.equivariant = config.equivariant
         self.key, self.query, self.goal = (
             ResNet43(_FEATURES, config=config, generator=generator) for _ in range(3)
@@ -120,20 +130,36 @@ class TransportGoalSplit(nn.Module):
         """Place logits (B, R, H, W); `pick` (B, 2) int64 row and column within the image."""
         before, after = image.chunk(2, dim=1)
         current, centres = _pad(before, pick, self.crop)
-        goal = self.goal(_pad(after, pick, self.crop)[0])
+        if self.pad_features:
+            current = normalise(before)
+        goal = self.goal(normalise(after) if self.pad_features else _pad(after, pick, self.crop)[0])
         goal = goal + self.goal_bias if self.goal_bias else goal
-        window = _Window(
-            current, centres, crop=self.crop, n_rotations=n_rotations, equivariant=self.equivariant
-        )
-        kernels = window.crops(self.query(window.of(current)) * window.of(goal))
         key = self.key(current) * goal
+        if self.pad_features:
+            key = _framed(key, self.crop)
+            query = _framed(self.query(current) * goal, self.crop)
+            kernels = rotated_crops(query, centres, size=self.crop, n_rotations=n_rotations)
+        else:
+            window = _Window(
+                current,
+                centres,
+                crop=self.crop,
+                n_rotations=n_rotations,
+                equivariant=self.equivariant,
+            )
+            kernels = window.crops(self.query(window.of(current)) * window.of(goal))
         return _correlate(key, kernels, gain=self.gain, focus=self.focus, exact=self.exact)
 
 
 def _pad(image: Tensor, pick: Tensor, crop: int) -> tuple[Tensor, Tensor]:
     """The network's input, padded by half a crop a side, and the picks in it (on the CPU)."""
+    return normalise(_framed(image, crop)), pick.cpu() + crop // 2
+
+
+def _framed(x: Tensor, crop: int) -> Tensor:
+    """Maps with half a crop of zeros around."""
     half = crop // 2
-    return normalise(functional.pad(image, (half, half, half, half))), pick.cpu() + half
+    return functional.pad(x, (half, half, half, half))
 
 
 def _correlate(key: Tensor, kernels: Tensor, *, gain: float, focus: float, exact: bool) -> Tensor:

@@ -65,6 +65,9 @@ class TransporterConfig:
     """Weight of the mean close to the pick, where that over the whole crop weighs 1. There the
     picked thing is a few pixels of a thousand; with 0.1, where it belongs is learnt in far fewer
     steps."""
+    pad_features: bool = False
+    """Put the zeros that crops need beyond the picture around features, not around the picture:
+    networks see 1.7 times fewer pixels at 160 x 80 with crops of 32."""
     goal_bias: float = 0.0
     """Added to the goal's features in Goal-Split: with 1 they multiply by about 1 at first."""
     n_rotations_train: int = 24
@@ -133,6 +136,7 @@ PRESETS = {
         crop=32,
         gain=100.0,
         focus=0.1,
+        pad_features=True,
         goal_bias=1.0,
         n_rotations_train=1,
     ),
@@ -230,6 +234,7 @@ class Transporter(nn.Module):
             crop_before_query=self.crop_before_query if before is None else before,
             gain=config.gain,
             focus=config.focus,
+            pad_features=config.pad_features,
             exact=config.exact,
             generator=generator,
         )
@@ -332,6 +337,7 @@ class GoalSplit(Transporter):
             crop=config.crop,
             gain=config.gain,
             focus=config.focus,
+            pad_features=config.pad_features,
             goal_bias=config.goal_bias,
             exact=config.exact,
             generator=generator,
