@@ -76,6 +76,7 @@ class ResNet43(nn.Module):
         out_channels: channels of the map
         pictures: seen by the network, each `NETWORK_CHANNELS` channels, times `subpixels` squared
         config: width and kind
+        marks: channels of a map that joins the first features, see `forward`
         generator: draws the initial weights
 
     Raises:
@@ -88,6 +89,7 @@ class ResNet43(nn.Module):
         *,
         pictures: int = 1,
         config: NetworkConfig = NetworkConfig(),
+        marks: int = 0,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
@@ -115,6 +117,7 @@ class ResNet43(nn.Module):
         )
         joined = ((c3, c2), (c2, c1), (c1, _HEAD_CHANNELS)) if config.skips else ()
         self.laterals = nn.ModuleList([_convolution(*each, 1, turns=turns) for each in joined])
+        self.mark = _convolution(marks, c1, 3, turns=turns, reads="plain") if marks else None
         for convolution in self.convolutions():
             if isinstance(convolution, QuarterTurnConvolution):
                 convolution.draw(generator)
@@ -125,13 +128,13 @@ class ResNet43(nn.Module):
     def convolutions(self) -> list[nn.Conv2d | QuarterTurnConvolution]:
         """In order: the stem; for every stage 1x1, 3x3, 1x1, shortcut, then 1x1, 3x3, 1x1.
 
-        With `skips`, three 1x1 come last.
+        With `skips`, three 1x1 come last, but for the 3x3 of `marks`.
         """
         kinds = (nn.Conv2d, QuarterTurnConvolution)
         return [module for module in self.modules() if isinstance(module, kinds)]
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Map (B, out, H, W) float32 of an image (B, C, H, W)."""
+    def forward(self, x: Tensor, mark: Tensor | None = None) -> Tensor:
+        """Map (B, out, H, W) float32 of an image (B, C, H, W), and of a map (B, marks, H, W)."""
         height, width = x.shape[-2:]
         if height % STRIDE or width % STRIDE:
             raise InputError(
@@ -140,7 +143,10 @@ class ResNet43(nn.Module):
         # On CPUs convolutions and interpolation of few channels run up to 4 times faster so.
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.bfloat16):
-            x = functional.relu(self.stem(x), inplace=True)
+            x = self.stem(x)
+            if self.mark is not None:
+                x = x + self.mark(mark)
+            x = functional.relu(x, inplace=True)
             finer: list[Tensor] = []
             for stage in self.stages[:-_GROWING]:
                 x = stage(x)

@@ -25,6 +25,8 @@ from .resnet import STRIDE, NetworkConfig, ResNet43, receptive_span
 __all__ = ["Transport", "TransportGoalSplit"]
 
 _FEATURES = 3
+_MARK_REACHES = (2.0, 8.0, 32.0)
+"""Distances from the pick at which the channels of its mark have fallen to 1/e [pixels]."""
 _FOCUS_SPREAD = 1.5
 """What is close to the pick: standard deviation of a Gaussian [pixels]."""
 
@@ -43,6 +45,7 @@ class Transport(nn.Module):
             Transporters did; else rotate and crop its features, as the paper's
         gain: what place logits are multiplied by
         focus: weight of the mean close to the pick, where that over the whole crop weighs 1
+        mark_pick: show the key network, and the goal's, how far every pixel is from the pick
         pad_features: put zeros around features in place of the image's, so that networks see fewer
             pixels: half a crop less on every side
         exact: correlate directly, as the original does
@@ -58,6 +61,7 @@ class Transport(nn.Module):
         crop_before_query: bool = False,
         gain: float = 1.0,
         focus: float = 0.0,
+        mark_pick: bool = False,
         pad_features: bool = False,
         exact: bool = False,
         generator: torch.Generator,
@@ -66,18 +70,20 @@ class Transport(nn.Module):
         self.crop = crop
         self.crop_before_query = crop_before_query
         self.gain, self.focus = gain, focus
-        self.pad_features, self.exact = pad_features, exact
+        self.mark_pick, self.pad_features, self.exact = mark_pick, pad_features, exact
         self.equivariant = config.equivariant
+        marks = len(_MARK_REACHES) if mark_pick else 0
         self.key, self.query = (
-            ResNet43(_FEATURES, pictures=pictures, config=config, generator=generator)
-            for _ in range(2)
+            ResNet43(_FEATURES, pictures=pictures, config=config, marks=each, generator=generator)
+            for each in (marks, 0)
         )
 
     def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
         """Place logits (B, R, H, W); `pick` (B, 2) int64 row and column within the image."""
         x, centres = _pad(image, pick, self.crop)
         seen = normalise(image) if self.pad_features else x
-        key = self.key(seen)
+        mark = _mark(seen, pick if self.pad_features else centres) if self.mark_pick else None
+        key = self.key(seen, mark)
         if self.pad_features:
             key = _framed(key, self.crop)
         if self.crop_before_query:
@@ -113,6 +119,7 @@ class TransportGoalSplit(nn.Module):
         gain: float = 1.0,
         focus: float = 0.0,
         goal_bias: float = 0.0,
+        mark_pick: bool = False,
         pad_features: bool = False,
         exact: bool = False,
         generator: torch.Generator,
@@ -120,10 +127,12 @@ class TransportGoalSplit(nn.Module):
         super().__init__()
         self.crop = crop
         self.gain, self.focus, self.goal_bias = gain, focus, goal_bias
-        self.pad_features, self.exact = pad_features, exact
+        self.mark_pick, self.pad_features, self.exact = mark_pick, pad_features, exact
         self.equivariant = config.equivariant
+        marks = len(_MARK_REACHES) if mark_pick else 0
         self.key, self.query, self.goal = (
-            ResNet43(_FEATURES, config=config, generator=generator) for _ in range(3)
+            ResNet43(_FEATURES, config=config, marks=each, generator=generator)
+            for each in (marks, 0, marks)
         )
 
     def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
@@ -132,9 +141,11 @@ class TransportGoalSplit(nn.Module):
         current, centres = _pad(before, pick, self.crop)
         if self.pad_features:
             current = normalise(before)
-        goal = self.goal(normalise(after) if self.pad_features else _pad(after, pick, self.crop)[0])
+        wanted = normalise(after) if self.pad_features else _pad(after, pick, self.crop)[0]
+        mark = _mark(current, pick if self.pad_features else centres) if self.mark_pick else None
+        goal = self.goal(wanted, mark)
         goal = goal + self.goal_bias if self.goal_bias else goal
-        key = self.key(current) * goal
+        key = self.key(current, mark) * goal
         if self.pad_features:
             key = _framed(key, self.crop)
             query = _framed(self.query(current) * goal, self.crop)
@@ -154,6 +165,14 @@ class TransportGoalSplit(nn.Module):
 def _pad(image: Tensor, pick: Tensor, crop: int) -> tuple[Tensor, Tensor]:
     """The network's input, padded by half a crop a side, and the picks in it (on the CPU)."""
     return normalise(_framed(image, crop)), pick.cpu() + crop // 2
+
+
+def _mark(x: Tensor, pick: Tensor) -> Tensor:
+    """How near the pixels of maps (B, C, H, W) are to picks (B, 2): (B, 3, H, W), 1 at the pick."""
+    rows, columns = (torch.arange(side, device=x.device) for side in x.shape[-2:])
+    down, right = (pick.to(x.device)[:, axis, None] for axis in range(2))
+    distance = torch.hypot((rows - down)[:, :, None].float(), (columns - right)[:, None].float())
+    return torch.stack([torch.exp(-distance / reach) for reach in _MARK_REACHES], dim=1)
 
 
 def _framed(x: Tensor, crop: int) -> Tensor:

@@ -65,6 +65,8 @@ class TransporterConfig:
     """Weight of the mean close to the pick, where that over the whole crop weighs 1. There the
     picked thing is a few pixels of a thousand; with 0.1, where it belongs is learnt in far fewer
     steps."""
+    mark_pick: bool = False
+    """Show the networks that say where to place how far every pixel is from the pick."""
     pad_features: bool = False
     """Put the zeros that crops need beyond the picture around features, not around the picture:
     networks see 1.7 times fewer pixels at 160 x 80 with crops of 32."""
@@ -136,6 +138,7 @@ PRESETS = {
         crop=32,
         gain=100.0,
         focus=0.1,
+        mark_pick=True,
         pad_features=True,
         goal_bias=1.0,
         n_rotations_train=1,
@@ -234,6 +237,7 @@ class Transporter(nn.Module):
             crop_before_query=self.crop_before_query if before is None else before,
             gain=config.gain,
             focus=config.focus,
+            mark_pick=config.mark_pick,
             pad_features=config.pad_features,
             exact=config.exact,
             generator=generator,
@@ -337,6 +341,7 @@ class GoalSplit(Transporter):
             crop=config.crop,
             gain=config.gain,
             focus=config.focus,
+            mark_pick=config.mark_pick,
             pad_features=config.pad_features,
             goal_bias=config.goal_bias,
             exact=config.exact,
