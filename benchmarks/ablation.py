@@ -43,6 +43,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no gain": {"network": replace(FAST, gain=1.0)},
     "no focus": {"network": replace(FAST, focus=0.0)},
     "coarse image": {"network": replace(FAST, fine=False)},
+    "no mark": {"network": replace(FAST, mark_pick=False)},
     "picture framed": {"network": replace(FAST, pad_features=False)},
     "no goal bias": {"network": replace(FAST, goal_bias=0.0)},
     "width of 1/2": {"network": replace(FAST, width=0.5)},

@@ -66,6 +66,9 @@ TRANSPORTS: dict[str, Callable[[], nn.Module]] = {
     "crop before": lambda: Transport(
         crop=CROP, config=NARROW, crop_before_query=True, generator=generator()
     ),
+    "marked": lambda: Transport(
+        crop=CROP, config=NARROW, mark_pick=True, pad_features=True, generator=generator()
+    ),
     "goal-split": lambda: TransportGoalSplit(
         crop=CROP, config=NARROW, goal_bias=1.0, generator=generator()
     ),

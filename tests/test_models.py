@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 from torch.nn import functional
 
 from learning.models.adam import KerasAdam
@@ -255,6 +256,38 @@ def test_window_of_the_query_changes_nothing(
         whole = correlate_direct(transport.key(x), kernels)
     assert ours.shape == (2, n_rotations, 320, 80)
     assert (ours - whole).abs().max() < 1e-5 * whole.abs().max()
+
+
+@pytest.mark.parametrize("pad_features", [False, True])
+def test_a_mark_tells_key_and_goal_how_far_the_pick_is(pad_features: bool) -> None:
+    """By its definition, and nothing where its weights are zero."""
+    image, config = 50 * torch.rand(1, 8, 40, 32, generator=generator(1)), NetworkConfig(width=0.01)
+    plain, marked = (
+        TransportGoalSplit(
+            crop=16, config=config, mark_pick=each, pad_features=pad_features, generator=generator()
+        )
+        for each in (False, True)
+    )
+    missing = marked.load_state_dict(plain.state_dict(), strict=False).missing_keys
+    assert {key.split(".")[0] for key in missing} == {"key", "goal"}
+    pick, frame = torch.tensor([[9, 21]]), 0 if pad_features else 8
+    seen: dict[torch.nn.Module, Tensor] = {}
+    for network in (marked.key, marked.goal):
+        network.mark.register_forward_pre_hook(
+            lambda module, given: seen.update({module: given[0]})
+        )
+    with torch.no_grad():
+        assert not torch.allclose(marked(image, pick), plain(image, pick))
+        for network in (marked.key, marked.goal):
+            mark = seen[network.mark]
+            assert mark.shape == (1, 3, 40 + 2 * frame, 32 + 2 * frame)
+            for channel, reach in enumerate((2, 8, 32)):
+                for row, column in ((9, 21), (12, 25), (0, 0)):
+                    far = math.hypot(row - 9, column - 21)
+                    found = float(mark[0, channel, row + frame, column + frame])
+                    assert found == pytest.approx(math.exp(-far / reach), rel=1e-5)
+            network.mark.weight.zero_()
+        assert torch.equal(marked(image, pick), plain(image, pick))
 
 
 @pytest.mark.parametrize("n_rotations", [1, 4])

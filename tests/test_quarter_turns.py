@@ -108,7 +108,7 @@ def test_agents_turn_with_the_camera_s_picture(agent: type[Transporter], fine: b
 @pytest.mark.parametrize("subpixels", [1, 2])
 def test_networks_turn_with_every_pixel_of_the_picture(subpixels: int) -> None:
     config = NetworkConfig(width=0.125, skips=True, equivariant=True, subpixels=subpixels)
-    network = ResNet43(3, pictures=2, config=config, generator=generator())
+    network = ResNet43(3, pictures=2, config=config, marks=1, generator=generator())
     fine = torch.randn(1, 2, 6, 24 * subpixels, 16 * subpixels, generator=generator(1))
 
     def channels(x: Tensor) -> Tensor:
@@ -116,10 +116,11 @@ def test_networks_turn_with_every_pixel_of_the_picture(subpixels: int) -> None:
         blocks = x.reshape(1, 2, 6, rows, subpixels, columns, subpixels)
         return blocks.permute(0, 1, 4, 6, 2, 3, 5).reshape(1, -1, rows, columns)
 
+    mark = torch.rand(1, 1, 24, 16, generator=generator(2))
     with torch.no_grad():
-        still = network(channels(fine))
+        still = network(channels(fine), mark)
         for quarters in (1, 2, 3):
-            found = network(channels(turn(fine, quarters)))
+            found = network(channels(turn(fine, quarters)), turn(mark, quarters))
             torch.testing.assert_close(found, turn(still, quarters), atol=2e-5, rtol=1e-4)
     assert not torch.allclose(still, turn(still, 2), atol=1e-3)
 
