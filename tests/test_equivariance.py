@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -13,7 +14,7 @@ from learning.models.attention import Attention
 from learning.models.correlation import correlate_direct, correlate_fft
 from learning.models.crops import rotated_crops
 from learning.models.resnet import NetworkConfig
-from learning.models.transport import Transport, TransportGoalSplit
+from learning.models.transport import Transport
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -69,8 +70,14 @@ TRANSPORTS: dict[str, Callable[[], nn.Module]] = {
     "marked": lambda: Transport(
         crop=CROP, config=NARROW, mark_pick=True, pad_features=True, generator=generator()
     ),
-    "goal-split": lambda: TransportGoalSplit(
-        crop=CROP, config=NARROW, goal_bias=1.0, generator=generator()
+    "goal-split": lambda: Transport(
+        pictures=2,
+        goal_split=True,
+        crop=CROP,
+        config=dataclasses.replace(NARROW, equivariant=True),
+        goal_bias=1.0,
+        mark_pick=True,
+        generator=generator(),
     ),
 }
 

@@ -18,7 +18,7 @@ from learning.models.adam import KerasAdam
 from learning.models.attention import Attention
 from learning.models.images import image_tensor
 from learning.models.resnet import ResNet43
-from learning.models.transport import Transport, TransportGoalSplit
+from learning.models.transport import Transport
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -31,7 +31,9 @@ MODULES = {
     "transport_goal_stack": lambda g: Transport(
         pictures=2, exact=True, crop_before_query=True, generator=g
     ),
-    "transport_goal_split": lambda g: TransportGoalSplit(exact=True, generator=g),
+    "transport_goal_split": lambda g: Transport(
+        pictures=2, goal_split=True, exact=True, generator=g
+    ),
 }
 
 

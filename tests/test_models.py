@@ -20,7 +20,7 @@ from learning.models.crops import crop_reach, rotated_crops
 from learning.models.images import image_tensor, normalise
 from learning.models.lift import LiftHead
 from learning.models.resnet import NetworkConfig, ResNet43, receptive_span
-from learning.models.transport import Transport, TransportGoalSplit
+from learning.models.transport import Transport
 from warp_deform.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -42,7 +42,7 @@ def test_parameter_counts_are_the_original_s() -> None:
     assert count(Attention(pictures=2, generator=g)) == 9_836_659
     assert count(Transport(generator=g)) == 19_666_866
     assert count(Transport(pictures=2, generator=g)) == 19_673_778
-    assert count(TransportGoalSplit(generator=g)) == 29_500_299
+    assert count(Transport(pictures=2, goal_split=True, generator=g)) == 29_500_299
 
 
 def test_weights_start_glorot_uniform_and_leave_the_global_generator_alone() -> None:
@@ -123,10 +123,15 @@ def test_image_sides_must_be_multiples_of_eight() -> None:
         NetworkConfig(width=0.0)
 
 
-def test_bfloat16_is_near_float32() -> None:
+@pytest.mark.parametrize("equivariant", [False, True])
+def test_bfloat16_is_near_float32(equivariant: bool) -> None:
     x = torch.randn(1, 6, 64, 32, generator=generator())
     exact, rounded = (
-        ResNet43(1, config=NetworkConfig(width=0.25, bfloat16=b), generator=generator(1))(x)
+        ResNet43(
+            1,
+            config=NetworkConfig(width=0.25, skips=True, equivariant=equivariant, bfloat16=b),
+            generator=generator(1),
+        )(x)
         for b in (False, True)
     )
     assert rounded.dtype == torch.float32
@@ -253,6 +258,8 @@ def test_window_of_the_query_changes_nothing(
         ours = transport(image, pick, n_rotations=n_rotations)
         x = normalise(torch.nn.functional.pad(image, (8, 8, 8, 8)))
         kernels = rotated_crops(transport.query(x), pick + 8, size=16, n_rotations=n_rotations)
+        if equivariant:  # a crop's first row and column have no partner across the pick
+            kernels[..., 0, :] = kernels[..., 0] = 0
         whole = correlate_direct(transport.key(x), kernels)
     assert ours.shape == (2, n_rotations, 320, 80)
     assert (ours - whole).abs().max() < 1e-5 * whole.abs().max()
@@ -263,8 +270,14 @@ def test_a_mark_tells_key_and_goal_how_far_the_pick_is(pad_features: bool) -> No
     """By its definition, and nothing where its weights are zero."""
     image, config = 50 * torch.rand(1, 8, 40, 32, generator=generator(1)), NetworkConfig(width=0.01)
     plain, marked = (
-        TransportGoalSplit(
-            crop=16, config=config, mark_pick=each, pad_features=pad_features, generator=generator()
+        Transport(
+            pictures=2,
+            goal_split=True,
+            crop=16,
+            config=config,
+            mark_pick=each,
+            pad_features=pad_features,
+            generator=generator(),
         )
         for each in (False, True)
     )
@@ -290,6 +303,27 @@ def test_a_mark_tells_key_and_goal_how_far_the_pick_is(pad_features: bool) -> No
         assert torch.equal(marked(image, pick), plain(image, pick))
 
 
+@pytest.mark.parametrize("pad_features", [False, True])
+@pytest.mark.parametrize("goal_split", [False, True])
+def test_pictures_of_a_batch_do_not_meet(goal_split: bool, pad_features: bool) -> None:
+    network = Transport(
+        pictures=2,
+        goal_split=goal_split,
+        crop=16,
+        config=NetworkConfig(width=0.01),
+        mark_pick=True,
+        pad_features=pad_features,
+        generator=generator(),
+    )
+    image = 50 * torch.rand(2, 8, 40, 32, generator=generator(1))
+    picks = torch.tensor([[3, 2], [35, 28]])
+    with torch.no_grad():
+        pairs = zip(image, picks, strict=True)
+        alone = torch.cat([network(scene[None], pick[None]) for scene, pick in pairs])
+        together = network(image, picks)
+    assert (together - alone).abs().max() < 1e-5 * alone.abs().max()
+
+
 @pytest.mark.parametrize("n_rotations", [1, 4])
 @pytest.mark.parametrize("pick", [[0, 0], [39, 5], [20, 16]])
 def test_features_may_be_framed_in_place_of_the_picture(pick: list[int], n_rotations: int) -> None:
@@ -299,8 +333,14 @@ def test_features_may_be_framed_in_place_of_the_picture(pick: list[int], n_rotat
     where = torch.tensor([pick])
     x, goal = normalise(image).chunk(2, dim=1)
     single = Transport(crop=16, config=config, pad_features=True, generator=generator())
-    split = TransportGoalSplit(
-        crop=16, config=config, pad_features=True, goal_bias=1.0, generator=generator()
+    split = Transport(
+        pictures=2,
+        goal_split=True,
+        crop=16,
+        config=config,
+        pad_features=True,
+        goal_bias=1.0,
+        generator=generator(),
     )
     with torch.no_grad():
         factor = split.goal(goal) + 1

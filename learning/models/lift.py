@@ -16,7 +16,7 @@ from torch.nn import functional
 from warp_deform.errors import InputError
 
 from .crops import rotated_crops
-from .images import CHANNELS, normalise
+from .images import CHANNELS, NETWORK_CHANNELS, normalise
 
 __all__ = ["LiftHead"]
 
@@ -53,7 +53,7 @@ class LiftHead(nn.Module):
             raise InputError(f"n_lifts: nothing to choose among {n_lifts}")
         self.crop = crop
         self.channels = CHANNELS * images
-        widths = (6 * images, *_CHANNELS[-halvings:])
+        widths = (NETWORK_CHANNELS * images, *_CHANNELS[-halvings:])
         self.convolutions = nn.ModuleList(
             nn.utils.skip_init(nn.Conv2d, before, after, 3, stride=2, padding=1)
             for before, after in pairwise(widths)

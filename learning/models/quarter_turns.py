@@ -22,19 +22,21 @@ from warp_deform.errors import InputError
 __all__ = ["TURNS", "Field", "QuarterTurnConvolution"]
 
 Field = Literal["regular", "plain"]
+"""Kind of a field."""
 TURNS = 4
+"""Maps of a regular field: quarter turns in a full one."""
 
 
 class QuarterTurnConvolution(nn.Module):
     """Maps (B, C, H, W) -> (B, out, H, W), zeros around, so that turned maps give turned ones.
 
     Args:
-        in_channels: of a regular field, all four maps counted
+        in_channels: all maps counted, four to a regular field
         out_channels: as `in_channels`
         size: side of the kernel [pixels]; 1 where a plain field is returned
-        reads: the field that comes in
-        gives: the field that is returned
-        pictures: that make up a plain field which comes in
+        reads: kind of the fields that come in
+        gives: kind of the fields that go out
+        pictures: that make up the plain fields which come in
         subpixels: the pixels that a pixel of such a picture covers, `subpixels` x `subpixels`, are
             images of their own (`images.image_tensor` with `fine`) and change places when it turns
 
@@ -60,8 +62,8 @@ class QuarterTurnConvolution(nn.Module):
         images = pictures * subpixels**2
         if reads == "plain" and in_channels % images:
             raise InputError(f"{in_channels} channels do not make up {images} images")
-        if gives == "plain" and size != 1:
-            raise InputError(f"a kernel of side 1 gives a plain field, got {size}")
+        if gives == "plain" and (reads == "plain" or size != 1):
+            raise InputError("plain fields come out of regular ones, by kernels of side 1")
         self.reads, self.gives = reads, gives
         self.size, self.pictures, self.subpixels = size, pictures, subpixels
         self.channels = in_channels, out_channels
@@ -93,8 +95,6 @@ class QuarterTurnConvolution(nn.Module):
 
     def kernel(self) -> Tensor:
         """The whole kernel (out, C, size, size), with the turned copies of what is learnt."""
-        if self.gives == "plain" and self.reads == "plain":
-            return self.weight
         if self.gives == "plain":
             return self.weight.expand(-1, -1, TURNS, -1, -1).flatten(1, 2)
         turned = [self._turned(turn) for turn in range(TURNS)]

@@ -50,7 +50,7 @@ class NetworkConfig:
     skips: bool = False
     """Finer features join the coarse ones that grow, as in U-Nets."""
     equivariant: bool = False
-    """When the picture makes quarter turns, so does the map, exactly; see quarter_turns.py."""
+    """When the picture makes quarter turns, so does the map (quarter_turns.py)."""
     subpixels: int = 1
     """Side of the square of camera pixels that stand in a pixel's channels."""
     bfloat16: bool = False
@@ -59,6 +59,8 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.width) and self.width > 0):
             raise InputError(f"width: a positive number is needed, got {self.width!r}")
+        if self.subpixels < 1:
+            raise InputError(f"subpixels: at least 1 is needed, got {self.subpixels}")
 
     @property
     def channels(self) -> list[int]:
@@ -80,7 +82,7 @@ class ResNet43(nn.Module):
         generator: draws the initial weights
 
     Raises:
-        InputError: in `forward`, a side that is no multiple of 8.
+        InputError: in `forward`, a side that is no multiple of 8, or a mark that is missing.
     """
 
     def __init__(
@@ -128,7 +130,7 @@ class ResNet43(nn.Module):
     def convolutions(self) -> list[nn.Conv2d | QuarterTurnConvolution]:
         """In order: the stem; for every stage 1x1, 3x3, 1x1, shortcut, then 1x1, 3x3, 1x1.
 
-        With `skips`, three 1x1 come last, but for the 3x3 of `marks`.
+        Then the three 1x1 of `skips` and the 3x3 of `marks`, where there are any.
         """
         kinds = (nn.Conv2d, QuarterTurnConvolution)
         return [module for module in self.modules() if isinstance(module, kinds)]
@@ -140,6 +142,8 @@ class ResNet43(nn.Module):
             raise InputError(
                 f"image: sides must be multiples of {STRIDE} pixels, got {height} x {width}"
             )
+        if (mark is None) != (self.mark is None):
+            raise InputError("mark: a network with marks needs one, others take none")
         # On CPUs convolutions and interpolation of few channels run up to 4 times faster so.
         x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.bfloat16):

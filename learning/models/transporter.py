@@ -4,8 +4,8 @@ Source: Zeng et al., CoRL 2020; Seita et al., ICRA 2021, sections on Transporter
 goal-conditioned variants, appendix on training; and what their code does, which the modules beside
 this one take up point by point.
 
-`exact=True` computes what the original computes, by the same operations. The default differs by a
-pick network that sees the image unpadded (attention.py); all else is the same but for rounding.
+`exact=True` computes what the original computes, by the same operations. Without it, the preset
+`paper` differs by a pick network that sees the image unpadded (attention.py), and by rounding.
 Kept in both: the crop comes after the query for Transporter and Goal-Split, before it for
 Goal-Stack (the original's default, which only the plain Transporter's configuration overrides);
 rotations are counted separately for training (24) and evaluation (1 in most of the original's
@@ -30,7 +30,7 @@ from .attention import Attention
 from .images import CHANNELS, image_tensor
 from .lift import LiftHead
 from .resnet import STRIDE, NetworkConfig
-from .transport import Transport, TransportGoalSplit
+from .transport import Transport
 
 __all__ = ["PRESETS", "Batch", "GoalSplit", "GoalStack", "Losses", "Picture", "PixelActions",
            "Transporter", "TransporterConfig"]  # fmt: skip
@@ -50,7 +50,7 @@ class TransporterConfig:
     skips: bool = False
     """Finer features join the coarse ones that grow, as in U-Nets: picks become sharp."""
     equivariant: bool = False
-    """What networks say turns with the picture by quarter turns, exactly (quarter_turns.py)."""
+    """What networks say turns with the picture by quarter turns (quarter_turns.py)."""
     fine: bool = False
     """Show networks every camera pixel: those that a network pixel covers are channels of their
     own, in place of their mean."""
@@ -92,6 +92,8 @@ class TransporterConfig:
         for name in ("n_rotations_train", "n_rotations_eval"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name}: at least 1 is needed, got {getattr(self, name)}")
+        if not (0 < self.gain < math.inf and 0 <= self.focus < math.inf):
+            raise InputError(f"gain {self.gain} and focus {self.focus}: must not be negative")
         if not self.lifts:
             raise InputError("lifts: at least one is needed")
         _ = self.network  # refuses what it cannot be built from
@@ -103,7 +105,7 @@ class TransporterConfig:
 
     @property
     def images(self) -> int:
-        """What a picture becomes, see `images.image_tensor`."""
+        """How many images a picture becomes, see `images.image_tensor`."""
         return self.scale**2 if self.fine else 1
 
     @property
@@ -136,6 +138,7 @@ PRESETS = {
         skips=True,
         equivariant=True,
         crop=32,
+        crop_before_query=False,
         gain=100.0,
         focus=0.1,
         mark_pick=True,
@@ -207,6 +210,8 @@ class Transporter(nn.Module):
     name: ClassVar[str] = "transporter"
     pictures: ClassVar[int] = 1
     """1, or 2 where the goal is seen too."""
+    goal_split: ClassVar[bool] = False
+    """The goal's picture has a network of its own."""
     crop_before_query: ClassVar[bool] = False
 
     def __init__(self, config: TransporterConfig, *, seed: int) -> None:
@@ -219,7 +224,21 @@ class Transporter(nn.Module):
             exact=config.exact,
             generator=generator,
         )
-        self.transport = self._transport(generator)
+        before = config.crop_before_query
+        self.transport = Transport(
+            pictures=self.pictures,
+            goal_split=self.goal_split,
+            config=config.network,
+            crop=config.crop,
+            crop_before_query=self.crop_before_query if before is None else before,
+            gain=config.gain,
+            focus=config.focus,
+            goal_bias=config.goal_bias,
+            mark_pick=config.mark_pick,
+            pad_features=config.pad_features,
+            exact=config.exact,
+            generator=generator,
+        )
         n_lifts = len(config.lifts)
         self.lift = (
             LiftHead(n_lifts, images=config.images, crop=config.crop, generator=generator)
@@ -227,24 +246,8 @@ class Transporter(nn.Module):
             else None
         )
 
-    def _transport(self, generator: torch.Generator) -> nn.Module:
-        config = self.config
-        before = config.crop_before_query
-        return Transport(
-            pictures=self.pictures,
-            config=config.network,
-            crop=config.crop,
-            crop_before_query=self.crop_before_query if before is None else before,
-            gain=config.gain,
-            focus=config.focus,
-            mark_pick=config.mark_pick,
-            pad_features=config.pad_features,
-            exact=config.exact,
-            generator=generator,
-        )
-
     def image(self, current: Picture, goal: Picture | None = None) -> Tensor:
-        """The network's image (4 or 8, H, W) of a picture, and of the goal's if the agent has one.
+        """The network's image (4 k, H, W) of a picture, and of the goal's if the agent has one.
 
         Raises:
             InputError: a goal is missing, or given to an agent that has none.
@@ -320,33 +323,18 @@ class Transporter(nn.Module):
     def _check(self, image: Tensor) -> None:
         shape = (CHANNELS * self.pictures * self.config.images, *self.config.shape)
         if image.ndim != 4 or image.shape[1:] != shape:
-            raise InputError(f"image: shape (B, {shape}) is needed, got {tuple(image.shape)}")
+            raise InputError(f"image: shape {('B', *shape)} is needed, got {tuple(image.shape)}")
 
 
 class GoalSplit(Transporter):
     """Transporter-Goal-Split: a third network sees the goal and multiplies key and query features.
 
-    Attention sees current and goal pictures stacked; `crop_before_query` has no meaning here.
+    Attention sees current and goal pictures stacked; features are never cropped before the query.
     """
 
     name = "goal-split"
     pictures = 2
-
-    def _transport(self, generator: torch.Generator) -> nn.Module:
-        config = self.config
-        if config.crop_before_query:
-            raise InputError("crop_before_query: Goal-Split multiplies features before it crops")
-        return TransportGoalSplit(
-            config=config.network,
-            crop=config.crop,
-            gain=config.gain,
-            focus=config.focus,
-            mark_pick=config.mark_pick,
-            pad_features=config.pad_features,
-            goal_bias=config.goal_bias,
-            exact=config.exact,
-            generator=generator,
-        )
+    goal_split = True
 
 
 class GoalStack(Transporter):
