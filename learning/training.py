@@ -287,6 +287,8 @@ def _claim(
     wanted = json.loads(json.dumps(deciding))
     if run.settings.exists():
         found = read_json(run.settings)
+        if "rounded" in found:
+            raise InputError(f"{run.path} is a shared policy, not trained further; choose another --out")
         different = [key for key in wanted if found.get(key) != wanted[key]]
         if different:
             raise InputError(

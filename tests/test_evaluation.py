@@ -171,6 +171,12 @@ def test_a_shared_run_is_the_chosen_snapshot_in_half_its_bytes(
     assert json.loads(capsys.readouterr().out)["demos"] == 2
     assert main(arguments) == 2
     assert "exists" in capsys.readouterr().err
+    more = TrainConfig(
+        task="block-notarget", agent="gt-mlp", data=run.path.parent / "demos", out=shared,
+        preset="fast", schedule=SCHEDULE,
+    )  # fmt: skip
+    with pytest.raises(InputError, match="shared policy"):
+        train(more)
 
 
 def test_goals_come_from_goal_seeds(run: RunFolder) -> None:
