@@ -288,7 +288,9 @@ def _claim(
     if run.settings.exists():
         found = read_json(run.settings)
         if "rounded" in found:
-            raise InputError(f"{run.path} is a shared policy, not trained further; choose another --out")
+            raise InputError(
+                f"{run.path} is a shared policy, not trained further; choose another --out"
+            )
         different = [key for key in wanted if found.get(key) != wanted[key]]
         if different:
             raise InputError(
