@@ -186,6 +186,28 @@ def test_a_goal_is_the_fabric_on_the_square() -> None:
     assert task.goal_targets(layout, state).dtype == np.float64
 
 
+def test_a_start_for_a_goal_from_elsewhere_is_drawn_by_its_square() -> None:
+    """As near to it as demonstrations begin, not where another episode's square would be."""
+    task, layout, _ = start(FabricFlatNotarget, 3)
+    goal = layout.targets
+
+    def gap(drawn: Layout) -> float:
+        return float(np.linalg.norm(drawn.particle_q[:, :2].mean(axis=0) - drawn.targets[0, :2]))
+
+    own, foreign = (
+        [draw(np.random.default_rng(seed)) for seed in range(60)]
+        for draw in (
+            lambda rng: task.sample(rng, REACH),
+            lambda rng: task.sample_for_goal(rng, REACH, goal),
+        )
+    )
+    for drawn in foreign:
+        np.testing.assert_array_equal(drawn.targets, goal)
+    assert max(map(gap, foreign)) <= max(map(gap, own)) + 0.02
+    assert np.mean(list(map(gap, foreign))) == pytest.approx(np.mean(list(map(gap, own))), rel=0.1)
+    assert len({drawn.particle_q.tobytes() for drawn in foreign}) == 60
+
+
 def test_cover_needs_the_cube_hidden_and_near() -> None:
     task, layout, _ = start(FabricCover, 1)
     x, y = layout.particle_q[:, :2].mean(axis=0)

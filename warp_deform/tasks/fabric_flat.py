@@ -83,7 +83,13 @@ class FabricFlat(Task):
         """
         side = self.fabric.side
         room = side / np.sqrt(2) + self.overshoot
-        x, y, yaw = space.sample(rng, side, side, extent=room)
+        return self._start(rng, space, space.sample(rng, side, side, extent=room))
+
+    def _start(
+        self, rng: np.random.Generator, space: FreeSpace, pose: tuple[float, float, float]
+    ) -> Layout:
+        """The square at a pose, and a fabric drawn by it."""
+        side, (x, y, yaw) = self.fabric.side, pose
         zone = square_zone((x, y), yaw, side)
         free = space.occupy_quads(zone.corners)
         for _ in range(_MOST_DRAWS):
@@ -216,6 +222,13 @@ class FabricFlatNotarget(FabricFlat):
         """As fabric-flat. Targets (101, 3): the square's pose, then the goal's vertices."""
         layout = super().sample(rng, space)
         return layout.with_targets(np.vstack([layout.targets, self._flat(layout.targets[0])]))
+
+    def sample_for_goal(
+        self, rng: np.random.Generator, space: FreeSpace, targets: np.ndarray
+    ) -> Layout:
+        """The square where the goal's episode had it, and a fabric drawn by it."""
+        x, y, yaw = (float(value) for value in targets[0])
+        return self._start(rng, space, (x, y, yaw)).with_targets(targets)
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(600,): x, y, z of every vertex, then of the goal's."""
