@@ -120,8 +120,9 @@ class ScriptedChooser:
         self._layout = Layout(np.zeros((0, 3)), np.zeros((0, 7)), targets)
 
     def reset(self) -> None:
-        """Forget what was missed."""
+        """Forget what was missed and moved."""
         self._tried = Tried()
+        self._placed: list[np.ndarray] = []
 
     def choose(self, seen: Observation) -> PickPlaceAction | None:
         """See `Chooser.choose`."""
@@ -150,7 +151,8 @@ class PolicyChooser:
     """A policy that `warp-deform train` made.
 
     It sees the mask as three channels of 0 or 255 and a height of zeros, as in `cable-mask-goal`,
-    and picks elsewhere after an action that changed nothing.
+    and picks elsewhere after an action that changed nothing, and than where its last two actions
+    put something down.
 
     Args:
         path: a run's folder or a snapshot
@@ -177,12 +179,13 @@ class PolicyChooser:
                 f"{CableMaskGoal.name} and its workspace"
             )
         self._policy = policy
-        self._tried = Tried()
+        self.reset()
         self.name = policy.description.agent
 
     def reset(self) -> None:
-        """Forget what was missed."""
+        """Forget what was missed and moved."""
         self._tried = Tried()
+        self._placed: list[np.ndarray] = []
 
     def choose(self, seen: Observation) -> PickPlaceAction | None:
         """See `Chooser.choose`.
@@ -194,10 +197,17 @@ class PolicyChooser:
             return None
         if seen.goal is None and self._policy.agent.pictures == _TWO_PICTURES:
             raise InputError(f"{self.name} needs a goal; give --goal")
-        avoid = [np.array(xy) for xy in self._tried.picks(seen)]
+        from learning.policy import MISSED, PUT_DOWN, RESTING
+
+        missed = self._tried.picks(seen)
+        if missed and self._placed:
+            self._placed.pop()  # nothing was put down
+        avoid = [(np.array(xy), MISSED) for xy in missed]
+        avoid += [(place, PUT_DOWN) for place in self._placed[-RESTING:]]
         goal = None if seen.goal is None else _picture(seen.goal)
         action = to_action(self._policy.act(_picture(seen.mask), goal, avoid=avoid))
         self._tried.chose(action)
+        self._placed.append(np.array(action.place_xy))
         return action
 
 

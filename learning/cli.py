@@ -126,8 +126,8 @@ class EvalOptions(CommandOptions):
     stage_rule: Literal["action", "privileged"] = "action"
     """Who chooses the lift: the policy, or the paper's rule, which reads the simulator."""
     retry: bool = True
-    """Agents over pictures pick elsewhere after an action that changed nothing that they see; the
-    paper's do not."""
+    """Agents over pictures remember what they missed and what they just put down, and pick
+    elsewhere; the paper's do not."""
     goals: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of goals that the test episodes share in turn, see `warp-deform goals`."""
     video: Annotated[Path | None, arg(metavar="DIR")] = None

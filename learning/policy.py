@@ -33,8 +33,10 @@ __all__ = ["AGENTS", "Agent", "AgentDescription", "ImagePolicy", "Policy", "Retr
 
 Agent = Transporter | GtState | GtState2Step
 
-_AVOIDED = 0.008
+MISSED = 0.008
 """Around a missed pick [m]: a bead's diameter and more."""
+PUT_DOWN, RESTING = 0.02, 2
+"""What was put down within so many metres by so many of the last actions is left alone."""
 _MOST_TRIED = 20
 _LEVELS, _PIXELS = 10, 4
 """A picture has changed if so many colour levels differ in more than so many pixels; a bead of 1 cm
@@ -126,11 +128,11 @@ class ImagePolicy:
         goal: Mapping[str, np.ndarray] | None = None,
         *,
         rng: np.random.Generator | None = None,
-        avoid: Sequence[np.ndarray] = (),
+        avoid: Sequence[tuple[np.ndarray, float]] = (),
     ) -> np.ndarray:
         """See `Policy.act`.
 
-        avoid: points x, y [m] within 8 mm of which nothing is to be picked
+        avoid: points x, y and distances [m] from them within which nothing is to be picked
 
         Raises:
             InputError: a picture is missing, or is not a top-down picture of the table.
@@ -148,22 +150,23 @@ class ImagePolicy:
         place_yaw = found.place_yaw[0] if yaw == 0.0 else wrap_angle(yaw + found.place_yaw[0])
         return np.array([*pick, yaw, *place, place_yaw, found.lift[0]])
 
-    def _near(self, points: Sequence[np.ndarray]) -> torch.Tensor:
-        """Network pixels (1, H, W) bool near any of the points."""
+    def _near(self, discs: Sequence[tuple[np.ndarray, float]]) -> torch.Tensor:
+        """Network pixels (1, H, W) bool on any of the discs."""
         config = self.agent.config
         rows, columns = config.shape
         grid = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1)
         world = self._task.grid.to_world(config.to_camera(grid))
-        gaps = [np.linalg.norm(world - point, axis=-1) for point in points]
-        return torch.from_numpy(np.min(gaps, axis=0) < _AVOIDED)[None]
+        inside = [np.linalg.norm(world - point, axis=-1) < reach for point, reach in discs]
+        return torch.from_numpy(np.any(inside, axis=0))[None]
 
 
 class RetryingPolicy:
     """An image policy that picks elsewhere after an action that changed nothing in the picture.
 
-    A policy without memory would repeat a missed grasp for ever. This one remembers, within an
-    episode, where it picked since the picture last changed; nothing else is taken from the past,
-    and nothing from the simulator. `reset` it between episodes.
+    A policy without memory would repeat a missed grasp for ever, or pull the same end to and fro.
+    This one remembers, within an episode, where it picked since the picture last changed, and where
+    its last two actions put something down; it picks elsewhere. Nothing else is taken from the
+    past, and nothing from the simulator. `reset` it between episodes.
     """
 
     def __init__(self, policy: ImagePolicy) -> None:
@@ -174,6 +177,7 @@ class RetryingPolicy:
         """Forget the episode."""
         self._seen: np.ndarray | None = None
         self._tried: list[np.ndarray] = []
+        self._placed: list[np.ndarray] = []
 
     def act(
         self,
@@ -186,9 +190,14 @@ class RetryingPolicy:
         color = _picture(observation, "")[0].astype(np.int16)
         if self._seen is None or _changed(color, self._seen):
             self._tried = []
+        elif self._placed:
+            self._placed.pop()  # nothing was put down
         self._seen = color
-        action = self.policy.act(observation, goal, avoid=self._tried[-_MOST_TRIED:])
+        discs = [(pick, MISSED) for pick in self._tried[-_MOST_TRIED:]]
+        discs += [(place, PUT_DOWN) for place in self._placed[-RESTING:]]
+        action = self.policy.act(observation, goal, avoid=discs)
         self._tried.append(action[:2])
+        self._placed.append(action[3:5])
         return action
 
 

@@ -40,8 +40,8 @@ class Protocol:
     goal_folder: a folder of goals that the test episodes share in turn instead
     stage_rule: who chooses the lift, "action" (the policy) or "privileged" (the paper's hidden
         rule, which reads the simulator)
-    retry: whether agents over pictures pick elsewhere after an action that changed nothing that
-        they see, see `policy.RetryingPolicy`; the paper's do not
+    retry: whether agents over pictures remember what they missed and what they just put down, and
+        pick elsewhere, see `policy.RetryingPolicy`; the paper's do not
     """
 
     split: Literal["validation", "test"]

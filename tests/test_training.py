@@ -119,7 +119,9 @@ def test_a_retrying_policy_picks_elsewhere_until_something_changes(
     gaps = [np.linalg.norm(a - b) for i, a in enumerate(picks) for b in picks[:i]]
     assert min(gaps) >= 0.008
     moved = {**seen, "color": np.roll(color, 7, axis=0)}
-    assert (retrying.act(moved)[:2] == policy.act(moved)[:2]).all()
+    last = retrying.act(seen)[3:5]
+    again = retrying.act(moved)[:2]
+    assert (again == policy.act(moved, avoid=[(last, 0.02)])[:2]).all()
     noisy = {**moved, "color": np.clip(moved["color"].astype(int) + 5, 0, 255).astype(np.uint8)}
     assert np.linalg.norm(retrying.act(noisy)[:2] - policy.act(moved)[:2]) >= 0.008
     retrying.reset()
