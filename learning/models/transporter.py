@@ -130,7 +130,7 @@ class TransporterConfig:
 
 PRESETS = {
     "paper": TransporterConfig(),
-    # A step costs nearly 30 times less CPU time than the paper's (benchmarks/models.py).
+    # For two CPU cores: benchmarks/models.py says what a step costs, ablation.py what each part brings.
     "fast": TransporterConfig(
         scale=2,
         fine=True,
