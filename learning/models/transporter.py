@@ -130,7 +130,7 @@ class TransporterConfig:
 
 PRESETS = {
     "paper": TransporterConfig(),
-    # For two CPU cores: benchmarks/models.py says what a step costs, ablation.py what each part brings.
+    # benchmarks/models.py measures what a step costs, ablation.py what each part brings.
     "fast": TransporterConfig(
         scale=2,
         fine=True,
