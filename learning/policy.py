@@ -28,8 +28,8 @@ from .models.gt_state import GtState, GtState2Step, GtStateConfig
 from .models.transporter import GoalSplit, GoalStack, Transporter, TransporterConfig
 from .snapshots import RunFolder, read_snapshot
 
-__all__ = ["AGENTS", "Agent", "AgentDescription", "ImagePolicy", "Policy", "RetryingPolicy",
-           "StatePolicy", "load_policy", "make_agent"]  # fmt: skip
+__all__ = ["AGENTS", "MISSED", "PUT_DOWN", "RESTING", "Agent", "AgentDescription", "ImagePolicy",
+           "Policy", "RetryingPolicy", "StatePolicy", "load_policy", "make_agent"]  # fmt: skip
 
 Agent = Transporter | GtState | GtState2Step
 

@@ -31,6 +31,8 @@ from .resnet import STRIDE, NetworkConfig, ResNet43, receptive_span
 __all__ = ["Transport"]
 
 _FEATURES = 3
+_PICTURES = 2
+"""The current one and the goal's."""
 _MARK_REACHES = (2.0, 8.0, 32.0)
 """Distances from the pick at which the channels of its mark have fallen to 1/e [pixels]."""
 _FOCUS_SPREAD = 1.5
@@ -83,10 +85,10 @@ class Transport(nn.Module):
         generator: torch.Generator,
     ) -> None:
         super().__init__()
-        if goal_split and (pictures != 2 or crop_before_query):
-            raise InputError(
-                "Goal-Split sees two pictures, and multiplies features before it crops"
-            )
+        if goal_split and pictures != _PICTURES:
+            raise InputError(f"pictures: Goal-Split sees {_PICTURES}, got {pictures}")
+        if goal_split and crop_before_query:
+            raise InputError("crop_before_query: Goal-Split multiplies features before it crops")
         self.crop, self.crop_before_query = crop, crop_before_query
         self.gain, self.focus, self.goal_bias = gain, focus, goal_bias
         self.mark_pick, self.pad_features, self.exact = mark_pick, pad_features, exact
