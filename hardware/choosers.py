@@ -58,7 +58,7 @@ class Tried:
 
     def picks(self, seen: Observation) -> list[tuple[float, float]]:
         """Picks [m] that failed on this picture, or were refused or skipped."""
-        if self._mask is None or mask_iou(seen.mask, self._mask) < _SAME:
+        if _differ(seen.mask, self._mask):
             self._picks = []
         self._mask = seen.mask
         return [*self._picks, *(action.pick_xy for action in seen.refused)]
@@ -120,9 +120,8 @@ class ScriptedChooser:
         self._layout = Layout(np.zeros((0, 3)), np.zeros((0, 7)), targets)
 
     def reset(self) -> None:
-        """Forget what was missed and moved."""
+        """Forget what was missed."""
         self._tried = Tried()
-        self._placed: list[np.ndarray] = []
 
     def choose(self, seen: Observation) -> PickPlaceAction | None:
         """See `Chooser.choose`."""
@@ -151,8 +150,7 @@ class PolicyChooser:
     """A policy that `warp-deform train` made.
 
     It sees the mask as three channels of 0 or 255 and a height of zeros, as in `cable-mask-goal`,
-    and picks elsewhere after an action that changed nothing, and than where its last two actions
-    put something down.
+    and has the `learning.memory.Memory` of policies in simulation.
 
     Args:
         path: a run's folder or a snapshot
@@ -184,8 +182,10 @@ class PolicyChooser:
 
     def reset(self) -> None:
         """Forget what was missed and moved."""
-        self._tried = Tried()
-        self._placed: list[np.ndarray] = []
+        from learning.memory import Memory
+
+        self._memory = Memory()
+        self._seen: np.ndarray | None = None
 
     def choose(self, seen: Observation) -> PickPlaceAction | None:
         """See `Chooser.choose`.
@@ -197,18 +197,17 @@ class PolicyChooser:
             return None
         if seen.goal is None and self._policy.agent.pictures == _TWO_PICTURES:
             raise InputError(f"{self.name} needs a goal; give --goal")
-        from learning.policy import MISSED, PUT_DOWN, RESTING
-
-        missed = self._tried.picks(seen)
-        if missed and self._placed:
-            self._placed.pop()  # nothing was put down
-        avoid = [(np.array(xy), MISSED) for xy in missed]
-        avoid += [(place, PUT_DOWN) for place in self._placed[-RESTING:]]
+        avoid = self._memory.avoid(changed=_differ(seen.mask, self._seen))
+        self._seen = seen.mask
         goal = None if seen.goal is None else _picture(seen.goal)
-        action = to_action(self._policy.act(_picture(seen.mask), goal, avoid=avoid))
-        self._tried.chose(action)
-        self._placed.append(np.array(action.place_xy))
-        return action
+        action = self._policy.act(_picture(seen.mask), goal, avoid=avoid)
+        self._memory.chose(action[:2], action[3:5])
+        return to_action(action)
+
+
+def _differ(mask: np.ndarray, before: np.ndarray | None) -> bool:
+    """Whether a mask shows another cable than the one before, noise aside."""
+    return before is None or mask_iou(mask, before) < _SAME
 
 
 def _picture(mask: np.ndarray) -> dict[str, np.ndarray]:

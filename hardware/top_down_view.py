@@ -6,6 +6,7 @@ square and of one size, so a tangent in the picture is a tangent on the table.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -67,10 +68,7 @@ class TopDownView:
         Raises:
             InputError: part of the workspace is outside of the picture
         """
-        rows, columns = (n * supersample for n in self.shape)
-        grid = np.moveaxis(np.indices((rows, columns)), 0, -1).reshape(-1, 2)
-        xy = self.pixel_to_base((grid + 0.5) / supersample - 0.5)
-        seen = calibration.base_to_pixel(xy).astype(np.float32)
+        seen = _samples(self, calibration, supersample)
         height, width = image.shape[:2]
         if (height, width) != calibration.intrinsics.size[::-1]:
             raise InputError(
@@ -80,12 +78,26 @@ class TopDownView:
         # Half a pixel beyond the outer centres still belongs to the picture.
         outside = (seen < -0.5) | (seen > (width - 0.5, height - 0.5))
         if outside.any():
-            share = float(outside.any(axis=1).mean())
+            share = float(outside.any(axis=-1).mean())
             raise InputError(
                 f"{100 * share:.1f} % of the workspace is outside of the camera's picture; choose "
                 "a higher home pose or a smaller workspace, and calibrate anew"
             )
-        maps = seen.reshape(rows, columns, 2)
-        big = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        big = cv2.remap(image, seen, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         size = self.shape[::-1]
         return np.asarray(cv2.resize(big, size, interpolation=cv2.INTER_AREA))
+
+
+@functools.lru_cache(maxsize=2)
+def _samples(view: TopDownView, calibration: Calibration, supersample: int) -> np.ndarray:
+    """Columns and rows at which a picture is sampled, (rows, columns, 2) float32.
+
+    An episode samples all of its pictures at the same ones, and projecting them through a lens
+    takes longer than the rest of looking.
+    """
+    rows, columns = (n * supersample for n in view.shape)
+    grid = np.moveaxis(np.indices((rows, columns)), 0, -1).reshape(-1, 2)
+    xy = view.pixel_to_base((grid + 0.5) / supersample - 0.5)
+    seen = calibration.base_to_pixel(xy).astype(np.float32).reshape(rows, columns, 2)
+    seen.flags.writeable = False
+    return seen

@@ -24,20 +24,16 @@ from warp_deform.rendering.pixels import SHAPE
 from warp_deform.tasks.metrics import wrap_angle
 from warp_deform.tasks.registry import task as find_task
 
+from .memory import Memory
 from .models.gt_state import GtState, GtState2Step, GtStateConfig
 from .models.transporter import GoalSplit, GoalStack, Transporter, TransporterConfig
 from .snapshots import RunFolder, read_snapshot
 
-__all__ = ["AGENTS", "MISSED", "PUT_DOWN", "RESTING", "Agent", "AgentDescription", "ImagePolicy",
-           "Policy", "RetryingPolicy", "StatePolicy", "load_policy", "make_agent"]  # fmt: skip
+__all__ = ["AGENTS", "Agent", "AgentDescription", "ImagePolicy", "Policy", "RetryingPolicy",
+           "StatePolicy", "load_policy", "make_agent"]  # fmt: skip
 
 Agent = Transporter | GtState | GtState2Step
 
-MISSED = 0.008
-"""Around a missed pick [m]: a bead's diameter and more."""
-PUT_DOWN, RESTING = 0.02, 2
-"""What was put down within so many metres by so many of the last actions is left alone."""
-_MOST_TRIED = 20
 _LEVELS, _PIXELS = 10, 4
 """A picture has changed if so many colour levels differ in more than so many pixels; a bead of 1 cm
 covers 8."""
@@ -161,12 +157,9 @@ class ImagePolicy:
 
 
 class RetryingPolicy:
-    """An image policy that picks elsewhere after an action that changed nothing in the picture.
+    """An image policy with a `Memory` of the episode: it picks elsewhere than what failed.
 
-    A policy without memory would repeat a missed grasp for ever, or pull the same end to and fro.
-    This one remembers, within an episode, where it picked since the picture last changed, and where
-    its last two actions put something down; it picks elsewhere. Nothing else is taken from the
-    past, and nothing from the simulator. `reset` it between episodes.
+    `reset` it between episodes.
     """
 
     def __init__(self, policy: ImagePolicy) -> None:
@@ -176,8 +169,7 @@ class RetryingPolicy:
     def reset(self) -> None:
         """Forget the episode."""
         self._seen: np.ndarray | None = None
-        self._tried: list[np.ndarray] = []
-        self._placed: list[np.ndarray] = []
+        self._memory = Memory()
 
     def act(
         self,
@@ -188,16 +180,10 @@ class RetryingPolicy:
     ) -> np.ndarray:
         """See `Policy.act`."""
         color = _picture(observation, "")[0].astype(np.int16)
-        if self._seen is None or _changed(color, self._seen):
-            self._tried = []
-        elif self._placed:
-            self._placed.pop()  # nothing was put down
+        changed = self._seen is None or _changed(color, self._seen)
         self._seen = color
-        discs = [(pick, MISSED) for pick in self._tried[-_MOST_TRIED:]]
-        discs += [(place, PUT_DOWN) for place in self._placed[-RESTING:]]
-        action = self.policy.act(observation, goal, avoid=discs)
-        self._tried.append(action[:2])
-        self._placed.append(action[3:5])
+        action = self.policy.act(observation, goal, avoid=self._memory.avoid(changed=changed))
+        self._memory.chose(action[:2], action[3:5])
         return action
 
 

@@ -61,6 +61,7 @@ class SolverData:
         self.world_count = len(worlds)
         self._group(worlds)
         self.arrays: dict[str, Mirrored] = {}
+        self.views: dict[str, np.ndarray] = {}
         self._fill_topologies(pairs_per_particle)
         add_sheets(self, pairs_per_particle)
         self._fill_particles()
@@ -109,8 +110,9 @@ class SolverData:
         self, name: str, count: int, dtype: Any, shape: tuple[int, ...], number: Any
     ) -> np.ndarray:
         """Add the array "struct.field" of `count` elements; returns its view."""
-        self.arrays[name] = Mirrored(count, dtype, self.device, number, shape)
-        return self.arrays[name].view
+        self.arrays[name] = array = Mirrored(count, dtype, self.device, number, shape)
+        self.views[name] = array.view
+        return array.view
 
     def add_constant(self, name: str, values: np.ndarray, dtype: Any, number: Any) -> None:
         """Add an array that holds `values`."""
@@ -263,10 +265,17 @@ class SolverData:
 
     # -- access
 
-    @property
-    def views(self) -> dict[str, np.ndarray]:
-        """NumPy views of all arrays by name."""
-        return {name: mirrored.view for name, mirrored in self.arrays.items()}
+    def to_device(self) -> None:
+        """Make the device see what was written to the views."""
+        if not self.device.is_cpu:
+            for mirrored in self.arrays.values():
+                mirrored.to_device()
+
+    def to_host(self) -> None:
+        """Make the views see what a kernel wrote."""
+        if not self.device.is_cpu:
+            for mirrored in self.arrays.values():
+                mirrored.to_host()
 
     def struct(self, name: str) -> Any:
         """One of the kernel's structs (see `KERNEL_ARGUMENTS`), filled with the arrays."""

@@ -22,6 +22,10 @@ __all__: list[str] = []  # `warp_deform.solver` is the import path of what is he
 
 _FOREVER = 1.0e7
 """More substeps than any launch has, exactly representable in float32."""
+_WATCHED = tuple(
+    f"watch.{name}" for name in ("steps", "nonfinite", "stretch", "depth", "clamped", "overflow")
+)
+"""What a launch notes, in the order of the fields of `WatchValues`."""
 
 
 class SolverFusedXPBD(SolverBase):
@@ -87,6 +91,8 @@ class SolverFusedXPBD(SolverBase):
             self.data.has_edges,
         )
         self._launch: Any = None
+        self._launched: Any = None
+        self._last_settings: tuple[Any, Any] | None = None
         self._gravity()
         # padded lanes divide by their stiffness as well
         self.data.views["group.stiffness"][:] = 1.0
@@ -202,18 +208,14 @@ class SolverFusedXPBD(SolverBase):
             data.reserve_frames(frames)
             self._launch = None
         settings = self._settings(max_steps, record_every)
-        for name in ("watch.steps", "watch.nonfinite", "watch.stretch", "watch.depth",
-                     "watch.clamped", "watch.overflow"):  # fmt: skip
-            data.arrays[name].view[...] = 0
+        for name in _WATCHED:
+            data.views[name][...] = 0
         inputs = {}
         if self.bundles is not None:
             inputs = {name: view.copy() for name, view in data.views.items()}
-        for mirrored in data.arrays.values():
-            mirrored.to_device()
-        launch = self._recorded(settings)
-        launch.launch()
-        for mirrored in data.arrays.values():
-            mirrored.to_host()
+        data.to_device()
+        self._recorded(settings).launch()
+        data.to_host()
         values = self._values()
         if self.bundles is not None and self._problems(values):
             from .bundle import write_bundle
@@ -227,7 +229,14 @@ class SolverFusedXPBD(SolverBase):
         return tuple(p for w, v in enumerate(values) if v.steps for p in v.problems(w, limits))
 
     def _settings(self, max_steps: int, record_every: int) -> Any:
-        c, data = self.config, self.data
+        """The kernel's settings; the same object for the same launch, as most launches repeat."""
+        key = self.config, max_steps, record_every
+        if self._last_settings is None or self._last_settings[0] != key:
+            self._last_settings = key, self._new_settings(*key)
+        return self._last_settings[1]
+
+    def _new_settings(self, c: SolverConfig, max_steps: int, record_every: int) -> Any:
+        data = self.data
         settings = data.types.Settings()
         settings.dt = c.dt
         settings.max_steps = max_steps
@@ -257,8 +266,9 @@ class SolverFusedXPBD(SolverBase):
                 device=self.model.device,
                 record_cmd=True,
             )
-        else:
+        elif settings is not self._launched:
             self._launch.set_param_at_index(0, settings)
+        self._launched = settings
         return self._launch
 
     def forget_launch(self) -> None:
@@ -266,18 +276,12 @@ class SolverFusedXPBD(SolverBase):
         self._launch = None
 
     def _values(self) -> list[WatchValues]:
-        views, out = self.data.views, []
+        columns = [self.data.views[name].ravel().tolist() for name in _WATCHED]
+        out = []
         for slot in self.data.slot:
-            group, lane = divmod(int(slot), self.data.lanes)
+            steps, nonfinite, stretch, depth, clamped, overflow = (c[slot] for c in columns)
             out.append(
-                WatchValues(
-                    steps=int(views["watch.steps"][group, lane]),
-                    nonfinite=bool(views["watch.nonfinite"][group, lane] > 0),
-                    stretch=float(views["watch.stretch"][group, lane]),
-                    depth=float(views["watch.depth"][group, lane]),
-                    clamped=int(views["watch.clamped"][group, lane]),
-                    overflow=int(views["watch.overflow"][group, lane]),
-                )
+                WatchValues(int(steps), nonfinite > 0, stretch, depth, int(clamped), int(overflow))
             )
         return out
 
