@@ -10,27 +10,30 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from warp_deform.errors import InputError
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
-from warp_deform.tasks.metrics import mask_iou
 from warp_deform.tasks.strand_grasp import find_grasp, map_direction
 from warp_deform.tasks.task import Layout, Snapshot
 
 from .episode import Observation
-from .pick_place import PickPlaceAction
+from .finger_room import has_finger_room
+from .pick_place import PickPlaceAction, PickPlaceConfig, PickPlaceOutcome
 from .top_down_view import TopDownView
 from .twin import TwinLook
 
 __all__ = ["PolicyChooser", "RandomChooser", "ScriptedChooser", "Tried", "tangent_at",
            "to_action"]  # fmt: skip
 
-_SAME = 0.97
-"""Overlap of two masks above which they show the same cable, noise aside."""
+_SHIFTED = 0.05
+"""Share of a mask's pixels beside the other mask, above which the cable has moved."""
 _NEAR = 0.008
 """Picks this close to one that failed are the same one [m]: the paper's pixels are 1.9 mm."""
 _TWO_PICTURES = 2
+_MOST_LOOKS = 8
+"""Picks that a policy proposes before its first one is taken without finger room."""
 _MARGIN = 0.02  # [m] that random places keep from the workspace's rim
 
 
@@ -58,7 +61,7 @@ class Tried:
 
     def picks(self, seen: Observation) -> list[tuple[float, float]]:
         """Picks [m] that failed on this picture, or were refused or skipped."""
-        if _differ(seen.mask, self._mask):
+        if _moved(seen, self._mask):
             self._picks = []
         self._mask = seen.mask
         return [*self._picks, *(action.pick_xy for action in seen.refused)]
@@ -150,17 +153,25 @@ class PolicyChooser:
     """A policy that `warp-deform train` made.
 
     It sees the mask as three channels of 0 or 255 and a height of zeros, as in `cable-mask-goal`,
-    and has the `learning.memory.Memory` of policies in simulation.
+    and has the `learning.memory.Memory` of policies in simulation. Where the fingers would come
+    down on the cable, its next best pick is taken.
 
     Args:
         path: a run's folder or a snapshot
         view: the workspace; must be the policy's own
+        open_width_m: between the fingers on the way down [m]
 
     Raises:
         InputError: no such policy, one of another task, or one that needs the simulator's state
     """
 
-    def __init__(self, path: Path, *, view: TopDownView | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        view: TopDownView | None = None,
+        open_width_m: float = PickPlaceConfig.open_width_m,
+    ) -> None:
         from learning.policy import ImagePolicy, load_policy
 
         self._view = view or TopDownView()
@@ -176,7 +187,7 @@ class PolicyChooser:
                 f"{path} was trained on {task} and sees another table; give a policy of "
                 f"{CableMaskGoal.name} and its workspace"
             )
-        self._policy = policy
+        self._policy, self._open_width = policy, open_width_m
         self.reset()
         self.name = policy.description.agent
 
@@ -197,17 +208,40 @@ class PolicyChooser:
             return None
         if seen.goal is None and self._policy.agent.pictures == _TWO_PICTURES:
             raise InputError(f"{self.name} needs a goal; give --goal")
-        avoid = self._memory.avoid(changed=_differ(seen.mask, self._seen))
+        avoid = self._memory.avoid(changed=_moved(seen, self._seen))
         self._seen = seen.mask
         goal = None if seen.goal is None else _picture(seen.goal)
-        action = self._policy.act(_picture(seen.mask), goal, avoid=avoid)
+        proposed = []
+        for _ in range(_MOST_LOOKS):
+            proposed.append(self._policy.act(_picture(seen.mask), goal, avoid=avoid))
+            if has_finger_room(
+                seen.mask, to_action(proposed[-1]), view=self._view, open_width_m=self._open_width
+            ):
+                break
+            avoid.append((proposed[-1][:2], _NEAR))
+        else:
+            proposed = proposed[:1]  # nowhere is room: what it wanted most
+        action = proposed[-1]
         self._memory.chose(action[:2], action[3:5])
         return to_action(action)
 
 
-def _differ(mask: np.ndarray, before: np.ndarray | None) -> bool:
-    """Whether a mask shows another cable than the one before, noise aside."""
-    return before is None or mask_iou(mask, before) < _SAME
+def _moved(seen: Observation, before: np.ndarray | None) -> bool:
+    """Whether the last action brought the cable elsewhere than in the mask before.
+
+    What was grasped in vain is not brought anywhere, though fingers may have pushed it a little.
+    Edges may differ by a pixel: that is noise.
+    """
+    if before is None:
+        return True
+    if seen.last in (PickPlaceOutcome.MISSED_GRASP, PickPlaceOutcome.OBSTRUCTED):
+        return False
+    near = np.ones((3, 3), np.uint8)
+    beside = sum(
+        np.count_nonzero(a & (cv2.dilate(b.astype(np.uint8), near) == 0))
+        for a, b in ((seen.mask, before), (before, seen.mask))
+    )
+    return beside > _SHIFTED * np.count_nonzero(before)
 
 
 def _picture(mask: np.ndarray) -> dict[str, np.ndarray]:
