@@ -35,6 +35,8 @@ from .top_down_view import TopDownView
 __all__ = ["PlannerChooser", "PlannerConfig"]
 
 _LANES = 8
+_STRETCH = 15
+"""Links of the stretches whose lengths are compared: 75 mm, longer than a kink."""
 _RISE = 0.6
 """Of a strand that comes to lie on another, in radii a bead."""
 
@@ -72,6 +74,16 @@ class _SeenChain(CableMaskGoal):
     def score(self, layout: Layout, snapshot: Snapshot) -> float:
         """Overlap with the goal's own mask."""
         return mask_iou(self.mask(snapshot.particle_q), self._goal)
+
+    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+        """The task's, less how far stretches of the chain are from being as long as in the goal.
+
+        Without the second part moves that push the chain together look as good as others; it then
+        kinks and crosses itself, and the next masks no longer show how it lies.
+        """
+        return super().promise(layout, snapshot) - unlike(
+            snapshot.particle_q[:, :2], layout.targets, length=_STRETCH * self.cable.spacing
+        )
 
 
 class PlannerChooser:
@@ -150,6 +162,23 @@ class PlannerChooser:
         )
         self._worlds = Worlds(task, 1, robot="panda", lanes=_LANES)
         self._lookahead = Lookahead(task, robot="panda", precision="float32", count=_LANES)
+
+
+def unlike(beads: np.ndarray, targets: np.ndarray, *, length: float) -> float:
+    """Return how much the ends of stretches are nearer or farther apart than those of the targets.
+
+    Args:
+        beads, targets: along the chain [m], (n, 2)
+        length: of a stretch of `_STRETCH` links, straightened [m]
+
+    Returns:
+        the mean over all stretches, relative to their length; the same either way round
+    """
+    apart = [
+        np.linalg.norm(points[_STRETCH:] - points[:-_STRETCH], axis=1)
+        for points in (beads, targets, targets[::-1])
+    ]
+    return float(min(np.abs(apart[0] - way).mean() for way in apart[1:])) / length
 
 
 def stacked(xy: np.ndarray, cable: CableConfig) -> np.ndarray:

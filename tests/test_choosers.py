@@ -26,7 +26,7 @@ from hardware.choosers import RandomChooser, ScriptedChooser, to_action
 from hardware.episode import EpisodeConfig, Observation, refusal, run_episode
 from hardware.human import HumanChooser
 from hardware.pick_place import PickPlaceAction, PickPlaceConfig
-from hardware.planner import PlannerChooser, PlannerConfig
+from hardware.planner import PlannerChooser, PlannerConfig, unlike
 from hardware.recording import Recording
 from hardware.replaying import replay_recording
 from hardware.safety import SafeRobot
@@ -131,3 +131,17 @@ def test_the_scripted_and_the_planned_action_approach_the_goal(tmp_path: Path) -
 def test_an_environments_action_loses_its_lift() -> None:
     action = to_action(np.array([0.4, 0.1, 0.2, 0.5, -0.1, 0.3, 0.05]))
     assert action == PickPlaceAction((0.4, 0.1), 0.2, (0.5, -0.1), 0.3)
+
+
+def test_a_chain_pushed_together_is_unlike_its_goal() -> None:
+    """A stretch of a chain counts by how far its ends are apart, wherever and however it lies."""
+    straight = np.column_stack([np.zeros(90), np.arange(90) * 5e-3])
+    turned = straight[:, ::-1] + 0.1
+    assert unlike(turned, straight, length=15 * 5e-3) == pytest.approx(0.0, abs=1e-12)
+    kinked = straight.copy()
+    kinked[45:] -= [0.0, 0.075]  # the second half lies back by as long as a stretch
+    across = 15  # stretches that bridge the kink, of 75; their ends meet
+    assert unlike(kinked, straight, length=15 * 5e-3) == pytest.approx(across / 75, rel=1e-6)
+    arc = np.linspace(0.0, np.pi, 90)
+    bow = np.column_stack([np.cos(arc), np.sin(arc)]) * 89 * 5e-3 / np.pi
+    assert unlike(bow, bow[::-1], length=15 * 5e-3) == pytest.approx(0.0, abs=1e-12)
