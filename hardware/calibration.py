@@ -14,6 +14,7 @@ import numpy as np
 from warp_deform.errors import InputError
 
 from .camera import CameraIntrinsics
+from .frozen import freeze_arrays
 from .homography import apply_homography
 from .json_file import read_json, read_numbers, require, write_json
 from .table_plane import TablePlane
@@ -74,6 +75,7 @@ class Calibration:
         depth = np.column_stack([frame, np.ones(4)]) @ H[2]
         if depth.min() * depth.max() <= 0.0:
             raise InputError("calibration: part of the picture looks past the table's horizon")
+        freeze_arrays(self, "home_q", "base_H_pixel")
 
     def pixel_to_base(self, pixels: np.ndarray) -> np.ndarray:
         """Return the points on the table (n, 3) [m] seen at pixels (n, 2), column and row."""

@@ -14,6 +14,7 @@ import numpy as np
 from warp_deform.errors import InputError, WarpDeformError
 
 from .closing import Closing
+from .frozen import freeze_arrays
 from .json_file import read_numbers
 
 __all__ = [
@@ -62,6 +63,7 @@ class CameraIntrinsics:
             raise InputError(f"intrinsics: distortion has shape {n}; OpenCV takes 4, 5, 8, 12, 14")
         if not np.isfinite(self.distortion).all():
             raise InputError("intrinsics: a distortion coefficient is not finite")
+        freeze_arrays(self, "matrix", "distortion")
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Return where pixels (n, 2), column and row, would be without distortion."""

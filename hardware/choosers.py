@@ -1,7 +1,7 @@
 """Who chooses actions: a learned policy, chance, or the twin's true state.
 
-Actions are in the base frame. What was missed, refused or skipped is not proposed again while the
-picture stays the same. `hardware.planner` and `hardware.human` hold the others.
+Actions are in the base frame. What was missed, refused or skipped is not proposed again until
+something is brought elsewhere. `hardware.planner` and `hardware.human` hold the others.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from warp_deform.tasks.task import Layout, Snapshot
 
 from .episode import Observation
 from .finger_room import has_finger_room
-from .pick_place import PickPlaceAction, PickPlaceConfig, PickPlaceOutcome
+from .pick_place import PickPlaceAction, PickPlaceOutcome
 from .top_down_view import TopDownView
 from .twin import TwinLook
 
 __all__ = ["PolicyChooser", "RandomChooser", "ScriptedChooser", "Tried", "tangent_at",
            "to_action"]  # fmt: skip
 
-_SHIFTED = 0.05
-"""Share of a mask's pixels beside the other mask, above which the cable has moved."""
+_SHIFTED = 0.01
+"""A cable has moved if more of it than this share lies beside where it lay, or the other way
+round: a chain of 45 cm that was drawn along itself by 1 cm has."""
 _NEAR = 0.008
 """Picks this close to one that failed are the same one [m]: the paper's pixels are 1.9 mm."""
 _TWO_PICTURES = 2
-_MOST_LOOKS = 8
-"""Picks that a policy proposes before its first one is taken without finger room."""
+_MOST_PROPOSALS = 8
+"""Picks that are looked at for finger room; where none of them has it, the first is taken."""
 _MARGIN = 0.02  # [m] that random places keep from the workspace's rim
 
 
@@ -53,21 +54,21 @@ def tangent_at(mask: np.ndarray, view: TopDownView, xy: tuple[float, float]) -> 
 
 
 class Tried:
-    """Where was picked since the picture last changed."""
+    """Where was picked since something was last brought elsewhere."""
 
     def __init__(self) -> None:
         self._mask: np.ndarray | None = None
         self._picks: list[tuple[float, float]] = []
 
     def picks(self, seen: Observation) -> list[tuple[float, float]]:
-        """Picks [m] that failed on this picture, or were refused or skipped."""
+        """Picks [m] that failed since then, or were refused or skipped."""
         if _moved(seen, self._mask):
             self._picks = []
         self._mask = seen.mask
         return [*self._picks, *(action.pick_xy for action in seen.refused)]
 
     def chose(self, action: PickPlaceAction) -> None:
-        """Remember an action; it counts as failed where the next picture is the same."""
+        """Remember an action; it counts as failed unless it brings the cable elsewhere."""
         self._picks.append(action.pick_xy)
 
     def failed(self, seen: Observation, action: PickPlaceAction) -> bool:
@@ -153,25 +154,19 @@ class PolicyChooser:
     """A policy that `warp-deform train` made.
 
     It sees the mask as three channels of 0 or 255 and a height of zeros, as in `cable-mask-goal`,
-    and has the `learning.memory.Memory` of policies in simulation. Where the fingers would come
-    down on the cable, its next best pick is taken.
+    and has the `learning.memory.Memory` of policies in simulation. Where a finger would come down
+    on the cable its next best pick is taken, unless its first eight are all like that; each that
+    is passed over costs as much as choosing one.
 
     Args:
         path: a run's folder or a snapshot
         view: the workspace; must be the policy's own
-        open_width_m: between the fingers on the way down [m]
 
     Raises:
         InputError: no such policy, one of another task, or one that needs the simulator's state
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        view: TopDownView | None = None,
-        open_width_m: float = PickPlaceConfig.open_width_m,
-    ) -> None:
+    def __init__(self, path: Path, *, view: TopDownView | None = None) -> None:
         from learning.policy import ImagePolicy, load_policy
 
         self._view = view or TopDownView()
@@ -187,15 +182,13 @@ class PolicyChooser:
                 f"{path} was trained on {task} and sees another table; give a policy of "
                 f"{CableMaskGoal.name} and its workspace"
             )
-        self._policy, self._open_width = policy, open_width_m
+        self._policy = policy
         self.reset()
         self.name = policy.description.agent
 
     def reset(self) -> None:
         """Forget what was missed and moved."""
-        from learning.memory import Memory
-
-        self._memory = Memory()
+        self._memory = self._policy.memory()
         self._seen: np.ndarray | None = None
 
     def choose(self, seen: Observation) -> PickPlaceAction | None:
@@ -212,15 +205,13 @@ class PolicyChooser:
         self._seen = seen.mask
         goal = None if seen.goal is None else _picture(seen.goal)
         proposed = []
-        for _ in range(_MOST_LOOKS):
+        for _ in range(_MOST_PROPOSALS):
             proposed.append(self._policy.act(_picture(seen.mask), goal, avoid=avoid))
-            if has_finger_room(
-                seen.mask, to_action(proposed[-1]), view=self._view, open_width_m=self._open_width
-            ):
+            if has_finger_room(seen.mask, to_action(proposed[-1]), view=self._view):
                 break
             avoid.append((proposed[-1][:2], _NEAR))
         else:
-            proposed = proposed[:1]  # nowhere is room: what it wanted most
+            proposed = proposed[:1]
         action = proposed[-1]
         self._memory.chose(action[:2], action[3:5])
         return to_action(action)
@@ -229,19 +220,19 @@ class PolicyChooser:
 def _moved(seen: Observation, before: np.ndarray | None) -> bool:
     """Whether the last action brought the cable elsewhere than in the mask before.
 
-    What was grasped in vain is not brought anywhere, though fingers may have pushed it a little.
-    Edges may differ by a pixel: that is noise.
+    What was grasped in vain was not brought anywhere: fingers that met it may have pushed it, but
+    meet it again where they are told to. Edges may differ by a pixel: that is noise.
     """
     if before is None:
         return True
     if seen.last in (PickPlaceOutcome.MISSED_GRASP, PickPlaceOutcome.OBSTRUCTED):
         return False
     near = np.ones((3, 3), np.uint8)
-    beside = sum(
+    return any(
         np.count_nonzero(a & (cv2.dilate(b.astype(np.uint8), near) == 0))
+        > _SHIFTED * np.count_nonzero(a)
         for a, b in ((seen.mask, before), (before, seen.mask))
     )
-    return beside > _SHIFTED * np.count_nonzero(before)
 
 
 def _picture(mask: np.ndarray) -> dict[str, np.ndarray]:

@@ -2,9 +2,9 @@
 
 From the mask comes where the beads lie (`chain_from_mask`). A simulated chain is laid there, and
 the candidates of the task `cable-mask-goal`, and others around the best, are tried. What counts is
-the overlap with the goal's mask and the distance of the beads from where that mask puts them. Where
-strands cross the estimate is a guess, so the best action is done and everything estimated anew from
-the next picture.
+the overlap with the goal's mask, the distance of the beads from where that mask puts them, and that
+the chain is not bent otherwise than there. Where strands cross the estimate is a guess, so the best
+action is done and everything estimated anew from the next picture.
 
 Source: model predictive control, receding horizon; the search is `warp_deform.planning`.
 """
@@ -32,11 +32,11 @@ from .episode import Observation
 from .pick_place import PickPlaceAction
 from .top_down_view import TopDownView
 
-__all__ = ["PlannerChooser", "PlannerConfig"]
+__all__ = ["PlannerChooser", "PlannerConfig", "SeenChain", "chord_error"]
 
 _LANES = 8
-_STRETCH = 15
-"""Links of the stretches whose lengths are compared: 75 mm, longer than a kink."""
+_CHORD = 15
+"""Links that a chord bridges: 75 mm, more than a kink."""
 _RISE = 0.6
 """Of a strand that comes to lie on another, in radii a bead."""
 
@@ -53,7 +53,7 @@ class PlannerConfig:
     """Actions ahead; two need twice the budget or more to be of use."""
 
 
-class _SeenChain(CableMaskGoal):
+class SeenChain(CableMaskGoal):
     """The task with one start, the seen one, and a goal that is a mask."""
 
     randomised = False
@@ -76,14 +76,18 @@ class _SeenChain(CableMaskGoal):
         return mask_iou(self.mask(snapshot.particle_q), self._goal)
 
     def promise(self, layout: Layout, snapshot: Snapshot) -> float:
-        """The task's, less how far stretches of the chain are from being as long as in the goal.
+        """Score, less the mean distance from the targets and the `chord_error`, the better way.
 
-        Without the second part moves that push the chain together look as good as others; it then
-        kinks and crosses itself, and the next masks no longer show how it lies.
+        Without the second of them moves that push the chain together look as good as others; it
+        then kinks and crosses itself, and the next masks no longer show how it lies.
         """
-        return super().promise(layout, snapshot) - unlike(
-            snapshot.particle_q[:, :2], layout.targets, length=_STRETCH * self.cable.spacing
-        )
+        q, cable = snapshot.particle_q[:, :2], self.cable
+        costs = [
+            np.linalg.norm(q - way, axis=1).mean() / cable.length
+            + chord_error(q, way, links=_CHORD, spacing=cable.spacing)
+            for way in (layout.targets, layout.targets[::-1])
+        ]
+        return self.score(layout, snapshot) - float(min(costs))
 
 
 class PlannerChooser:
@@ -148,7 +152,7 @@ class PlannerChooser:
         """Worlds for a goal; made once."""
         if self._goal is not None and np.array_equal(goal, self._goal):
             return
-        task = _SeenChain(goal)
+        task = SeenChain(goal)
         targets = estimate_chain(goal, self._view, task.cable.beads)
         if targets is None:
             raise InputError("the goal's mask shows no chain; capture it again")
@@ -164,21 +168,23 @@ class PlannerChooser:
         self._lookahead = Lookahead(task, robot="panda", precision="float32", count=_LANES)
 
 
-def unlike(beads: np.ndarray, targets: np.ndarray, *, length: float) -> float:
-    """Return how much the ends of stretches are nearer or farther apart than those of the targets.
+def chord_error(beads: np.ndarray, targets: np.ndarray, *, links: int, spacing: float) -> float:
+    """Return by how much chords of a chain differ in length from those of its targets.
+
+    A chord joins beads so many links apart. It says how bent the chain is there, not where it lies.
 
     Args:
         beads, targets: along the chain [m], (n, 2)
-        length: of a stretch of `_STRETCH` links, straightened [m]
+        links: bridged by a chord
+        spacing: of the beads [m]
 
     Returns:
-        the mean over all stretches, relative to their length; the same either way round
+        the mean over all chords, relative to the length of a straight one
     """
-    apart = [
-        np.linalg.norm(points[_STRETCH:] - points[:-_STRETCH], axis=1)
-        for points in (beads, targets, targets[::-1])
-    ]
-    return float(min(np.abs(apart[0] - way).mean() for way in apart[1:])) / length
+    found, wanted = (
+        np.linalg.norm(points[links:] - points[:-links], axis=1) for points in (beads, targets)
+    )
+    return float(np.abs(found - wanted).mean()) / (links * spacing)
 
 
 def stacked(xy: np.ndarray, cable: CableConfig) -> np.ndarray:

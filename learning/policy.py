@@ -146,6 +146,10 @@ class ImagePolicy:
         place_yaw = found.place_yaw[0] if yaw == 0.0 else wrap_angle(yaw + found.place_yaw[0])
         return np.array([*pick, yaw, *place, place_yaw, found.lift[0]])
 
+    def memory(self) -> Memory:
+        """A new episode's memory, whose `Memory.avoid` is for `act`."""
+        return Memory()
+
     def _near(self, discs: Sequence[tuple[np.ndarray, float]]) -> torch.Tensor:
         """Network pixels (1, H, W) bool on any of the discs."""
         config = self.agent.config
@@ -169,7 +173,7 @@ class RetryingPolicy:
     def reset(self) -> None:
         """Forget the episode."""
         self._seen: np.ndarray | None = None
-        self._memory = Memory()
+        self._memory = self.policy.memory()
 
     def act(
         self,

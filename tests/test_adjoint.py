@@ -214,6 +214,9 @@ def test_sleep_passes_nothing_on() -> None:
     awake = substep_vjp(solver, [0], one, one, sleep=False)
     assert "sleep" not in awake.counts()
     assert np.abs(awake.velocities).min() > 0
+    set_state(solver, x, v)
+    again = substep_vjp(solver, [0], one, one)
+    assert again.counts() == asleep.counts(), "the one awake changed nothing for later ones"
 
 
 def test_stopping_distance_of_a_sliding_particle() -> None:

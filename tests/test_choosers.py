@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +23,18 @@ from test_episode import Arm
 from hardware.backends.sim import SimRobot
 from hardware.cameras.sim import SimCamera
 from hardware.chain_from_mask import estimate_chain
-from hardware.choosers import RandomChooser, ScriptedChooser, to_action
+from hardware.choosers import RandomChooser, ScriptedChooser, still_chain, to_action
 from hardware.episode import EpisodeConfig, Observation, refusal, run_episode
+from hardware.finger_room import has_finger_room
 from hardware.human import HumanChooser
 from hardware.pick_place import PickPlaceAction, PickPlaceConfig
-from hardware.planner import PlannerChooser, PlannerConfig, unlike
+from hardware.planner import PlannerChooser, PlannerConfig, SeenChain, chord_error
 from hardware.recording import Recording
 from hardware.replaying import replay_recording
 from hardware.safety import SafeRobot
 from hardware.twin import CableTwin
 from warp_deform.tasks.chain_shapes import curved_chain
+from warp_deform.tasks.task import Layout
 
 
 def test_a_persons_points_are_grasped_across_the_cable(tmp_path: Path) -> None:
@@ -133,15 +136,40 @@ def test_an_environments_action_loses_its_lift() -> None:
     assert action == PickPlaceAction((0.4, 0.1), 0.2, (0.5, -0.1), 0.3)
 
 
-def test_a_chain_pushed_together_is_unlike_its_goal() -> None:
-    """A stretch of a chain counts by how far its ends are apart, wherever and however it lies."""
+def test_chords_tell_how_a_chain_is_bent_wherever_it_lies() -> None:
     straight = np.column_stack([np.zeros(90), np.arange(90) * 5e-3])
-    turned = straight[:, ::-1] + 0.1
-    assert unlike(turned, straight, length=15 * 5e-3) == pytest.approx(0.0, abs=1e-12)
+    error = functools.partial(chord_error, links=15, spacing=5e-3)
+    assert error(straight[:, ::-1] + 0.1, straight) == pytest.approx(0.0, abs=1e-12)
     kinked = straight.copy()
-    kinked[45:] -= [0.0, 0.075]  # the second half lies back by as long as a stretch
-    across = 15  # stretches that bridge the kink, of 75; their ends meet
-    assert unlike(kinked, straight, length=15 * 5e-3) == pytest.approx(across / 75, rel=1e-6)
+    kinked[45:] -= [0.0, 0.075]  # the second half lies back by as long as a chord
+    assert error(kinked, straight) == pytest.approx(15 / 75), "15 of 75 chords bridge the kink"
     arc = np.linspace(0.0, np.pi, 90)
     bow = np.column_stack([np.cos(arc), np.sin(arc)]) * 89 * 5e-3 / np.pi
-    assert unlike(bow, bow[::-1], length=15 * 5e-3) == pytest.approx(0.0, abs=1e-12)
+    assert error(bow, straight) > 0.01 and error(straight, bow) == error(bow, straight)
+
+
+def test_a_planner_prefers_a_straight_chain_beside_its_goal_to_a_kinked_one_on_it() -> None:
+    task = SeenChain(GOAL)
+    targets = chain(0.50)[:, :2]
+    layout = Layout(chain(0.50), np.zeros((0, 7)), targets)
+    beside, kinked = chain(0.52), chain(0.50)
+    kinked[45:60, 1] = kinked[45, 1] - np.arange(15) * 5e-3  # back
+    kinked[60:, 1] -= 30 * 5e-3  # and on from there
+    distances = [np.linalg.norm(q[:, :2] - targets, axis=1).mean() for q in (beside, kinked)]
+    beside += [np.diff(distances)[0], 0.0, 0.0]
+    promises = [task.promise(layout, still_chain(q)) for q in (beside, kinked)]
+    scores = [task.score(layout, still_chain(q)) for q in (beside, kinked)]
+    assert scores[0] < scores[1], "the kinked one lies half on the goal"
+    assert promises[0] - scores[0] > promises[1] - scores[1] + 0.1
+
+
+def test_fingers_need_room_beside_the_strand() -> None:
+    lone = TASK.mask(chain(0.45))
+
+    def room(mask: np.ndarray, yaw: float) -> bool:
+        action = PickPlaceAction((0.45, 0.0), yaw, (0.5, 0.0), yaw)
+        return has_finger_room(mask, action, view=TWIN.view)
+
+    assert room(lone, np.pi / 2) and not room(lone, 0.0), "along the strand both fingers meet it"
+    verdicts = {gap: room(lone | TASK.mask(chain(0.45 + gap)), np.pi / 2) for gap in (0.022, 0.032)}
+    assert verdicts == {0.022: False, 0.032: True}

@@ -16,11 +16,14 @@ from .structures import structures
 from .tether import NO_TETHER
 from .topology import WorldTopology, read_worlds, tethers
 
-__all__ = ["KERNEL_ARGUMENTS", "SolverData"]
+__all__ = ["KERNEL_ARGUMENTS", "WATCHED", "SolverData"]
 
 KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near",
                     "bodies", "contacts", "grips", "watch", "sheets", "cells", "tape")  # fmt: skip
 """The kernel's structs, after the settings, in the order of its arguments."""
+
+WATCHED = ("steps", "nonfinite", "stretch", "depth", "clamped", "overflow")
+"""What a launch notes of every world, in the order of the fields of `WatchValues`."""
 
 _NUMPY = {wp.float32: np.float32, wp.float64: np.float64}
 
@@ -241,7 +244,7 @@ class SolverData:
         ):  # fmt: skip
             self.add_array(f"grips.{name}", slots, dtype, shape, number)
         self.reserve_knots(slots * 16)
-        for name in ("steps", "nonfinite", "stretch", "depth", "clamped", "overflow"):
+        for name in WATCHED:
             self.add_array(f"watch.{name}", self.group_count, t.V, (self.lanes,), number)
         self.reserve_frames(0)
 
@@ -346,6 +349,11 @@ class SolverData:
                 self.set_bodies(w, q[self.body_ids[w]], qd[self.body_ids[w]])
         views["bodies.w"][:] = views["bodies.w0"]
         self.clear_grips()
+
+    def clear_watch(self) -> None:
+        """Nothing is noted yet."""
+        for name in WATCHED:
+            self.views[f"watch.{name}"][...] = 0
 
     def clear_grips(self) -> None:
         """Nothing is gripped or pushed in any world."""

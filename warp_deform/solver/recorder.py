@@ -173,10 +173,8 @@ class Recorder:
         self._marks = [int(m) for m in marks]
         if not self._marks or self._marks[0] < 1 or sorted(set(self._marks)) != self._marks:
             raise InputError(f"marks must be positive ascending substeps, got {list(marks)}")
-        for name in ("steps", "nonfinite", "stretch", "depth", "clamped", "overflow"):
-            data.arrays[f"watch.{name}"].view[...] = 0
-        for mirrored in data.arrays.values():
-            mirrored.to_device()
+        data.clear_watch()
+        data.to_device()
         self._bind()
         self._settings = self._new_settings()
         self._inputs = self._checkpoints.save_inputs()
@@ -191,8 +189,7 @@ class Recorder:
             if begin == mark:
                 self.states[mark] = self._read()
         self._final = self._checkpoints.save()
-        for mirrored in data.arrays.values():
-            mirrored.to_host()
+        data.to_host()
         return self.solver._values()
 
     def _record_segment(self, begin: int, end: int, last: int) -> int:
@@ -260,7 +257,8 @@ class Recorder:
         self._forward.launch()
 
     def _new_settings(self) -> Any:
-        settings = self.solver._settings(0, 0)
+        # one of its own: it is changed here and between launches
+        settings = self.solver._new_settings(self.solver.config, 0, 0)
         if not self.sleep:
             settings.dry = settings.sleep = 0.0
         return settings

@@ -14,7 +14,7 @@ from newton.solvers import SolverBase
 from ..errors import InputError
 from ..objects.attributes import NAMESPACE, register_attributes
 from .config import SolverConfig
-from .data import SolverData
+from .data import WATCHED, SolverData
 from .forward import forward_kernel
 from .guards import PhysicsError, Problem, WatchValues
 
@@ -22,10 +22,6 @@ __all__: list[str] = []  # `warp_deform.solver` is the import path of what is he
 
 _FOREVER = 1.0e7
 """More substeps than any launch has, exactly representable in float32."""
-_WATCHED = tuple(
-    f"watch.{name}" for name in ("steps", "nonfinite", "stretch", "depth", "clamped", "overflow")
-)
-"""What a launch notes, in the order of the fields of `WatchValues`."""
 
 
 class SolverFusedXPBD(SolverBase):
@@ -91,8 +87,8 @@ class SolverFusedXPBD(SolverBase):
             self.data.has_edges,
         )
         self._launch: Any = None
-        self._launched: Any = None
-        self._last_settings: tuple[Any, Any] | None = None
+        self._launch_settings: Any = None
+        self._cached_settings: tuple[Any, Any] | None = None
         self._gravity()
         # padded lanes divide by their stiffness as well
         self.data.views["group.stiffness"][:] = 1.0
@@ -208,8 +204,7 @@ class SolverFusedXPBD(SolverBase):
             data.reserve_frames(frames)
             self._launch = None
         settings = self._settings(max_steps, record_every)
-        for name in _WATCHED:
-            data.views[name][...] = 0
+        data.clear_watch()
         inputs = {}
         if self.bundles is not None:
             inputs = {name: view.copy() for name, view in data.views.items()}
@@ -229,27 +224,27 @@ class SolverFusedXPBD(SolverBase):
         return tuple(p for w, v in enumerate(values) if v.steps for p in v.problems(w, limits))
 
     def _settings(self, max_steps: int, record_every: int) -> Any:
-        """The kernel's settings; the same object for the same launch, as most launches repeat."""
+        """The kernel's settings, not to be changed: launches alike, which is most, share them."""
         key = self.config, max_steps, record_every
-        if self._last_settings is None or self._last_settings[0] != key:
-            self._last_settings = key, self._new_settings(*key)
-        return self._last_settings[1]
+        if self._cached_settings is None or self._cached_settings[0] != key:
+            self._cached_settings = key, self._new_settings(*key)
+        return self._cached_settings[1]
 
-    def _new_settings(self, c: SolverConfig, max_steps: int, record_every: int) -> Any:
+    def _new_settings(self, config: SolverConfig, max_steps: int, record_every: int) -> Any:
         data = self.data
         settings = data.types.Settings()
-        settings.dt = c.dt
+        settings.dt = config.dt
         settings.max_steps = max_steps
-        settings.recovery = c.recovery
-        settings.max_speed = c.max_speed
-        settings.calm_speed = c.calm_speed
-        settings.margin = c.margin
-        settings.rest_speed = c.rest_speed
-        settings.viscous = -math.expm1(-c.viscosity * c.dt)
-        settings.dry = c.dry_friction * c.dt
-        settings.sleep = c.sleep_speed
-        settings.sleep_ramp = c.sleep_ramp
-        settings.rest_steps = max(1, round(c.rest_seconds / c.dt))
+        settings.recovery = config.recovery
+        settings.max_speed = config.max_speed
+        settings.calm_speed = config.calm_speed
+        settings.margin = config.margin
+        settings.rest_speed = config.rest_speed
+        settings.viscous = -math.expm1(-config.viscosity * config.dt)
+        settings.dry = config.dry_friction * config.dt
+        settings.sleep = config.sleep_speed
+        settings.sleep_ramp = config.sleep_ramp
+        settings.rest_steps = max(1, round(config.rest_seconds / config.dt))
         settings.check_every = 20
         settings.record_every = record_every
         settings.particle_stride = int(data.group_particle[-1])
@@ -266,9 +261,9 @@ class SolverFusedXPBD(SolverBase):
                 device=self.model.device,
                 record_cmd=True,
             )
-        elif settings is not self._launched:
+        elif settings is not self._launch_settings:
             self._launch.set_param_at_index(0, settings)
-        self._launched = settings
+        self._launch_settings = settings
         return self._launch
 
     def forget_launch(self) -> None:
@@ -276,7 +271,7 @@ class SolverFusedXPBD(SolverBase):
         self._launch = None
 
     def _values(self) -> list[WatchValues]:
-        columns = [self.data.views[name].ravel().tolist() for name in _WATCHED]
+        columns = [self.data.views[f"watch.{name}"].ravel().tolist() for name in WATCHED]
         out = []
         for slot in self.data.slot:
             steps, nonfinite, stretch, depth, clamped, overflow = (c[slot] for c in columns)

@@ -1,0 +1,15 @@
+"""Arrays of frozen dataclasses that are frozen too: what was computed from them may be kept."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["freeze_arrays"]
+
+
+def freeze_arrays(owner: object, *names: str) -> None:
+    """Put copies in place of arrays of a frozen dataclass, float64, that cannot be written."""
+    for name in names:
+        array = np.array(getattr(owner, name), dtype=np.float64)
+        array.flags.writeable = False
+        object.__setattr__(owner, name, array)
