@@ -6,8 +6,8 @@
 Ten goals, and ten tosses for each (the paper: ten goals, an episode each); at most 10 actions, done
 above an overlap (intersection over union of the masks) of 0.25. Robot, safety layer, camera,
 segmentation and recording are those of `warp-deform franka run --robot sim`; tosses and goals are
-of seeds that no demonstration has. With --out, episodes already in that file are not played again.
-Intervals of rates are Wilson's, of actions 1.96 standard errors, 95 %.
+of seeds that no demonstration has. Episodes whose physics cannot be trusted count as
+failed. With --out, episodes already in that file are not played again. Intervals of rates are Wilson's, of actions 1.96 standard errors, 95 %.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ from hardware.goal_file import sampled_goal
 from hardware.recorder import EpisodeRecorder, RecorderConfig
 from hardware.rig import open_rig
 from hardware.rig_config import RigConfig
+from hardware.scoring import MAX_ACTIONS
 from warp_deform.quiet import quiet_warp
+from warp_deform.solver.guards import PhysicsError
 from warp_deform.workers import single_threaded
 
 GOAL_SEED, TOSS_SEED = 700_000, 800_000
@@ -102,8 +104,12 @@ def play(
         config = RecorderConfig(robot_id="sim", camera_id="sim", actor=chooser.name,
                                 calibration=rig.calibration.digest())  # fmt: skip
         with EpisodeRecorder(Path(folder, "episode"), config, goal_mask=seen.mask) as recorder:
-            result = run_episode(rig.robot, rig.camera, rig.calibration, chooser,
-                                 recorder=recorder, goal=seen.mask)  # fmt: skip
+            try:
+                result = run_episode(rig.robot, rig.camera, rig.calibration, chooser,
+                                     recorder=recorder, goal=seen.mask)  # fmt: skip
+            except PhysicsError:
+                spent = time.process_time() - began
+                return Played(agent, goal, toss, False, MAX_ACTIONS, ("physics",), (0.0,), spent)
     return Played(
         agent=agent,
         goal=goal,
