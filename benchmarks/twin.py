@@ -6,8 +6,9 @@
 Ten goals, and ten tosses for each (the paper: ten goals, an episode each); at most 10 actions, done
 above an overlap (intersection over union of the masks) of 0.25. Robot, safety layer, camera,
 segmentation and recording are those of `warp-deform franka run --robot sim`; tosses and goals are
-of seeds that no demonstration has. Episodes whose physics cannot be trusted count as
-failed. With --out, episodes already in that file are not played again. Intervals of rates are Wilson's, of actions 1.96 standard errors, 95 %.
+of seeds that no demonstration has. Episodes whose physics cannot be trusted count as failed. With
+--out, episodes already in that file are not played again. Intervals of rates are Wilson's, of
+actions 1.96 standard errors, 95 %.
 """
 
 from __future__ import annotations
