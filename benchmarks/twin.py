@@ -34,7 +34,6 @@ from hardware.rig import open_rig
 from hardware.rig_config import RigConfig
 from hardware.scoring import MAX_ACTIONS
 from warp_deform.quiet import quiet_warp
-from warp_deform.solver.guards import PhysicsError
 from warp_deform.workers import single_threaded
 
 GOAL_SEED, TOSS_SEED = 700_000, 800_000
@@ -105,18 +104,14 @@ def play(
         config = RecorderConfig(robot_id="sim", camera_id="sim", actor=chooser.name,
                                 calibration=rig.calibration.digest())  # fmt: skip
         with EpisodeRecorder(Path(folder, "episode"), config, goal_mask=seen.mask) as recorder:
-            try:
-                result = run_episode(rig.robot, rig.camera, rig.calibration, chooser,
-                                     recorder=recorder, goal=seen.mask)  # fmt: skip
-            except PhysicsError:
-                spent = time.process_time() - began
-                return Played(agent, goal, toss, False, MAX_ACTIONS, ("physics",), (0.0,), spent)
+            result = run_episode(rig.robot, rig.camera, rig.calibration, chooser,
+                                 recorder=recorder, goal=seen.mask)  # fmt: skip
     return Played(
         agent=agent,
         goal=goal,
         toss=toss,
         success=result.score.success,
-        actions=len(result.outcomes),
+        actions=len(result.outcomes) if result.error is None else MAX_ACTIONS,
         outcomes=tuple(outcome.value for outcome in result.outcomes),
         overlaps=tuple(float(overlap) for overlap in result.score.iou),
         cpu_s=time.process_time() - began,

@@ -8,8 +8,9 @@ What happens when something goes wrong:
   the arm, lets go, goes home and records the action as aborted; nobody there means that only
   reflexes are recovered from, as often as the limits allow;
 - a picture that shows no cable on foam: the operator is asked whether to take another;
-- anything else (a limit broken on the way, a lost connection, a blocked gripper): the arm is
-  stopped and the episode ends with the error as its outcome.
+- anything else (a limit broken on the way, a lost connection, a blocked gripper, a twin whose
+  simulation cannot be trusted any more): the arm is stopped and the episode ends with the error as
+  its outcome.
 
 Source: Seita et al., ICRA 2021, section on physical experiments: pictures from the home pose, at
 most 10 actions, success at an overlap of more than 0.25.
@@ -26,6 +27,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.solver.guards import PhysicsError
 
 from .calibration import Calibration
 from .camera import Camera, CameraError, Frame
@@ -255,7 +257,7 @@ def run_episode(
         robot.stop()
         recorder.finish("stopped")
         raise
-    except (RobotError, CameraError, SegmentationError) as problem:
+    except (RobotError, CameraError, SegmentationError, PhysicsError) as problem:
         error = problem
         outcome = f"error: {type(problem).__name__}: {' '.join(str(problem).split())}"
         if not isinstance(problem, ConnectionLost):

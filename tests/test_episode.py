@@ -33,7 +33,6 @@ from hardware import (
     GraspError,
     MotionError,
     ReflexError,
-    RobotError,
     SafetyViolation,
     UserStopped,
 )
@@ -59,6 +58,7 @@ from hardware.scoring import score_recording
 from hardware.twin import CableTwin, TwinConfig
 from warp_deform.cli import main as command
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
 
 FAR = PickPlaceAction((0.45, 0.5), 0.0, (0.5, 0.0), 0.0)
 TESTS = Path(__file__).resolve().parent
@@ -164,10 +164,13 @@ def test_a_reflex_is_recovered_from_as_often_as_the_limits_allow(tmp_path: Path)
         MotionError("ended elsewhere"),
         GraspError("stuck"),
         ConnectionLost("gone"),
+        PhysicsError((Problem(ProblemKind.STRETCH, 0, 2.1, 2.0),)),
     ],
     ids=lambda error: type(error).__name__,
 )
-def test_with_nobody_there_other_errors_stop_the_arm(tmp_path: Path, error: RobotError) -> None:
+def test_with_nobody_there_other_errors_stop_the_arm(
+    tmp_path: Path, error: WarpDeformError
+) -> None:
     arm = Arm(error)
     result, _ = episode(tmp_path / "a", arm, [ACTION] * 2)
     assert result.error is error and result.outcomes == ()

@@ -23,7 +23,6 @@ _NAME = re.compile(r"episode_(\d{9})\.parquet")
 _STALE_SECONDS = 3600.0  # a writer holds its temporary file for milliseconds
 _INDEX = "index.json"
 _INDEX_FORMAT = 1
-_MAX_INDEX_BYTES = 2**30
 # Answers of filesystems that have no hard links (FAT, some network mounts).
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK}
 
@@ -176,6 +175,32 @@ def rebuild_index(folder: Path) -> dict[str, Any]:
         InputError: see `EpisodeReader`.
     """
     reader = EpisodeReader(folder)
+    index = _index(reader)
+    _publish(reader.folder / _INDEX, _index_text(index), overwrite=True)
+    return index
+
+
+def read_index(folder: Path) -> dict[str, Any]:
+    """Return what the index has to say by the files; one that says something else is mended.
+
+    Raises:
+        InputError: see `EpisodeReader`.
+    """
+    reader = EpisodeReader(folder)
+    index = _index(reader)
+    text = _index_text(index)
+    try:
+        with (reader.folder / _INDEX).open("rb") as file:
+            current = file.read(len(text) + 1) == text
+    except OSError:
+        current = False  # missing
+    if not current:
+        _publish(reader.folder / _INDEX, text, overwrite=True)
+    return index
+
+
+def _index(reader: EpisodeReader) -> dict[str, Any]:
+    """What the files' metadata come to."""
     episodes, hashes = {}, []
     for seed in reader.seeds:
         with reader._open(seed) as file:
@@ -195,35 +220,15 @@ def rebuild_index(folder: Path) -> dict[str, Any]:
             "sim_seconds": info.sim_seconds,
             "state_hash": info.state_hash,
         }
-    index = {
+    return {
         "format": _INDEX_FORMAT,
         "state_hash": combine_hashes(hashes),
         "episodes": episodes,
     }
-    text = json.dumps(index, indent=1, sort_keys=True, allow_nan=False) + "\n"
-    _publish(reader.folder / _INDEX, text.encode(), overwrite=True)
-    return index
 
 
-def read_index(folder: Path) -> dict[str, Any]:
-    """Return the index if it agrees with the files, else rebuild it.
-
-    Raises:
-        InputError: see `EpisodeReader`.
-    """
-    reader = EpisodeReader(folder)
-    try:
-        with (reader.folder / _INDEX).open("rb") as file:
-            index = json.loads(file.read(_MAX_INDEX_BYTES))
-        recorded = {name: entry["seal"] for name, entry in index["episodes"].items()}
-        current = index["format"] == _INDEX_FORMAT
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        return rebuild_index(folder)  # missing or damaged: the files are the truth
-    seals = {}
-    for seed in reader.seeds:
-        with reader._open(seed) as episode:
-            seals[episode_name(seed)] = episode.seal
-    return index if current and recorded == seals else rebuild_index(folder)
+def _index_text(index: dict[str, Any]) -> bytes:
+    return json.dumps(index, indent=1, sort_keys=True, allow_nan=False).encode() + b"\n"
 
 
 def _list_seeds(folder: Path) -> tuple[int, ...]:
