@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -50,13 +52,14 @@ def image_batch(
     data: Demonstrations,
     agent: Transporter,
     *,
-    count: int,
+    moments: Iterable[tuple[int, int]],
     rng: np.random.Generator,
     augment: bool = True,
     mirror: bool = False,
 ) -> Batch:
-    """`count` moments, drawn and moved by `rng`, as an agent over pictures sees them.
+    """Moments, moved by `rng`, as an agent over pictures sees them.
 
+    moments: demonstrations and moments, `Demonstrations.drawn` say
     mirror: show every second one mirrored, where mirror images are scenes of the task
 
     Raises:
@@ -64,8 +67,7 @@ def image_batch(
     """
     images, picks, places, thetas, lifts = [], [], [], [], []
     grid, copies, mirrors = data.task.grid, data.task.rotated_copies, data.task.mirrors
-    for _ in range(count):
-        moment = data.moment(*data.draw(rng))
+    for moment in (data.moment(*each) for each in moments):
         pictures = [(moment.color, moment.height)]
         if agent.pictures == 2:
             pictures.append((moment.goal_color, moment.goal_height))
@@ -99,18 +101,17 @@ def state_batch(
     data: Demonstrations,
     lifts: tuple[float, ...],
     *,
-    count: int,
+    moments: Iterable[tuple[int, int]],
     rng: np.random.Generator,
     augment: bool = True,
 ) -> StateBatch:
-    """`count` moments, drawn and moved by `rng`, as a ground-truth baseline sees them.
+    """Moments, moved by `rng`, as a ground-truth baseline sees them; see `image_batch`.
 
     Raises:
         InputError: a lift is no stage's.
     """
     states, actions = [], []
-    for _ in range(count):
-        state, action = data.state(*data.draw(rng))
+    for state, action in (data.state(*each) for each in moments):
         if augment:
             grid, copies = data.task.grid, data.task.rotated_copies
             moved = draw_transform(action, rng=rng, grid=grid, copies=copies)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -32,7 +32,7 @@ class TrainOptions(CommandOptions):
     data: Annotated[Path, arg(metavar="DIR")]
     """Folder of demonstrations, see `warp-deform demo`."""
     demos: Annotated[int | None, arg(metavar="N")] = None
-    """Demonstrations to learn from, drawn by --seed; all when left out."""
+    """Demonstrations to learn from, drawn by --seed; when left out, all that are not held out."""
     seed: int = 0
     """Of the initial weights, of what is drawn, and of which demonstrations are used."""
     preset: Literal["paper", "fast"] = "paper"
@@ -53,6 +53,8 @@ class TrainOptions(CommandOptions):
     """Compute by the original's operations, several times slower; see docs/learning.md."""
     bf16: bool = False
     """Convolve in bfloat16: quicker where the processor multiplies it natively."""
+    hold_out: Annotated[int, arg(metavar="N")] = 0
+    """Further demonstrations, not learnt from: the snapshot of the lowest loss on them is taken."""
     validate: Annotated[int, arg(metavar="N")] = 0
     """Validation episodes that every snapshot plays during training."""
     patience: Annotated[int | None, arg(metavar="N")] = None
@@ -83,23 +85,21 @@ def train(options: TrainOptions) -> Outcome:
         demos=options.demos,
         seed=options.seed,
         preset=options.preset,
+        steps=options.steps,
+        batch=options.batch,
+        lr=options.lr,
+        snapshots=options.snapshots,
         augment=options.augment,
         exact=options.exact,
         bf16=options.bf16,
         device=options.device,
         threads=options.threads,
+        hold_out=options.hold_out,
         validate=options.validate,
         patience=options.patience,
         tensorboard=options.tensorboard,
         untrained=options.untrained,
     )
-    changes: dict[str, Any] = {
-        name: value
-        for name in ("steps", "batch", "lr", "snapshots")
-        if (value := getattr(options, name)) is not None
-    }
-    if changes:
-        config = replace(config, schedule=replace(config.plan, **changes))
     report = asdict(run_training(config))
     if rank():
         raise SystemExit(0)  # under torchrun the first process speaks for all

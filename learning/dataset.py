@@ -7,6 +7,7 @@ it was made from. It may be deleted at any time, and several processes may make 
 
 from __future__ import annotations
 
+import copy
 import os
 import secrets
 from collections.abc import Iterator, Mapping
@@ -24,6 +25,7 @@ __all__ = ["Demonstrations", "Moment", "choose"]
 
 _FOLDER = "rows"
 _FORMAT = 1
+_COLUMNS = "color", "height", "action", "ground_truth"
 _IMPORTED = "original"
 """Whose the recordings of the original code are, `interchange.deformable_ravens.DEMONSTRATOR`."""
 _IMPORTED_ABOVE = {"bag-color-goal": 0.5}
@@ -86,8 +88,9 @@ class Demonstrations:
     Args:
         folder: what `warp-deform demo` wrote
         task: the task that must be in it
-        count: demonstrations to learn from; None takes all
+        count: demonstrations to learn from; None takes all but the spare ones
         seed: which ones, see `choose`
+        spare: how many others there have to be, see `spared`
 
     Raises:
         InputError: no folder, another task's episodes, failures among them, or too few.
@@ -95,7 +98,9 @@ class Demonstrations:
     Source: Seita et al., ICRA 2021, code that records demonstrations.
     """
 
-    def __init__(self, folder: Path, *, task: str, count: int | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, folder: Path, *, task: str, count: int | None = None, seed: int = 0, spare: int = 0
+    ) -> None:
         self.task = find_task(task)
         reader = EpisodeReader(Path(folder))
         index = read_index(Path(folder))["episodes"]
@@ -116,13 +121,32 @@ class Demonstrations:
         self.left_out = len(reader) - len(seeds)
         if not seeds:
             raise InputError(f"{folder}: none of its {len(reader)} episodes is a demonstration")
-        self.seeds = choose(tuple(seeds), len(seeds) if count is None else count, seed=seed)
-        self.seals = tuple(index[episode_name(number)]["seal"] for number in self.seeds)
-        cache = Path(folder) / _FOLDER
+        if count is None:
+            count = len(seeds) - spare
+        chosen = choose(tuple(seeds), count, seed=seed)
+        rest = tuple(sorted(set(seeds) - set(chosen)))
+        if spare > len(rest):
+            raise InputError(
+                f"{folder} holds {len(seeds)} demonstrations, too few to learn from {count} and "
+                f"hold out {spare}; collect more"
+            )
+        self._reader, self._index, self._seed, self._rest = reader, index, seed, rest
+        self._take(chosen)
+
+    def _take(self, seeds: tuple[int, ...]) -> None:
+        self.seeds = seeds
+        self.seals = tuple(self._index[episode_name(number)]["seal"] for number in seeds)
+        cache = self._reader.folder / _FOLDER
         self._episodes = [
-            _open(reader, number, cache / f"{number:09d}-{seal}-{_FORMAT}.npy")
+            _open(self._reader, number, cache / f"{number:09d}-{seal}-{_FORMAT}.npy")
             for number, seal in zip(self.seeds, self.seals, strict=True)
         ]
+
+    def spared(self, count: int) -> Demonstrations:
+        """So many others, drawn from those that are not among these."""
+        found = copy.copy(self)
+        found._take(choose(self._rest, count, seed=self._seed))
+        return found
 
     def __len__(self) -> int:
         """Number of demonstrations."""
@@ -151,13 +175,16 @@ class Demonstrations:
             )
         return size
 
-    def draw(self, rng: np.random.Generator) -> tuple[int, int]:
-        """A demonstration and one of its moments: first the one, then the other, both uniformly.
+    def drawn(self, count: int, rng: np.random.Generator) -> Iterator[tuple[int, int]]:
+        """So many times a demonstration, then one of its moments, both drawn uniformly by `rng`.
+
+        Each is drawn when it is asked for, so `rng` may serve between them.
 
         Source: Seita et al., ICRA 2021, code of the training loop.
         """
-        episode = int(rng.integers(len(self._episodes)))
-        return episode, int(rng.integers(len(self._episodes[episode].actions)))
+        for _ in range(count):
+            episode = int(rng.integers(len(self._episodes)))
+            yield episode, int(rng.integers(len(self._episodes[episode].actions)))
 
     def moment(self, episode: int, t: int) -> Moment:
         """Moment t of a demonstration; its goal is how the demonstration ended (hindsight)."""
@@ -200,6 +227,8 @@ def _open(reader: EpisodeReader, seed: int, path: Path) -> _Rows:
     """The cached rows of an episode, made first where they are missing or damaged."""
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
+        if rows.dtype.names != _COLUMNS or rows.ndim != 1 or len(rows) < 2:
+            raise ValueError("something else under this name")
     except (OSError, ValueError, EOFError):  # not made yet, or cut short by a full disk
         _write(_rows(reader.read(seed)), path)
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -212,10 +241,10 @@ def _rows(episode: Episode) -> np.ndarray:
     shape = first.height.shape
     kind = np.dtype(
         [
-            ("color", "u1", (*shape, 3)),
-            ("height", "<f4", shape),
-            ("action", "<f8", (7,)),
-            ("ground_truth", "<f4", first.ground_truth.shape),
+            (_COLUMNS[0], "u1", (*shape, 3)),
+            (_COLUMNS[1], "<f4", shape),
+            (_COLUMNS[2], "<f8", (7,)),
+            (_COLUMNS[3], "<f4", first.ground_truth.shape),
         ]
     )
     rows = np.zeros(len(episode.steps), kind)
@@ -233,6 +262,8 @@ def _write(rows: np.ndarray, path: Path) -> None:
         path.parent.mkdir(exist_ok=True)
         with temporary.open("xb") as file:
             np.save(file, rows, allow_pickle=False)
+            file.flush()
+            os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
         raise InputError(

@@ -86,6 +86,11 @@ class TrainingLog:
                 self._board.add_scalar(f"train/{name}", value, step)
         self._sums, self._count, self._since = {}, 0, time.perf_counter()
 
+    def mark(self, step: int, values: Mapping[str, float]) -> None:
+        """Hand what was measured of a snapshot to TensorBoard, where it is written for."""
+        for name, value in values.items() if self._board is not None else ():
+            self._board.add_scalar(name, value, step)
+
     def check(self, step: int) -> None:
         """See that the losses since the last line are finite.
 
@@ -115,7 +120,10 @@ class TrainingLog:
             temporary.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Write the lines so far and close TensorBoard's file."""
+        """Write the lines so far and close TensorBoard's file.
+
+        Steps after the last whole line are in none: the next call would log them again.
+        """
         try:
             self.flush()
         finally:

@@ -24,6 +24,7 @@ from warp_deform.rendering.pixels import SHAPE
 from warp_deform.tasks.metrics import wrap_angle
 from warp_deform.tasks.registry import task as find_task
 
+from .batches import task_lifts
 from .memory import Memory
 from .models.gt_state import GtState, GtState2Step, GtStateConfig
 from .models.transporter import GoalSplit, GoalStack, Transporter, TransporterConfig
@@ -238,6 +239,10 @@ def load_policy(path: str | Path, *, device: str = "cpu") -> ImagePolicy | State
         description = AgentDescription(**record["agent"])
         agent = make_agent(description)
         agent.load_state_dict(weights)
+        if agent.config.lifts != task_lifts(find_task(description.task)):
+            raise ValueError(f"lifts {list(agent.config.lifts)} are not those of the task's stages")
+        if not all(bool(each.isfinite().all()) for each in agent.parameters()):
+            raise ValueError("its weights are not finite")
     except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{file} is no snapshot of this release's agents: {reason}") from error

@@ -15,13 +15,13 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import save_file
 from torch import Tensor
 
 from warp_deform.errors import InputError, WarpDeformError
@@ -85,7 +85,8 @@ class RunFolder:
         check_fields(found, _SETTINGS, what=what)
         check_fields(found["agent"], _AGENT, what=what)
         check_fields(found["schedule"], {"steps": int}, what=what)
-        optional = {"validate": int, "trained_steps": int, "versions": dict, "demonstrators": list}
+        optional = {"validate": int, "trained_steps": int, "versions": dict, "demonstrators": list,
+                    "hold_out": int}  # fmt: skip
         check_fields(found, {k: v for k, v in optional.items() if k in found}, what=what)
         check_fields({"patience": None, **found}, {"patience": (int, type(None))}, what=what)
         if not all(seed.isdecimal() for seed in found["demonstrations"]):
@@ -113,17 +114,21 @@ class RunFolder:
         return sorted(int(match[1]) for match in matches if match)
 
     def chosen_snapshot(self) -> Path:
-        """The snapshot that the evaluation chose; the last one before there is an evaluation.
+        """The snapshot that the evaluation chose.
+
+        Before there is an evaluation, that of the lowest loss on held-out demonstrations (the
+        earliest of equals); without any the last one.
 
         Raises:
             InputError: there is none, or a file is damaged.
         """
-        self.read_settings()
+        settings = self.read_settings()
         steps = self.steps()
         if not steps:
             raise InputError(f"{self.path} has no snapshot yet; run `warp-deform train` to its end")
         if not self.report.is_file():
-            return self.snapshot(steps[-1])
+            losses = self.held_out() if settings.get("hold_out") else {}
+            return self.snapshot(min(losses, key=losses.__getitem__) if losses else steps[-1])
         chosen = self.read_report()["selected"]
         if chosen not in steps:
             raise InputError(
@@ -131,32 +136,38 @@ class RunFolder:
             )
         return self.snapshot(chosen)
 
+    def held_out(self) -> dict[int, float]:
+        """Loss [nat] on held-out demonstrations by step, see `held_out.HeldOut`."""
+        records = {step: read_record(self.snapshot(step)) for step in self.steps()}
+        return {step: each["held_out"] for step, each in records.items() if "held_out" in each}
+
     def write_snapshot(
         self, step: int, weights: Mapping[str, Tensor], record: Mapping[str, Any]
     ) -> Path:
         """Store weights, and a record of what they are beside them."""
         path = self.snapshot(step)
         write_json(path.with_suffix(".json"), {"format": _FORMAT, "step": step, **record})
-        _publish(path, save({name: each.contiguous() for name, each in weights.items()}))
+        _write_tensors(path, weights)
         return path
 
-    def write_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Store what training goes on from, in place of what was stored before."""
-        metadata = {"format": str(_FORMAT), "step": str(step)}
-        data = save({name: each.contiguous() for name, each in tensors.items()}, metadata)
-        _publish(self.state, data)
+    def write_state(self, tensors: Mapping[str, Tensor], step: int, *, key: str) -> None:
+        """Store what training goes on from, in place of what was stored before.
 
-    def read_state(self) -> tuple[dict[str, Tensor], int]:
-        """What `write_state` stored, and its step; nothing and 0 at the beginning.
+        key: digest of the settings that it belongs to
+        """
+        _write_tensors(self.state, tensors, {"format": str(_FORMAT), "step": str(step), "key": key})
+
+    def read_state(self) -> tuple[dict[str, Tensor], int, str]:
+        """What `write_state` stored, its step and key; nothing and step 0 at the beginning.
 
         Raises:
             InputError: it is damaged.
         """
         if not self.state.exists():
-            return {}, 0
+            return {}, 0, ""
         tensors, metadata = _read(self.state)
         try:
-            return tensors, int(metadata["step"])
+            return tensors, int(metadata["step"]), metadata["key"]
         except (KeyError, ValueError) as error:
             raise InputError(f"{self.state} is damaged; train into another folder") from error
 
@@ -188,6 +199,7 @@ def read_record(path: Path) -> dict[str, Any]:
         )
     what = f"{beside} is no record of a snapshot"
     check_fields(record, {"step": int, "agent": dict}, what=what)
+    check_fields({"held_out": 0.0, **record}, {"held_out": float}, what=what)
     check_fields(record["agent"], _AGENT, what=what)
     return record
 
@@ -228,7 +240,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, record: Mapping[str, Any]) -> None:
     """Write a JSON object, whole or not at all."""
     text = json.dumps(record, indent=1, sort_keys=True, allow_nan=False)
-    _publish(path, text.encode() + b"\n")
+    _publish(path, lambda temporary: temporary.write_text(text + "\n", encoding="utf-8"))
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -240,16 +252,27 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise InputError(f"{path} is damaged or no safetensors file") from error
 
 
-def _publish(path: Path, data: bytes) -> None:
-    """Write `data` under a temporary name, then give it its name."""
+def _write_tensors(
+    path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None
+) -> None:
+    """Write tensors, whole or not at all."""
+
+    def write(temporary: Path) -> None:
+        save_file({name: each.contiguous() for name, each in tensors.items()}, temporary, metadata)
+
+    _publish(path, write)
+
+
+def _publish(path: Path, write: Callable[[Path], object]) -> None:
+    """Have a file written under a temporary name, then give it its name."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
+        write(temporary)
+        with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
-    except OSError as error:
-        raise WarpDeformError(f"{path} cannot be written: {error.strerror}") from error
+    except (OSError, SafetensorError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise WarpDeformError(f"{path} cannot be written: {reason}") from error
     finally:
         temporary.unlink(missing_ok=True)

@@ -16,6 +16,7 @@ import contextlib
 import difflib
 import fcntl
 import json
+import os
 import sys
 import time
 import tomllib
@@ -36,6 +37,7 @@ from warp_deform.robots import robot as find_robot
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.workers import Workers, worker_count
 
+from .models.transporter import Transporter
 from .policy import AGENTS, AgentDescription
 from .report import write_report
 from .report_run import evaluate_run
@@ -79,7 +81,7 @@ class SweepConfig:
     """A grid. The fields are the keys of the file; those without a default have to be there.
 
     steps, batch, lr, snapshots: None takes the preset's; untrained: evaluate step 0 too
-    device, validate, patience: see `training.TrainConfig`
+    bf16: of agents over pictures; device, validate, patience: see `training.TrainConfig`
     Agents are combined with the tasks that they fit: those that see a goal, with tasks that have
     one.
     """
@@ -94,6 +96,7 @@ class SweepConfig:
     batch: int | None = None
     lr: float | None = None
     snapshots: int | None = None
+    bf16: bool = False
     untrained: bool = False
     device: str = "cpu"
     validate: int = 0
@@ -140,7 +143,7 @@ class SweepConfig:
         return (self.demonstrations.folder or self.out / "demos") / task
 
     def _cell(self, demos: int, task: str, agent: str, seed: int) -> TrainConfig:
-        config = TrainConfig(
+        return TrainConfig(
             task=task,
             agent=agent,
             data=self.data(task),
@@ -148,18 +151,17 @@ class SweepConfig:
             demos=demos,
             seed=seed,
             preset=self.preset,
+            steps=self.steps,
+            batch=self.batch,
+            lr=self.lr,
+            snapshots=self.snapshots,
+            bf16=self.bf16 and issubclass(AGENTS[agent], Transporter),
             untrained=self.untrained,
             device=self.device,
             validate=self.validate,
             patience=self.patience,
             progress=False,
         )
-        changes: dict[str, Any] = {
-            name: value
-            for name in ("steps", "batch", "lr", "snapshots")
-            if (value := getattr(self, name)) is not None
-        }
-        return replace(config, schedule=replace(config.plan, **changes))
 
 
 def read_sweep(path: Path) -> SweepConfig:
@@ -198,6 +200,7 @@ def run_sweep(
         WarpDeformError: a worker process was killed; what had been finished is kept.
     """
     began = time.perf_counter()
+    config = _resolved(config)
     cells = config.cells()
     todo = [cell for cell in cells if not _done(cell, config)]
     count = None
@@ -246,11 +249,19 @@ def _fits(task: str, agent: str) -> bool:
 
 def _wanted(cell: TrainConfig, config: SweepConfig) -> dict[str, Any]:
     """What a run was to be, for the file that says that it is done."""
-    settings = {**asdict(cell), "data": str(cell.data), "out": None, "progress": None}
+    data = os.path.relpath(cell.data, config.out)  # the whole may be moved
+    settings = {**asdict(cell), "data": data, "out": None, "progress": None}
     wanted: dict[str, Any] = json.loads(
         json.dumps({"training": settings, "evaluation": asdict(config.evaluation)})
     )
     return wanted
+
+
+def _resolved(config: SweepConfig) -> SweepConfig:
+    """With absolute paths: a worker elsewhere need not stand where this process does."""
+    where = config.demonstrations
+    folder = None if where.folder is None else where.folder.resolve()
+    return replace(config, out=config.out.resolve(), demonstrations=replace(where, folder=folder))
 
 
 def _done(cell: TrainConfig, config: SweepConfig) -> bool:

@@ -15,34 +15,32 @@ ours.
 from __future__ import annotations
 
 import hashlib
-import json
-import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from warp_deform.episodes import EpisodeReader, versions
-from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.errors import InputError
 from warp_deform.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 
 from .batches import check_lifts, image_batch, state_batch, task_lifts
 from .dataset import Demonstrations
-from .log import LINE_STEPS, TrainingLog
-from .models.adam import KerasAdam
+from .held_out import HeldOut
+from .log import TrainingLog
 from .models.gt_state import GtStateConfig
 from .models.transporter import PRESETS, Transporter, TransporterConfig
 from .policy import AGENTS, Agent, AgentDescription, make_agent
 from .processes import DEVICES, Process, join_processes
 from .schedules import SCHEDULES, Schedule, preset_schedule
-from .snapshots import RunFolder, read_json, write_json
+from .snapshots import RunFolder
+from .training_state import Trained, claim, on_cpu, state_steps
 
 __all__ = ["TrainConfig", "TrainReport", "train"]
 
@@ -55,12 +53,13 @@ class TrainConfig:
     """What to train, and how.
 
     demos: demonstrations to learn from, drawn by `seed`; None takes all that `data` holds
-    schedule: None takes the preset's
+    schedule: None takes the preset's; steps, batch, lr, snapshots: changes to it
     network: None takes the preset's; rotations and lifts are the task's in any case
     augment: turn and shift what is seen at random
     exact: compute by the original's operations, several times slower
     bf16: convolve in bfloat16, agents over pictures alone
     threads: of torch, a process; another number may change the last bits
+    hold_out: further demonstrations, not learnt from, on which every snapshot's loss is measured
     validate: validation episodes that every snapshot plays; 0 plays none
     patience: stop when so many snapshots in a row brought no better validation; None never stops
     untrained: also a snapshot of the initial weights, step 0, where a learning curve begins
@@ -75,12 +74,17 @@ class TrainConfig:
     seed: int = 0
     preset: str = "paper"
     schedule: Schedule | None = None
+    steps: int | None = None
+    batch: int | None = None
+    lr: float | None = None
+    snapshots: int | None = None
     network: TransporterConfig | None = None
     augment: bool = True
     exact: bool = False
     bf16: bool = False
     device: str = "cpu"
     threads: int = 1
+    hold_out: int = 0
     validate: int = 0
     patience: int | None = None
     tensorboard: bool = False
@@ -95,7 +99,7 @@ class TrainConfig:
             raise InputError(f"preset is {self.preset!r}; it must be one of {sorted(SCHEDULES)}")
         if self.device not in DEVICES:
             raise InputError(f"device is {self.device!r}; it must be 'cpu' or 'cuda'")
-        for name, least in (("seed", 0), ("threads", 1), ("validate", 0)):
+        for name, least in (("seed", 0), ("threads", 1), ("validate", 0), ("hold_out", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be {least} or more")
         if self.patience is not None:
@@ -111,18 +115,15 @@ class TrainConfig:
                 raise InputError(f"{name} is for agents over pictures; {self.agent} has its own")
         if self.bf16 and self.exact:
             raise InputError("bf16 and exact exclude each other: the original computes in float32")
+        self.plan(self.demos or 0)  # refuses changes that do not go together
 
-    @property
-    def plan(self) -> Schedule:
-        """The schedule in force."""
-        if self.schedule is not None:
-            return self.schedule
-        demos = self.demos
-        if demos is None:
-            demos = sum(1 for _ in self.data.glob("episode_*.parquet"))
-        return preset_schedule(
+    def plan(self, demos: int) -> Schedule:
+        """The schedule in force with so many demonstrations."""
+        plan = self.schedule or preset_schedule(
             self.preset, task=self.task, demos=demos, sees_state=self._sees_state
         )
+        wanted = {name: getattr(self, name) for name in ("steps", "batch", "lr", "snapshots")}
+        return replace(plan, **{k: v for k, v in wanted.items() if v is not None})
 
     @property
     def _sees_state(self) -> bool:
@@ -135,7 +136,8 @@ class TrainReport:
 
     left_out: recordings of the folder that are no demonstrations, see `dataset.Demonstrations`
     steps: taken in all; snapshots: the steps of which there are snapshots; loss: mean over the last
-    logged steps [nat]; seconds: of this call [s]; weights_hash: of the last snapshot's weights
+    logged steps [nat]; held_out: that of snapshots on held-out demonstrations by step [nat];
+    seconds: of this call [s]; weights_hash: of the last snapshot's weights
     """
 
     task: str
@@ -147,6 +149,7 @@ class TrainReport:
     steps: int
     snapshots: tuple[int, ...]
     loss: float | None
+    held_out: dict[int, float]
     seconds: float
     stopped_early: bool
     weights_hash: str
@@ -160,28 +163,28 @@ def train(config: TrainConfig) -> TrainReport:
         WarpDeformError: loss or weights are no longer finite, or something cannot be written.
     """
     began = time.perf_counter()
-    plan, run = config.plan, RunFolder(config.out)
+    run = RunFolder(config.out)
     with join_processes(config.device, threads=config.threads) as here:
         rank, world, device = here
         # What is trained, and on what
-        data = Demonstrations(config.data, task=config.task, count=config.demos, seed=config.seed)
+        data = Demonstrations(
+            config.data, task=config.task, count=config.demos, seed=config.seed,
+            spare=config.hold_out,
+        )  # fmt: skip
         check_lifts(data)
+        plan = config.plan(len(data))
         description = _describe(config, data)
         agent = make_agent(description, seed=config.seed).to(device)
-        if rank == 0:
-            _claim(run, config, plan, description, data, world)
+        held_out = HeldOut(agent, data.spared(config.hold_out)) if config.hold_out else None
+        key = claim(run, config, plan, description, data, processes=world, write=rank == 0)
         here.wait()
-        names = dict(agent.named_parameters())
-        optimizer = KerasAdam(agent.parameters(), lr=plan.lr)
-        averaged = {name: each.detach().clone() for name, each in names.items()}
 
         # Go on where a run was interrupted, perhaps while its last snapshot was validated
-        tensors, first = run.read_state()
-        if tensors:
-            _restore(tensors, first, names, averaged, optimizer)
+        trained = Trained(agent, plan, run, key)
+        first = trained.restore()
         stopped = _validate(run, config, [k for k in run.steps() if 0 < k <= first], here)
         network: nn.Module = DistributedDataParallel(agent) if world > 1 else agent
-        kept, store = set(plan.snapshot_steps()), _state_steps(plan)
+        kept, store = set(plan.snapshot_steps()), state_steps(plan)
 
         shown = config.progress and rank == 0
         bar = progress_bar(f"train {config.task}", plan.steps, done=first, shown=shown)
@@ -195,32 +198,34 @@ def train(config: TrainConfig) -> TrainReport:
                 inputs = _batch(data, agent, plan, config.augment, rng, device)
 
                 # One step of the optimiser
-                lr = optimizer.param_groups[0]["lr"] = plan.lr_at(step)
-                optimizer.zero_grad(set_to_none=True)
+                lr = trained.optimizer.param_groups[0]["lr"] = plan.lr_at(step)
+                trained.optimizer.zero_grad(set_to_none=True)
                 losses = network(*inputs)
                 loss = losses.total()
                 loss.backward()
-                optimizer.step()
-                _average(averaged, names, plan.kept_at(step))
+                trained.step(step)
                 log.add(step, {"loss": loss, **losses._asdict()}, lr=lr)
 
                 # Snapshots, and what an interrupted run goes on from
                 due, last = step in kept, step == plan.steps
                 if due or last or step % store == 0:
                     log.check(step)
-                    _check_weights(averaged, step)
+                    trained.check(step)
                     if rank == 0 and due:
-                        record = {"agent": asdict(description)}
-                        run.write_snapshot(step, _detached(averaged), record)
+                        record: dict[str, Any] = {"agent": asdict(description)}
+                        if held_out is not None:
+                            record["held_out"] = held_out.loss(trained.averaged())
+                            log.mark(step, {"held_out/loss": record["held_out"]})
+                        run.write_snapshot(step, on_cpu(trained.averaged()), record)
                     if rank == 0 and (last or step % store == 0):
                         log.flush()
-                        run.write_state(_state(names, averaged, optimizer), step)
+                        trained.store(step)
                 if due:
                     stopped = _validate(run, config, [step], here)
                 advance()
         if config.untrained and rank == 0:
             initial = dict(make_agent(description, seed=config.seed).named_parameters())
-            run.write_snapshot(0, _detached(initial), {"agent": asdict(description)})
+            run.write_snapshot(0, on_cpu(initial), {"agent": asdict(description)})
         here.wait()
         steps = run.steps()
         return TrainReport(
@@ -233,6 +238,7 @@ def train(config: TrainConfig) -> TrainReport:
             steps=steps[-1],
             snapshots=tuple(steps),
             loss=log.last_loss(),
+            held_out=run.held_out(),
             seconds=time.perf_counter() - began,
             stopped_early=steps[-1] < plan.steps,
             weights_hash=_hash(run.snapshot(steps[-1])),
@@ -261,49 +267,6 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
     )
 
 
-def _claim(
-    run: RunFolder,
-    config: TrainConfig,
-    plan: Schedule,
-    description: AgentDescription,
-    data: Demonstrations,
-    world: int,
-) -> None:
-    """Write the run's settings into its folder, or refuse one that holds another run."""
-    deciding = {
-        "agent": asdict(description),
-        "preset": config.preset,
-        "schedule": asdict(plan),
-        "seed": config.seed,
-        "augment": config.augment,
-        "patience": config.patience,
-        "validate": config.validate,
-        "processes": world,
-        "threads": config.threads,
-        "device": config.device,
-        "demonstrations": dict(zip(map(str, data.seeds), data.seals, strict=True)),
-        "versions": versions(),
-    }
-    wanted = json.loads(json.dumps(deciding))
-    if run.settings.exists():
-        found = read_json(run.settings)
-        if "rounded" in found:
-            raise InputError(
-                f"{run.path} is a shared policy, not trained further; choose another --out"
-            )
-        different = [key for key in wanted if found.get(key) != wanted[key]]
-        if different:
-            raise InputError(
-                f"{run.path} holds a run with another {different[0]}; choose another --out"
-            )
-        return
-    run.create()
-    reader = EpisodeReader(config.data)
-    names = sorted({reader.info(seed).demonstrator for seed in data.seeds})
-    told = {"data": str(config.data), "left_out": data.left_out, "demonstrators": names}
-    write_json(run.settings, {**wanted, **told})
-
-
 def _batch(
     data: Demonstrations,
     agent: Agent,
@@ -313,69 +276,14 @@ def _batch(
     device: torch.device,
 ) -> tuple[Any, ...]:
     """Arguments of the agent's losses."""
+    moments = data.drawn(plan.batch, rng)
     if isinstance(agent, Transporter):
         batch = image_batch(
-            data, agent, count=plan.batch, rng=rng, augment=augment, mirror=plan.mirror
+            data, agent, moments=moments, rng=rng, augment=augment, mirror=plan.mirror
         )
         return (batch._replace(image=batch.image.to(device)),)
-    tensors = state_batch(data, agent.config.lifts, count=plan.batch, rng=rng, augment=augment)
+    tensors = state_batch(data, agent.config.lifts, moments=moments, rng=rng, augment=augment)
     return tuple(each.to(device) for each in tensors)
-
-
-def _state_steps(plan: Schedule) -> int:
-    """Steps from one stored state to the next: whole lines of the log, so that none is torn."""
-    every = max(plan.steps / plan.snapshots / 10, 100)
-    return LINE_STEPS * math.ceil(every / LINE_STEPS)
-
-
-@torch.no_grad()
-def _average(averaged: Mapping[str, Tensor], names: Mapping[str, Tensor], keep: float) -> None:
-    for name, each in averaged.items():
-        each.lerp_(names[name].detach(), 1.0 - keep)
-
-
-def _detached(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name: each.detach().cpu() for name, each in tensors.items()}
-
-
-_MOMENTS = "exp_avg", "exp_avg_sq"
-
-
-def _state(
-    names: Mapping[str, nn.Parameter], averaged: Mapping[str, Tensor], optimizer: KerasAdam
-) -> dict[str, Tensor]:
-    """Weights, their averages and the optimiser's moments under one name each."""
-    found = {f"weights.{name}": each for name, each in names.items()}
-    found |= {f"averaged.{name}": each for name, each in averaged.items()}
-    for name, parameter in names.items():
-        for key in _MOMENTS:
-            found[f"{key}.{name}"] = optimizer.state[parameter][key]
-    return _detached(found)
-
-
-def _restore(
-    tensors: Mapping[str, Tensor],
-    step: int,
-    names: Mapping[str, nn.Parameter],
-    averaged: Mapping[str, Tensor],
-    optimizer: KerasAdam,
-) -> None:
-    """Put back what `_state` gave."""
-    with torch.no_grad():
-        for name, parameter in names.items():
-            parameter.copy_(tensors[f"weights.{name}"])
-            averaged[name].copy_(tensors[f"averaged.{name}"])
-            optimizer.state[parameter] = {
-                "step": torch.tensor(float(step)),
-                **{key: tensors[f"{key}.{name}"].to(parameter.device) for key in _MOMENTS},
-            }
-    optimizer.param_groups[0]["steps"] = step
-
-
-def _check_weights(averaged: Mapping[str, Tensor], step: int) -> None:
-    """Raise WarpDeformError unless all weights are finite; the average keeps what ever was not."""
-    if not all(bool(each.isfinite().all()) for each in averaged.values()):
-        raise WarpDeformError(f"weights are not finite at step {step}; lower the step size")
 
 
 def _validate(run: RunFolder, config: TrainConfig, steps: Sequence[int], here: Process) -> bool:

@@ -73,7 +73,7 @@ def test_moments_are_drawn_uniformly_over_episodes_then_steps(tmp_path: Path) ->
     for seed, actions in ((0, 1), (1, 4)):
         writer.write(block_episode(seed, actions=actions))
     data, rng = Demonstrations(tmp_path, task=TASK), np.random.default_rng(0)
-    drawn = [data.draw(rng) for _ in range(4000)]
+    drawn = list(data.drawn(4000, rng))
     shares = [drawn.count((0, 0)) / 4000, *(drawn.count((1, t)) / 4000 for t in range(4))]
     assert np.abs(np.array(shares) - [0.5, 0.125, 0.125, 0.125, 0.125]).max() < 0.03
 

@@ -59,10 +59,13 @@ def test_two_processes_train_as_one_with_both_batches(
     )
     original, drawn = training.state_batch, []
 
-    def of_both(data: Any, lifts: Any, *, rng: Any, **options: Any) -> Any:
+    def of_both(data: Any, lifts: Any, *, augment: bool, **_: Any) -> Any:
         drawn.append(1)
         ranks = (np.random.default_rng([training._STREAM, 0, len(drawn), k]) for k in (0, 1))
-        batches = [original(data, lifts, rng=each, **options) for each in ranks]
+        batches = [
+            original(data, lifts, moments=data.drawn(BATCH, each), rng=each, augment=augment)
+            for each in ranks
+        ]
         return tuple(torch.cat(parts) for parts in zip(*batches, strict=True))
 
     train(replace(alone, out=tmp_path / "single"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +42,19 @@ def test_bags_by_color_train_for_longer(
     config = TrainConfig(
         task=task, agent=agent, data=Path("none"), out=Path("none"), demos=demos, preset=preset
     )
-    assert config.plan == found
+    assert config.plan(demos) == found
     if sees_state:
         assert found == STATE_SCHEDULES[preset]
 
 
-def test_without_a_number_the_demonstrations_of_the_folder_count(tmp_path: Path) -> None:
-    config = TrainConfig(task="bag-color-goal", agent="goal-stack", data=tmp_path, out=tmp_path)
-    assert config.plan.steps == 20_000
-    for seed in range(100):
-        (tmp_path / f"episode_{seed:09d}.parquet").touch()
-    assert config.plan.steps == 40_000
+def test_changes_to_the_preset_come_on_top(tmp_path: Path) -> None:
+    config = TrainConfig(
+        task="bag-color-goal", agent="goal-stack", data=tmp_path, out=tmp_path, lr=0.5
+    )
+    assert config.plan(99) == replace(SCHEDULES["paper"], lr=0.5)
+    assert config.plan(100).steps == 40_000
+    with pytest.raises(InputError, match="snapshots is 7; with steps = 6"):
+        replace(config, steps=6, snapshots=7)
 
 
 @settings(derandomize=True, deadline=None, max_examples=200)

@@ -201,8 +201,8 @@ def test_agents_go_with_the_tasks_that_they_fit(tmp_path: Path) -> None:
         ("block-notarget", "goal-split"),
         ("block-notarget", "gt-mlp"),
     ]
-    assert {cell.plan.lr for cell in config.cells()} == {1.0}
-    assert config.cells()[0].plan.steps == 4000, "the preset's"
+    assert {cell.plan(1).lr for cell in config.cells()} == {1.0}
+    assert config.cells()[0].plan(1).steps == 4000, "the preset's"
 
 
 @pytest.mark.parametrize(

@@ -197,9 +197,12 @@ def test_a_lift_that_a_robot_makes_of_a_stage_s_is_taken(tmp_path: Path) -> None
     EpisodeWriter(tmp_path).write(lifted(0.05))
     data = Demonstrations(tmp_path, task=TASK)
     check_lifts(data)
-    assert state_batch(data, (0.04,), count=8, rng=np.random.default_rng(0))[2].tolist() == [0] * 8
+    assert (
+        state_batch(data, (0.04,), moments=[(0, 0)] * 8, rng=np.random.default_rng(0))[2].tolist()
+        == [0] * 8
+    )
     with pytest.raises(InputError, match=r"lifts to 0\.0[45] m"):
-        state_batch(data, (0.1, 0.3), count=1, rng=np.random.default_rng(0))
+        state_batch(data, (0.1, 0.3), moments=[(0, 0)], rng=np.random.default_rng(0))
 
 
 def test_damaged_and_foreign_snapshots_are_refused(

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from torch import nn
 from training_samples import write_demonstrations
 
 from learning import evaluation, log, training
 from learning.log import TrainingLog
 from learning.schedules import Schedule
-from learning.snapshots import RunFolder
+from learning.snapshots import RunFolder, read_json, write_json
 from learning.training import TrainConfig, train
-from warp_deform.errors import WarpDeformError
+from learning.training_state import Trained, state_steps
+from warp_deform.errors import InputError, WarpDeformError
 
 TASK = "cable-line-notarget"
 PICTURES = Schedule(steps=4, batch=1, lr=1e-3, warmup=2, decay=True, ema=0.9, snapshots=2)
@@ -66,7 +69,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if agent == "goal-stack":  # whole lines of the log would take too many of its steps
-        monkeypatch.setattr(training, "_state_steps", lambda _: stored)
+        monkeypatch.setattr(training, "state_steps", lambda _: stored)
     settings = {"agent": agent, "schedule": schedule}
     whole = train(config(folder, tmp_path / "whole", **settings))
     name = "state_batch" if agent == "gt-mlp" else "image_batch"
@@ -86,7 +89,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
 @pytest.mark.parametrize("snapshots", [1, 3, 7, 11, 150])
 def test_states_are_stored_between_lines_of_the_log(snapshots: int) -> None:
     plan = Schedule(steps=20_000, batch=1, lr=1.0, snapshots=snapshots)
-    assert training._state_steps(plan) % log.LINE_STEPS == 0
+    assert state_steps(plan) % log.LINE_STEPS == 0
 
 
 def test_what_was_logged_is_kept_whatever_ends_a_run(
@@ -198,8 +201,43 @@ def test_no_snapshot_and_no_state_hold_what_is_not_finite(
     assert not run.state.exists()
 
 
-def test_weights_are_looked_at_too() -> None:
+@pytest.mark.parametrize("ema", [0.0, 0.9])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_are_looked_at_too(ema: float, value: float, tmp_path: Path) -> None:
     """A gradient can be lost in a step whose loss was still finite."""
-    for value in (float("nan"), float("inf")):
-        with pytest.raises(WarpDeformError, match="weights are not finite at step 7"):
-            training._check_weights({"a": torch.zeros(2), "b": torch.tensor([0.0, value])}, 7)
+    agent = nn.Linear(2, 2)
+    trained = Trained(agent, replace(STATES, ema=ema), RunFolder(tmp_path), "key")
+    trained.check(6)
+    nn.init.constant_(agent.bias, value)
+    agent(torch.zeros(1, 2)).sum().backward()
+    trained.step(7)
+    with pytest.raises(WarpDeformError, match="weights are not finite at step 7"):
+        trained.check(7)
+
+
+def test_a_state_of_another_run_is_refused(folder: Path, tmp_path: Path) -> None:
+    """Settings that were lost, a state that was copied here, and one of other weights."""
+    one, other = (train(config(folder, tmp_path / name, seed=k)) and RunFolder(tmp_path / name)
+                  for k, name in enumerate(("one", "other")))  # fmt: skip
+    kept = one.state.read_bytes()
+    one.state.write_bytes(other.state.read_bytes())
+    with pytest.raises(InputError, match=r"state\.safetensors is another run's"):
+        train(config(folder, one.path))
+    tensors, step, key = other.read_state()
+    for spoilt in ({}, {**tensors, "more": torch.zeros(1)}):
+        one.write_state(spoilt, step, key=key)
+        with pytest.raises(InputError, match="is another run's"):
+            train(config(folder, one.path))
+    one.state.write_bytes(kept)
+    one.settings.unlink()
+    with pytest.raises(InputError, match=r"holds parts of a run and no run\.json"):
+        train(config(folder, one.path))
+
+
+def test_another_release_of_a_package_is_named(folder: Path, tmp_path: Path) -> None:
+    train(config(folder, tmp_path))
+    run = RunFolder(tmp_path)
+    found = read_json(run.settings)
+    write_json(run.settings, {**found, "versions": {**found["versions"], "torch": "1.0"}})
+    with pytest.raises(InputError, match=r"begun with torch 1\.0, and 2\..* is installed"):
+        train(config(folder, tmp_path))

@@ -39,6 +39,9 @@ Picture = tuple[np.ndarray, np.ndarray]
 """Colour (320, 160, 3) uint8 and height (320, 160) float32 [m], as in an observation."""
 
 
+_MOST_ROTATIONS, _MOST_LIFT = 360, 1.0  # far beyond what is sensible: a file may say anything
+
+
 @dataclass(frozen=True, kw_only=True)
 class TransporterConfig:
     """Sizes and choices of a Transporter; the defaults are the paper's."""
@@ -90,12 +93,18 @@ class TransporterConfig:
         if self.crop < STRIDE or self.crop % STRIDE:
             raise InputError(f"crop: a multiple of {STRIDE} pixels is needed, got {self.crop}")
         for name in ("n_rotations_train", "n_rotations_eval"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: at least 1 is needed, got {getattr(self, name)}")
+            if not 1 <= getattr(self, name) <= _MOST_ROTATIONS:
+                raise InputError(
+                    f"{name}: 1 to {_MOST_ROTATIONS} are possible, got {getattr(self, name)}"
+                )
         if not (0 < self.gain < math.inf and 0 <= self.focus < math.inf):
             raise InputError(f"gain {self.gain} and focus {self.focus}: must not be negative")
-        if not self.lifts:
-            raise InputError("lifts: at least one is needed")
+        if not math.isfinite(self.goal_bias):
+            raise InputError(f"goal_bias: must be finite, got {self.goal_bias}")
+        if not self.lifts or not all(0 < lift <= _MOST_LIFT for lift in self.lifts):
+            raise InputError(
+                f"lifts: one or more, up to {_MOST_LIFT} m, are needed, got {list(self.lifts)}"
+            )
         _ = self.network  # refuses what it cannot be built from
 
     @property

@@ -1,0 +1,57 @@
+"""Demonstrations that are not learnt from: the loss on them says which snapshot to take.
+
+Where nothing can be played, on a robot say, this stands in for validation episodes.
+
+Source: Seita et al., ICRA 2021, section on physical experiments: of 30 demonstrations 24 to learn
+from and 6 for validation, the snapshot of the lowest validation loss is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .batches import image_batch, state_batch
+from .dataset import Demonstrations
+from .models.transporter import Transporter
+from .policy import Agent
+
+__all__ = ["HeldOut"]
+
+
+class HeldOut:
+    """Every moment of demonstrations that are not learnt from.
+
+    Args:
+        agent: whose losses
+        data: the demonstrations
+    """
+
+    def __init__(self, agent: Agent, data: Demonstrations) -> None:
+        self._agent, self._data = agent, data
+
+    @torch.no_grad()
+    def loss(self, weights: Mapping[str, Tensor]) -> float:
+        """Mean loss [nat] over all moments, as they were recorded, with weights by name."""
+        device = next(iter(weights.values())).device
+        moments = [(e, t) for e, length in enumerate(self._data.lengths()) for t in range(length)]
+        losses = [
+            torch.func.functional_call(self._agent, dict(weights), self._inputs(moment, device))
+            .total()
+            .item()
+            for moment in moments
+        ]
+        return float(np.mean(losses))
+
+    def _inputs(self, moment: tuple[int, int], device: torch.device) -> tuple[object, ...]:
+        rng = np.random.default_rng(0)  # nothing is drawn
+        if isinstance(self._agent, Transporter):
+            batch = image_batch(self._data, self._agent, moments=[moment], rng=rng, augment=False)
+            return (batch._replace(image=batch.image.to(device)),)
+        tensors = state_batch(
+            self._data, self._agent.config.lifts, moments=[moment], rng=rng, augment=False
+        )
+        return tuple(each.to(device) for each in tensors)
