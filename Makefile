@@ -31,8 +31,9 @@ demo: $(STAMP)
 		--out $(DEMO)/bag-items-1 --video $(DEMO)/bag-items-1.mp4
 	@echo "episodes and videos: $(DEMO)/"
 
+# Neighbours share kernels and fixtures: a worker begins with a run of them, and steals later.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n auto tests
+	$(BIN)/python -m pytest -n auto --dist worksteal tests
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -96,12 +96,16 @@ class Workers:
     def __enter__(self) -> Workers:
         """Let the processes start and import while the caller does something else."""
         if self.apart and not self._ray:
-            self._starting = self._loky(joblib.delayed(_import)() for _ in range(self.count))
+            try:
+                self._starting = self._loky(joblib.delayed(_import)() for _ in range(self.count))
+            except KeyboardInterrupt:
+                _interrupted()
+                raise
         return self
 
     def __exit__(self, *error: object) -> None:
         if error[0] is KeyboardInterrupt:
-            threading.excepthook = functools.partial(_report_others, threading.excepthook)
+            _interrupted()
         if self._starting is not None:
             _close(self._starting)
 
@@ -178,6 +182,11 @@ def _leave_with(owner: int) -> None:
     while os.getppid() == owner:
         time.sleep(_LOOK_SECONDS)
     os._exit(1)
+
+
+def _interrupted() -> None:
+    """Have joblib's threads end without a word."""
+    threading.excepthook = functools.partial(_report_others, threading.excepthook)
 
 
 def _report_others(
