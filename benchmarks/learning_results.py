@@ -2,19 +2,23 @@
 
     python benchmarks/learning_results.py RUNS... [--share RUN...] [--out FOLDER]
 
-RUNS are evaluated runs, or folders that hold some. `warp-deform report benchmarks/results/learning`
-makes the tables again from what is written here. Policies of --share are written as by
-`warp-deform eval RUN --share`, under policies/.
+RUNS are evaluated runs, or folders that hold some. `warp-deform report
+benchmarks/results/learning/runs --out OUT` makes the tables again from what is written here.
+Policies of --share are written as by `warp-deform eval RUN --share`, under policies/.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from learning.report import read_runs, write_report
 from learning.share import share_run
-from learning.snapshots import RunFolder, write_json
+from learning.snapshots import RunFolder, read_json, write_json
 
 
 def main() -> None:
@@ -33,10 +37,29 @@ def main() -> None:
         settings = {key: value for key, value in run.settings.items() if key != "data"}
         write_json(target.settings, settings)  # the path of the data is this machine's
         write_json(target.report, {k: v for k, v in run.info.items() if k != "videos"})
+        write_episodes(RunFolder(run.path), run.info, target.path)
     for path in options.share:
         share_run(path, options.out / "policies" / path.name)
     report = write_report([options.out / "runs"], options.out)
     print(report.text)
+
+
+def write_episodes(run: RunFolder, info: Mapping[str, Any], target: Path) -> None:
+    """One line a test episode of the chosen snapshot, and the losses of training."""
+    for path in sorted(run.evaluations.glob(f"step_{info['selected']:08d}-test-*.json")):
+        record = read_json(path)
+        if len(record["episodes"]) < info["test"]["n_episodes"]:
+            continue  # the paper's protocol plays fewer
+        label = "" if record["protocol"]["retry"] else "_no_retry"
+        with (target / f"episodes{label}.csv").open("w", newline="") as file:
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow(["seed", "success", "score", "actions", "failure"])
+            for each in record["episodes"]:
+                score = round(each["score"], 4)
+                row = [each["seed"], int(each["success"]), score, each["actions"], each["failure"]]
+                table.writerow(row)
+    if run.log.exists():
+        shutil.copyfile(run.log, target / run.log.name)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from original_recordings import (
     NUMPY_1,
     NUMPY_2,
@@ -23,6 +24,7 @@ from original_recordings import (
 
 from learning.interchange import deformable_ravens
 from learning.interchange.deformable_ravens import import_deformable_ravens, read_recording
+from learning.snapshots import RunFolder, read_snapshot
 from warp_deform.cli import main
 from warp_deform.episodes import HEIGHT_UNIT, EpisodeReader
 from warp_deform.errors import InputError
@@ -90,6 +92,16 @@ def test_a_recorded_demonstration_becomes_an_episode(
     (goal,) = load_goals(tmp_path / "demos")
     np.testing.assert_array_equal(goal.color, last.color)
     np.testing.assert_allclose(goal.targets[:2], after[:2])
+
+
+def test_it_is_learnt_from(original: Path, tmp_path: Path) -> None:
+    demos, run = str(tmp_path / "demos"), str(tmp_path / "run")
+    source = str(original / "insertion-goal")
+    assert main(["convert", source, demos, "--from", "deformable-ravens"]) == 0
+    what = ["block-notarget", "--agent", "goal-split", "--preset", "fast", "--data", demos]
+    assert main(["train", *what, "--steps", "2", "--snapshots", "2", "--out", run]) == 0
+    first, second = (read_snapshot(RunFolder(Path(run)).snapshot(step))[0] for step in (1, 2))
+    assert any(not torch.equal(first[name], second[name]) for name in first)
 
 
 @pytest.mark.parametrize("multiarray", [NUMPY_1, NUMPY_2])
