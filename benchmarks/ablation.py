@@ -13,14 +13,18 @@ the most probable place from the demonstrator's, given the pick: its median [mm]
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
+from torch.nn import functional
 
 from learning.dataset import Demonstrations
 from learning.evaluation import evaluate_snapshot
@@ -55,7 +59,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "half the step size": {"schedule": replace(PLAN, lr=PLAN.lr / 2)},
     "twice the step size": {"schedule": replace(PLAN, lr=PLAN.lr * 2)},
     "batch of 4": {"schedule": replace(PLAN, batch=4)},
+    "soft labels": {"soft": 1.5},
 }
+"""What differs from `fast`; `soft`: labels are Gaussians of that standard deviation [pixels]."""
 VALIDATION_SEED = 50_000
 NEAR_MM = 20.0
 
@@ -98,18 +104,19 @@ def judge(name: str, options: argparse.Namespace) -> dict[str, Any]:
         )
     )  # fmt: skip
     changes = dict(VARIANTS[name])
+    soft = changes.pop("soft", None)
     plan = changes.pop("schedule", PLAN)
     plan = replace(plan, steps=options.steps // plan.batch, snapshots=1)
     agent = "goal-split" if find_task(options.task).goal_conditioned else "transporter"
     label = "-".join(str(value) for value in what.values()).replace(" ", "_")
     run = RunFolder(options.folder / label)
     began = time.process_time()
-    train(
-        TrainConfig(
-            task=options.task, agent=agent, data=data["training"], out=run.path,
-            seed=options.seed, preset="fast", schedule=plan, **changes,
-        )
+    config = TrainConfig(
+        task=options.task, agent=agent, data=data["training"], out=run.path, seed=options.seed,
+        preset="fast", schedule=plan, **changes,
     )  # fmt: skip
+    with soft_labels(soft) if soft else contextlib.nullcontext():
+        train(config)
     row = {**what, "agent": agent, "cpu_s": time.process_time() - began}
     row |= held_out(run, Demonstrations(data["validation"], task=options.task))
     if options.episodes:
@@ -120,6 +127,28 @@ def judge(name: str, options: argparse.Namespace) -> dict[str, Any]:
     with options.out.open("a") as file:
         file.write(json.dumps(row) + "\n")
     return row
+
+
+@contextlib.contextmanager
+def soft_labels(deviation: float) -> Iterator[None]:
+    """Have heat maps learn Gaussians around their labels, of a deviation in pixels."""
+    plain, (rows, columns) = functional.cross_entropy, FAST.shape
+
+    def soft(logits: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
+        if logits.shape[1] % (rows * columns):
+            return plain(logits, label)  # of lifts
+        layer, at = label // (rows * columns), label % (rows * columns)
+        row, column = at // columns, at % columns
+        squares = (torch.arange(rows) - row[:, None])[:, :, None] ** 2 + (
+            torch.arange(columns) - column[:, None]
+        )[:, None] ** 2
+        target = torch.zeros(len(label), logits.shape[1] // (rows * columns), rows * columns)
+        wanted = torch.softmax(-squares.flatten(1) / (2 * deviation**2), dim=1)
+        target[torch.arange(len(label)), layer] = wanted
+        return plain(logits, target.flatten(1))
+
+    with mock.patch.object(functional, "cross_entropy", soft):
+        yield
 
 
 @torch.no_grad()
