@@ -12,6 +12,7 @@ Weights are safetensors: loading runs no code.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -146,7 +147,8 @@ class RunFolder:
     ) -> Path:
         """Store weights, and a record of what they are beside them."""
         path = self.snapshot(step)
-        write_json(path.with_suffix(".json"), {"format": _FORMAT, "step": step, **record})
+        about = {"format": _FORMAT, "step": step, "digest": _digest(weights)}
+        write_json(path.with_suffix(".json"), {**about, **record})
         _write_tensors(path, weights)
         return path
 
@@ -178,8 +180,10 @@ def read_snapshot(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         InputError: a file is missing or damaged, or of another format.
     """
-    record = read_record(path)
-    return _read(Path(path))[0], record
+    record, (weights, _) = read_record(path), _read(Path(path))
+    if record.get("digest", _digest(weights)) != _digest(weights):
+        raise InputError(f"{path} is damaged: these are not the weights that were written")
+    return weights, record
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -199,7 +203,8 @@ def read_record(path: Path) -> dict[str, Any]:
         )
     what = f"{beside} is no record of a snapshot"
     check_fields(record, {"step": int, "agent": dict}, what=what)
-    check_fields({"held_out": 0.0, **record}, {"held_out": float}, what=what)
+    optional = {"held_out": 0.0, "digest": ""}
+    check_fields({**optional, **record}, {"held_out": float, "digest": str}, what=what)
     check_fields(record["agent"], _AGENT, what=what)
     return record
 
@@ -250,6 +255,15 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             return tensors, file.metadata() or {}
     except (SafetensorError, OSError) as error:
         raise InputError(f"{path} is damaged or no safetensors file") from error
+
+
+def _digest(weights: Mapping[str, Tensor]) -> str:
+    """BLAKE2b-128 of names and values."""
+    found = hashlib.blake2b(digest_size=16)
+    for name in sorted(weights):
+        found.update(name.encode())
+        found.update(weights[name].reshape(-1).view(torch.uint8).numpy().data)
+    return found.hexdigest()
 
 
 def _write_tensors(

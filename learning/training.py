@@ -166,6 +166,8 @@ def train(config: TrainConfig) -> TrainReport:
     run = RunFolder(config.out)
     with join_processes(config.device, threads=config.threads) as here:
         rank, world, device = here
+        if config.exact:
+            torch.backends.cudnn.allow_tf32 = False  # on by default, with 10 bits of mantissa
         # What is trained, and on what
         data = Demonstrations(
             config.data, task=config.task, count=config.demos, seed=config.seed,

@@ -110,3 +110,15 @@ def test_a_damaged_report_is_not_taken_for_none(run: RunFolder) -> None:
         write_json(run.report, {**whole, **changes})
         with pytest.raises(InputError, match=told):
             load_policy(run.path)
+
+
+def test_a_flipped_bit_of_the_weights_is_seen(
+    run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = run.snapshot(2)
+    whole = bytearray(path.read_bytes())
+    whole[-1] ^= 1
+    path.write_bytes(whole)
+    with pytest.raises(InputError, match="is damaged: these are not the weights"):
+        load_policy(run.path)
+    assert "step_00000002.safetensors is damaged" in said(capsys, "eval", str(run.path), *SHORT)

@@ -15,6 +15,7 @@ from franka_episodes import GOAL, TASK, chain
 from hardware.choosers import PolicyChooser
 from hardware.episode import Observation
 from hardware.pick_place import PickPlaceAction, PickPlaceOutcome
+from learning.batches import task_lifts
 from learning.memory import MISSED, PUT_DOWN, RESTING, Memory
 from learning.models.transporter import PRESETS
 from learning.policy import AgentDescription, ImagePolicy, make_agent
@@ -45,7 +46,8 @@ def test_what_failed_is_tried_elsewhere_and_what_was_put_down_rests() -> None:
 @pytest.fixture
 def chooser(tmp_path: Path) -> PolicyChooser:
     """An untrained policy of the robot's task, small."""
-    config = dataclasses.asdict(dataclasses.replace(PRESETS["fast"], width=0.0625, crop=16))
+    small = dataclasses.replace(PRESETS["fast"], width=0.0625, crop=16, lifts=task_lifts(TASK))
+    config = dataclasses.asdict(small)
     description = AgentDescription(task=TASK.name, agent="goal-split", config=config)
     run = RunFolder(tmp_path)
     run.path.joinpath("snapshots").mkdir()
