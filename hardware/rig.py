@@ -18,15 +18,17 @@ from .backends.franka_config import NetworkedConfig
 from .calibration import Calibration
 from .camera import Camera, CameraIntrinsics, FileCamera, read_image
 from .emulator.world import World
-from .json_file import read_json
+from .json_file import read_json, require
 from .rig_config import REAL_ROBOTS, RigConfig
 from .robot import Robot
 from .safety import SafeRobot
 from .safety_limits import SafetyLimits
+from .table_plane import TablePlane
 from .top_down_view import TopDownView
 from .twin import TwinConfig, TwinLook
 
-__all__ = ["Rig", "open_camera", "open_rig", "open_robot", "read_intrinsics"]
+__all__ = ["Rig", "open_camera", "open_rig", "open_robot", "read_calibration", "read_intrinsics",
+           "read_table"]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ def open_rig(config: RigConfig) -> Iterator[Rig]:
         else:
             if config.robot == "sim":
                 raise InputError("the robot sim needs --camera sim: nothing else sees its chain")
-            calibration, view = Calibration.load(config.setup / "calibration.json"), TopDownView()
+            calibration, view = read_calibration(config), TopDownView()
             camera = open_camera(config, calibration.intrinsics)
         stack.enter_context(camera)
         empty = config.setup / "empty_view.png"
@@ -185,6 +187,33 @@ def _number(device: str | None) -> int:
     if device is not None and not device.isdigit():
         raise InputError(f"--device is {device!r}; it must be the number of a device, 0 say")
     return int(device or 0)
+
+
+def read_calibration(config: RigConfig) -> Calibration:
+    """Return the setup's calibration, if it is that of the setup as it is now.
+
+    Raises:
+        InputError: missing or damaged, or the table was touched off anew since
+    """
+    calibration = Calibration.load(config.setup / "calibration.json")
+    touched = config.setup / "table.json"
+    if touched.is_file() and read_table(touched) != calibration.table:
+        raise InputError(
+            f"{touched} is another table than the calibration's, whose floor would be wrong; "
+            "calibrate camera (or hand) again"
+        )
+    return calibration
+
+
+def read_table(path: Path) -> TablePlane:
+    """Return the plane that `calibrate table` wrote.
+
+    Raises:
+        InputError: missing or damaged
+    """
+    record = read_json(path, what="table", schema=1)
+    keys = ("height_m", "slope_x", "slope_y")
+    return TablePlane(*(float(require(record, k, float, what=f"table {path}")) for k in keys))
 
 
 def read_intrinsics(path: Path) -> CameraIntrinsics:

@@ -26,9 +26,9 @@ from .goal_file import write_picture
 from .hand_eye import calibrate_hand_eye
 from .homography import board_on_table, fit_homography, plane_homography
 from .human import Terminal
-from .json_file import read_json, require, write_json
+from .json_file import write_json
 from .panda_arm import HOME_Q
-from .rig import open_camera, open_robot, read_intrinsics
+from .rig import open_camera, open_robot, read_calibration, read_intrinsics, read_table
 from .rig_config import REAL_ROBOTS, RigConfig
 from .safety import SafeRobot
 from .safety_limits import SafetyLimits
@@ -94,6 +94,8 @@ def measure_table(
 ) -> dict[str, Any]:
     """Touch the foam at the workspace's corners and fit a plane; the arm moves.
 
+    A calibration made before is refused from then on: it holds the old table as its floor.
+
     Raises:
         InputError: nothing that moves, no provisional height, or no plane
         RobotError: see `touch_off`
@@ -124,8 +126,12 @@ def measure_table(
         "residuals_m": residuals.tolist(),
     }
     write_json(path, record)
-    return {"table": path, "height_m": float(plane.z(middle)),
-            "worst_residual_m": float(np.abs(residuals).max())}  # fmt: skip
+    return {
+        "table": path,
+        "height_m": float(plane.z(middle)),
+        "worst_residual_m": float(np.abs(residuals).max()),
+        "next": "calibrate camera or hand (again): the safety floor comes from there",
+    }
 
 
 def measure_camera(
@@ -146,7 +152,7 @@ def measure_camera(
         RobotError, CameraError: robot or camera fail
     """
     operator = operator or Terminal()
-    table = _table(config.setup / "table.json")
+    table = read_table(config.setup / "table.json")
     lens = _lens(config)
     with robot or _arm(config, table) as arm:
         if not operator.wait("lay the board flat into the workspace; the arm then goes home"):
@@ -200,7 +206,7 @@ def measure_hand_eye(
         RobotError, CameraError: robot or camera fail
     """
     operator = operator or Terminal()
-    table = _table(config.setup / "table.json")
+    table = read_table(config.setup / "table.json")
     lens = _lens(config)
     hands: list[np.ndarray] = []
     seen: list[np.ndarray] = []
@@ -254,7 +260,7 @@ def photograph_empty(config: RigConfig) -> dict[str, Any]:
         InputError: there is no calibration yet
         CameraError: no picture
     """
-    calibration = Calibration.load(config.setup / "calibration.json")
+    calibration = read_calibration(config)
     with open_camera(config, calibration.intrinsics) as device:
         view = TopDownView().rectify(device.read().rgb, calibration)
     path = config.setup / "empty_view.png"
@@ -300,12 +306,6 @@ def _calibration(
         error_m=error_m,
         details=details,
     )
-
-
-def _table(path: Path) -> TablePlane:
-    record = read_json(path, what="table", schema=1)
-    keys = ("height_m", "slope_x", "slope_y")
-    return TablePlane(*(float(require(record, k, float, what=f"table {path}")) for k in keys))
 
 
 def _marked(rgb: np.ndarray, pixels: np.ndarray) -> np.ndarray:

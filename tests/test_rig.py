@@ -1,0 +1,45 @@
+"""Opening a setup: its files must belong together, and to what stands on the table."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from franka_episodes import CALIBRATION
+
+from hardware.goal_file import write_picture
+from hardware.rig import open_rig, read_table
+from hardware.rig_config import RigConfig
+from hardware.table_plane import TablePlane
+from warp_deform.errors import InputError
+
+
+def write_table(setup: Path, table: TablePlane) -> None:
+    record = {"schema": 1, "height_m": table.height_m, "slope_x": table.slope_x,
+              "slope_y": table.slope_y}  # fmt: skip
+    (setup / "table.json").write_text(json.dumps(record))
+
+
+def filmed(setup: Path) -> RigConfig:
+    """A dry run over recorded pictures, with a calibration."""
+    CALIBRATION.save(setup / "calibration.json")
+    width, height = CALIBRATION.intrinsics.size
+    write_picture(setup / "frames" / "000_rgb.png", np.zeros((height, width, 3), np.uint8))
+    return RigConfig(camera="file", frames=setup / "frames", setup=setup)
+
+
+def test_a_table_touched_off_anew_needs_a_new_calibration(tmp_path: Path) -> None:
+    config = filmed(tmp_path)
+    with open_rig(config) as rig:  # a calibration alone is enough
+        assert rig.robot.limits.table == CALIBRATION.table
+    write_table(tmp_path, CALIBRATION.table)
+    assert read_table(tmp_path / "table.json") == CALIBRATION.table
+    with open_rig(config) as rig:
+        assert rig.robot.limits.table == CALIBRATION.table
+    write_table(tmp_path, replace(CALIBRATION.table, height_m=CALIBRATION.table.height_m + 1e-3))
+    refused = pytest.raises(InputError, match=r"table\.json is another table .* again$")
+    with refused, open_rig(config):
+        pass
