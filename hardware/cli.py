@@ -232,8 +232,8 @@ def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> Episo
         options.agent, rig, goal, seed=seed, policy=options.policy, budget=options.budget
     )
     described = RecorderConfig(
-        robot_id=rig.calibration.robot_id if config.real else config.robot,
-        camera_id=rig.calibration.camera_id,
+        robot_id=config.robot_id,
+        camera_id=config.camera_id,
         actor=chooser.name,
         calibration=rig.calibration.digest(),
         config={

@@ -193,7 +193,8 @@ def read_calibration(config: RigConfig) -> Calibration:
     """Return the setup's calibration, if it is that of the setup as it is now.
 
     Raises:
-        InputError: missing or damaged, or the table was touched off anew since
+        InputError: missing or damaged, the table was touched off anew since, or it is that of
+            another robot or camera
     """
     calibration = Calibration.load(config.setup / "calibration.json")
     touched = config.setup / "table.json"
@@ -202,6 +203,17 @@ def read_calibration(config: RigConfig) -> Calibration:
             f"{touched} is another table than the calibration's, whose floor would be wrong; "
             "calibrate camera (or hand) again"
         )
+    if config.robot in REAL_ROBOTS:
+        pairs = [("robot", "--robot and --host", calibration.robot_id, config.robot_id)]
+        if config.camera != "file":
+            pairs.append(("camera", "--camera and --device", calibration.camera_id,
+                          config.camera_id))  # fmt: skip
+        for what, flags, calibrated, named in pairs:
+            if calibrated != named:
+                raise InputError(
+                    f"the calibration in {config.setup} is of the {what} {calibrated!r}, not "
+                    f"{named!r}; give {flags} as then, or calibrate again"
+                )
     return calibration
 
 

@@ -48,3 +48,14 @@ class RigConfig:
     def real(self) -> bool:
         """Whether something outside of this process moves."""
         return self.robot in REAL_ROBOTS and self.execute
+
+    @property
+    def robot_id(self) -> str:
+        """Which robot, as a calibration names it."""
+        host = self.host if self.robot in REAL_ROBOTS else None
+        return f"{self.robot} {host or ''}".strip()
+
+    @property
+    def camera_id(self) -> str:
+        """Which camera, as a calibration names it; no number means device 0."""
+        return f"{self.camera} {'' if self.device in (None, '0') else self.device}".strip()

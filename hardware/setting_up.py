@@ -296,8 +296,8 @@ def _calibration(
     details: dict[str, Any],
 ) -> Calibration:
     return Calibration(
-        robot_id=f"{config.robot} {config.host or ''}".strip(),
-        camera_id=f"{config.camera} {config.device or ''}".strip(),
+        robot_id=config.robot_id,
+        camera_id=config.camera_id,
         home_q=np.array(HOME_Q),
         intrinsics=intrinsics,
         base_H_pixel=base_H_pixel,

@@ -36,9 +36,12 @@ def test_a_dry_run_needs_nothing_and_moves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, data, said = run(capfd, "run", "--agent", "random", "--seed", "3")
+    robot = ("--robot", "panda", "--host", "10.0.0.1")
+    code, data, said = run(capfd, "run", *robot, "--agent", "random", "--seed", "3")
     assert code == 0 and data["executed"] is False and data["actions"] <= 1
     assert data["folder"] == "franka-episodes/0000" and "dry run: move_linear" in said
+    meta = json.loads(Path("franka-episodes/0000/episode.json").read_text())
+    assert (meta["robot_id"], meta["camera_id"]) == ("panda 10.0.0.1", "sim")
     code, data, _ = run(capfd, "score", "franka-episodes/0000")
     assert code == 0 and data["n_episodes"] == 1
 

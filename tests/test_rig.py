@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from franka_episodes import CALIBRATION
 
 from hardware.goal_file import write_picture
-from hardware.rig import open_rig, read_table
+from hardware.rig import open_rig, read_calibration, read_table
 from hardware.rig_config import RigConfig
 from hardware.table_plane import TablePlane
 from warp_deform.errors import InputError
@@ -43,3 +45,27 @@ def test_a_table_touched_off_anew_needs_a_new_calibration(tmp_path: Path) -> Non
     refused = pytest.raises(InputError, match=r"table\.json is another table .* again$")
     with refused, open_rig(config):
         pass
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"host": "10.0.0.2"}, "robot 'panda 10.0.0.1', not 'panda 10.0.0.2'; give --robot"),
+        ({"robot": "fr3"}, "not 'fr3 10.0.0.1'"),
+        ({"device": "1"}, "camera 'uvc', not 'uvc 1'; give --camera"),
+        ({"camera": "realsense"}, "not 'realsense'"),
+        ({"device": "0"}, ""),
+        ({"robot": "dry_run", "host": None, "device": "1"}, ""),
+        ({"host": "10.0.0.2", "execute": False, "camera": "file"}, "not 'panda 10.0.0.2'"),
+        ({"camera": "file"}, ""),
+    ],
+)
+def test_a_calibration_is_of_one_robot_and_one_camera(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    config = RigConfig(robot="panda", host="10.0.0.1", camera="uvc", setup=tmp_path, execute=True)
+    replace(CALIBRATION, robot_id=config.robot_id, camera_id=config.camera_id).save(
+        tmp_path / "calibration.json"
+    )
+    with pytest.raises(InputError, match=message) if message else contextlib.nullcontext():
+        assert read_calibration(replace(config, **change)).camera_id == "uvc"
