@@ -4,9 +4,10 @@ What happens when something goes wrong:
 
 - a proposed action that the safety limits refuse: nothing moves, the chooser proposes another;
 - a missed grasp, or a descent that met something: recorded, and the episode goes on;
-- a reflex, the user stop, a motion that ended elsewhere: the operator is asked; "go on" recovers
-  the arm, lets go, goes home and records the action as aborted; nobody there means that only
-  reflexes are recovered from, as often as the limits allow;
+- a reflex, the user stop, a motion that ended elsewhere: the operator is asked, until it is cleared
+  or given up; during an action "go on" recovers the arm, lets go, goes home and records the action
+  as aborted; nobody there means that only reflexes are recovered from, as often as the limits
+  allow;
 - a picture that shows no cable on foam: the operator is asked whether to take another;
 - anything else (a limit broken on the way, a lost connection, a blocked gripper, a twin whose
   simulation cannot be trusted any more): the arm is stopped and the episode ends with the error as
@@ -18,9 +19,9 @@ most 10 actions, success at an overlap of more than 0.25.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -31,6 +32,7 @@ from warp_deform.solver.guards import PhysicsError
 
 from .calibration import Calibration
 from .camera import Camera, CameraError, Frame
+from .operators import Answer, Operator, Plan, Unattended, until_cleared
 from .overlay import draw_action
 from .pick_place import (
     PickPlaceAction,
@@ -41,14 +43,7 @@ from .pick_place import (
     way_points,
 )
 from .recorder import EpisodeRecorder
-from .robot import (
-    ConnectionLost,
-    MotionError,
-    ReflexError,
-    RobotError,
-    SafetyViolation,
-    UnreachablePose,
-)
+from .robot import ConnectionLost, MotionError, RobotError, SafetyViolation, UnreachablePose
 from .safety import SafeRobot
 from .scoring import MAX_ACTIONS, SUCCESS_IOU, EpisodeScore, score_masks
 from .segmentation import SegmentationConfig, SegmentationError, segment_cable
@@ -120,56 +115,6 @@ class Chooser(Protocol):
     def choose(self, seen: Observation) -> PickPlaceAction | None:
         """Return the next action; None where there is nothing to do, which ends the episode."""
         ...
-
-
-class Answer(StrEnum):
-    """What an operator says to a plan."""
-
-    DO = "do"
-    SKIP = "skip"
-    """Propose another."""
-    STOP = "stop"
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What is about to happen.
-
-    Attributes:
-        action: the action; None for the way to the home pose
-        poses: its way-points by name [m], (4, 4) each
-        overlay: the action drawn on the workspace; None for the way home
-        number: of the action, from 1
-    """
-
-    action: PickPlaceAction | None
-    poses: dict[str, np.ndarray]
-    overlay: np.ndarray | None
-    number: int
-
-
-class Operator(Protocol):
-    """Whoever watches the robot."""
-
-    def confirm(self, plan: Plan) -> Answer:
-        """Whether a plan may go ahead."""
-        ...
-
-    def go_on(self, problem: WarpDeformError) -> bool:
-        """Whether the cause of a problem is cleared and the episode may go on."""
-        ...
-
-
-class Unattended:
-    """Nobody watches: every plan goes ahead, and a reflex is recovered from; nothing else is."""
-
-    def confirm(self, plan: Plan) -> Answer:
-        """Go ahead."""
-        return Answer.DO
-
-    def go_on(self, problem: WarpDeformError) -> bool:
-        """Only after a reflex."""
-        return isinstance(problem, ReflexError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +234,7 @@ class _Episode:
         if not self._at_home():
             if self.operator.confirm(Plan(None, {}, None, 0)) is not Answer.DO:
                 return "stopped"
-            self.robot.home()
+            until_cleared(self.robot, self.operator, self.robot.home)
         while True:
             frame, view, mask = self._look()
             self.masks.append(mask)
@@ -355,7 +300,7 @@ class _Episode:
             if action is None:
                 self.say(f"{self.chooser.name} sees nothing to do")
                 return None
-            error = refusal(self.robot, action, self.config.pick_place)
+            error = self._refusal(action)
             if error is None:
                 answer = self.operator.confirm(self._plan(seen, action))
                 if answer is Answer.DO:
@@ -368,6 +313,11 @@ class _Episode:
                 self.say(f"refused: {error}")
             refused.append(action)
 
+    def _refusal(self, action: PickPlaceAction) -> WarpDeformError | None:
+        """Why an action would be refused; a robot that accepts no motion at all is asked about."""
+        attempt = functools.partial(refusal, self.robot, action, self.config.pick_place)
+        return until_cleared(self.robot, self.operator, attempt)
+
     def _plan(self, seen: Observation, action: PickPlaceAction) -> Plan:
         view, config = self.config.view, self.config.pick_place
         overlay = draw_action(seen.view, view, mask=seen.mask, goal=seen.goal, action=action)
@@ -379,9 +329,7 @@ class _Episode:
             result = execute(self.robot, action, self.config.pick_place)
         except MotionError as problem:
             self.say(f"action {len(self.outcomes) + 1}: {problem}")
-            if not self.operator.go_on(problem):
-                raise
-            result = self._recovered(action)
+            result = self._recovered(action, problem)
         pick, place = (
             tuple(self.config.view.base_to_pixel(np.array(xy)).tolist())
             for xy in (action.pick_xy, action.place_xy)
@@ -390,13 +338,16 @@ class _Episode:
         self.outcomes.append(result.outcome)
         self.say(f"action {len(self.outcomes)}: {result.outcome}")
 
-    def _recovered(self, action: PickPlaceAction) -> PickPlaceResult:
+    def _recovered(self, action: PickPlaceAction, problem: MotionError) -> PickPlaceResult:
         """Recover the arm, let go and go home; what became of the cable shows the next picture."""
         config, robot = self.config.pick_place, self.robot
         force = float(np.linalg.norm(robot.state().force_N[:3]))
-        robot.recover()
-        robot.open_gripper(config.release_width_m)
-        robot.home()
+
+        def let_go() -> None:
+            robot.open_gripper(config.release_width_m)
+            robot.home()
+
+        until_cleared(robot, self.operator, let_go, problem=problem)
         planned = way_points(action, robot.limits.table, config)
         height = float(robot.limits.height(planned["lift"]))
         outcome = PickPlaceOutcome.ABORTED

@@ -12,7 +12,8 @@ import numpy as np
 from warp_deform.errors import InputError, WarpDeformError
 
 from .choosers import tangent_at
-from .episode import Answer, Observation, Plan
+from .episode import Observation
+from .operators import Answer, Plan
 from .overlay import draw_action
 from .pick_place import PickPlaceAction
 from .top_down_view import TopDownView
@@ -31,6 +32,8 @@ class Terminal:
     Args:
         ask: shows a text and returns the answer; default: on stderr and from stdin
     """
+
+    attends = True
 
     def __init__(self, ask: Callable[[str], str] | None = None) -> None:
         self._ask = ask or _prompt

@@ -235,15 +235,21 @@ class SafeRobot:
         """End the motion in progress; see `Robot.stop`."""
         self._robot.stop()
 
-    def recover(self) -> None:
+    def recover(self, *, confirmed: bool = False) -> None:
         """Clear a reflex; see `Robot.recover`.
 
+        Args:
+            confirmed: whether an operator has looked at the arm; then it does not count
+
         Raises:
-            SafetyViolation: it was done `max_recoveries` times since `begin_episode`
+            SafetyViolation: it was done `max_recoveries` times since `begin_episode`, unconfirmed
             UserStopped: the user stop is pressed: that takes an operator
         """
         if self._robot.state().mode == RobotMode.USER_STOPPED:
             raise UserStopped("the user stop is pressed")
+        if confirmed:
+            self._robot.recover()
+            return
         if self._recoveries >= self.limits.max_recoveries:
             raise SafetyViolation(
                 f"max_recoveries: {self._recoveries} in this episode, "
@@ -254,7 +260,7 @@ class SafeRobot:
         self._robot.recover()
 
     def begin_episode(self) -> None:
-        """Count recoveries from zero."""
+        """Count recoveries without an operator from zero."""
         self._recoveries = 0
 
     def close(self) -> None:

@@ -179,6 +179,8 @@ def test_with_nobody_there_other_errors_stop_the_arm(
 
 
 class Person(Unattended):
+    attends = True
+
     def __init__(self, *answers: Answer, clears: bool = True) -> None:
         self.answers, self.clears = list(answers), clears
         self.plans, self.problems = list[Plan](), list[WarpDeformError]()

@@ -276,10 +276,14 @@ def test_recoveries_are_counted_per_episode_and_never_undo_a_user_stop() -> None
             robot.recover()
         with pytest.raises(SafetyViolation, match="max_recoveries"):
             robot.recover()
+        spy.mode = RobotMode.REFLEX
+        robot.recover(confirmed=True)  # an operator has looked: that counts for nothing
+        assert spy.mode == RobotMode.IDLE
     robot.begin_episode()
     spy.mode = RobotMode.USER_STOPPED
-    with pytest.raises(UserStopped):
-        robot.recover()
+    for confirmed in (False, True):
+        with pytest.raises(UserStopped):
+            robot.recover(confirmed=confirmed)
     assert spy.mode == RobotMode.USER_STOPPED
 
 
