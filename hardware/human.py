@@ -67,9 +67,17 @@ class Terminal:
 
 
 def _prompt(text: str, source: TextIO | None = None) -> str:
-    """Ask on stderr; the end of the input counts as "q"."""
+    """Ask on stderr; the end of the input counts as "q".
+
+    What was typed at a terminal before the question is no answer to it, and is dropped.
+    """
+    source = source or sys.stdin
+    if source.isatty():
+        import termios  # not on every system, and neither is a terminal
+
+        termios.tcflush(source, termios.TCIFLUSH)
     print(text, end="", file=sys.stderr, flush=True)
-    line = (source or sys.stdin).readline()
+    line = source.readline()
     return line.rstrip("\n") if line else "q"
 
 
