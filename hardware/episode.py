@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -241,11 +241,11 @@ class _Episode:
             done = len(self.outcomes)
             last = self.outcomes[-1] if done else None
             seen = Observation(done, view, mask, self.goal, last)
+            self._record(frame, seen)
             solved = self.goal is not None and _solved(mask, self.goal)
             if done >= self.config.max_actions or (solved and self.config.until_success):
-                self._record(frame, seen, None)
                 return "success" if self._succeeded() else "limit"
-            action = self._choose(frame, seen)
+            action = self._choose(seen)
             if action is None:
                 return "success" if self._succeeded() else "stopped"
             self._do(action)
@@ -274,29 +274,24 @@ class _Episode:
                 continue
             return frame, view, mask
 
-    def _record(self, frame: Frame, seen: Observation, action: PickPlaceAction | None) -> None:
-        overlay = draw_action(
-            seen.view, self.config.view, mask=seen.mask, goal=seen.goal, action=action
-        )
-        iou = self.recorder.observe(frame, seen.view, seen.mask, overlay=overlay)
+    def _record(self, frame: Frame, seen: Observation) -> None:
+        iou = self.recorder.observe(frame, seen.view, seen.mask, overlay=self._drawn(seen, None))
         score = "" if iou is None else f", overlap {iou:.3f}"
         self.say(f"after {seen.index} actions: {np.count_nonzero(seen.mask)} px of cable{score}")
 
-    def _choose(self, frame: Frame, seen: Observation) -> PickPlaceAction | None:
-        """An action that is allowed and confirmed; None where there is none, or to stop."""
+    def _drawn(self, seen: Observation, action: PickPlaceAction | None) -> np.ndarray:
+        view = self.config.view
+        return draw_action(seen.view, view, mask=seen.mask, goal=seen.goal, action=action)
+
+    def _choose(self, seen: Observation) -> PickPlaceAction | None:
+        """An action that is allowed and confirmed; None where there is none, or to stop.
+
+        The recorded overlay is that of the action; of none, where none is confirmed.
+        """
         refused: list[PickPlaceAction] = []
         while True:
-            now = Observation(
-                seen.index, seen.view, seen.mask, seen.goal, seen.last, tuple(refused)
-            )
-            try:
-                action = self.chooser.choose(now)
-            except BaseException:
-                if not refused:
-                    self._record(frame, seen, None)
-                raise
-            if not refused:
-                self._record(frame, seen, action)
+            now = replace(seen, refused=tuple(refused))
+            action = self.chooser.choose(now)
             if action is None:
                 self.say(f"{self.chooser.name} sees nothing to do")
                 return None
@@ -305,6 +300,7 @@ class _Episode:
                 answer = self.operator.confirm(self._plan(seen, action))
                 if answer is Answer.DO:
                     return action
+                self.recorder.show(self._drawn(seen, None))
                 if answer is Answer.STOP:
                     return None
             elif len(refused) + 1 >= _MOST_PROPOSALS:
@@ -319,10 +315,9 @@ class _Episode:
         return until_cleared(self.robot, self.operator, attempt)
 
     def _plan(self, seen: Observation, action: PickPlaceAction) -> Plan:
-        view, config = self.config.view, self.config.pick_place
-        overlay = draw_action(seen.view, view, mask=seen.mask, goal=seen.goal, action=action)
-        poses = way_points(action, self.robot.limits.table, config)
-        return Plan(action, poses, overlay, seen.index + 1)
+        overlay = self._drawn(seen, action)
+        poses = way_points(action, self.robot.limits.table, self.config.pick_place)
+        return Plan(action, poses, overlay, seen.index + 1, self.recorder.show(overlay))
 
     def _do(self, action: PickPlaceAction) -> None:
         try:

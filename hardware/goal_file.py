@@ -14,6 +14,7 @@ from warp_deform.tasks.chain_shapes import curved_chain
 
 from .camera import read_image
 from .chain_from_mask import estimate_chain
+from .json_file import write_whole
 from .top_down_view import TopDownView
 
 __all__ = ["GoalSeen", "read_goal", "sampled_goal", "write_goal", "write_picture"]
@@ -73,13 +74,9 @@ def write_goal(path: Path, mask: np.ndarray, view: np.ndarray) -> Path:
 
 
 def write_picture(path: Path, rgb: np.ndarray) -> None:
-    """Write a picture (H, W, 3) uint8 as PNG.
+    """Write a picture (H, W, 3) uint8 as PNG, whole or not at all.
 
     Raises:
         InputError: it cannot be written
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}; choose another") from error
+    write_whole(path, cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())

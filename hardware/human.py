@@ -50,6 +50,8 @@ class Terminal:
                 f"{math.degrees(plan.action.pick_yaw):.0f} deg, place {_xy(plan.action.place_xy)} "
                 f"turned by {turn:.0f} deg; z [m]: {heights}"
             )
+            if plan.picture is not None:
+                text += f"\n  drawn in {plan.picture}"
         answers = {"": Answer.DO, "s": Answer.SKIP, "q": Answer.STOP}
         while True:
             said = self._ask(f"{text}\n  Enter: do it, s: another, q: stop > ").strip().lower()

@@ -1,4 +1,4 @@
-"""JSON files that people keep and edit: written whole or not at all, read with one-line errors."""
+"""Files that people keep and edit: written whole or not at all; JSON read with one-line errors."""
 
 from __future__ import annotations
 
@@ -12,19 +12,28 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-__all__ = ["read_json", "read_numbers", "require", "write_json"]
+__all__ = ["read_json", "read_numbers", "require", "write_json", "write_whole"]
 
 _MAX_BYTES = 2**24
 
 
 def write_json(path: Path, record: dict[str, Any]) -> None:
-    """Write the record under a temporary name, flush it to the disk, then give it its name."""
+    """Write the record as `write_whole` does."""
     text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    write_whole(path, text.encode())
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write under a temporary name, flush to the disk, then give the file its name.
+
+    Raises:
+        InputError: it cannot be written; what stood there before still does
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
-            file.write(text.encode())
+            file.write(data)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -38,12 +39,14 @@ class Plan:
         poses: its way-points by name [m], (4, 4) each
         overlay: the action drawn on the workspace; None for the way home
         number: of the action, from 1
+        picture: file that shows `overlay`; None where there is none
     """
 
     action: PickPlaceAction | None
     poses: dict[str, np.ndarray]
     overlay: np.ndarray | None
     number: int
+    picture: Path | None = None
 
 
 class Operator(Protocol):

@@ -25,7 +25,7 @@ from warp_deform.errors import InputError
 from warp_deform.tasks.metrics import mask_iou
 
 from .camera import DEPTH_UNIT, Frame
-from .json_file import write_json
+from .json_file import write_json, write_whole
 from .pick_place import PickPlaceAction, PickPlaceResult
 from .recording import SCHEMA
 from .robot import Robot, RobotError, RobotState
@@ -118,7 +118,7 @@ class EpisodeRecorder:
             frame: the camera's picture
             view: the workspace from above, (H, W, 3) uint8
             mask: the cable in it, (H, W) bool
-            overlay: a picture for people, (h, w, 3) uint8: the planned action on the view
+            overlay: a picture for people, (h, w, 3) uint8; `show` replaces it by a plan
         """
         if self._observations != self._actions:
             raise InputError("an observation follows an action; record the action first")
@@ -141,6 +141,17 @@ class EpisodeRecorder:
         self._append(self._steps, {**line, "taken_s": frame.timestamp_s})
         self._observations += 1
         return iou
+
+    def show(self, overlay: np.ndarray) -> Path:
+        """Replace the last observation's overlay (h, w, 3) uint8; returns its file.
+
+        The file always shows one plan, whole: people look at it while they are asked.
+        """
+        if self._observations != self._actions + 1:
+            raise InputError("a plan follows an observation; record the observation first")
+        path = _named(self.folder / "frames" / f"{self._observations - 1:03d}", "overlay")
+        write_whole(path, _png(_bgr(overlay)))
+        return path
 
     def act(
         self,
@@ -272,19 +283,28 @@ def _named(stem: Path, name: str) -> Path:
 
 
 def _write_rgb(path: Path, rgb: np.ndarray) -> None:
+    _write_png(path, _bgr(rgb))
+
+
+def _bgr(rgb: np.ndarray) -> np.ndarray:
     if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
         raise InputError(f"a picture is (H, W, 3) uint8, not {rgb.shape} {rgb.dtype}")
-    _write_png(path, np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)))
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
+    data = _png(image)
+    with path.open("xb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _png(image: np.ndarray) -> bytes:
     done, data = cv2.imencode(".png", image, (cv2.IMWRITE_PNG_COMPRESSION, 1))
     if not done:
         raise InputError(f"a picture of shape {image.shape} cannot be written as PNG")
-    with path.open("xb") as file:
-        file.write(data.tobytes())
-        file.flush()
-        os.fsync(file.fileno())
+    return data.tobytes()
 
 
 def _sync_folder(folder: Path) -> None:

@@ -207,6 +207,8 @@ def test_steps_come_in_turn(tmp_path: Path) -> None:
     with EpisodeRecorder(tmp_path / "a", CONFIG) as recorder:
         with pytest.raises(InputError, match="observation first"):
             recorder.act(ACTION, result())
+        with pytest.raises(InputError, match="observation first"):
+            recorder.show(np.zeros((4, 4, 3), np.uint8))
         assert observe(recorder, 0, 1) is None
         with pytest.raises(InputError, match="action first"):
             observe(recorder, 1, 1)
