@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 from board_photographs import INTRINSICS, SIZE, TABLE, camera_above
-from safety_spy import SpyRobot
+from safety_spy import ARM, SpyRobot
 
-from hardware import GraspError, SafetyViolation
+from hardware import GraspError, MotionError, SafetyViolation
 from hardware.calibration import Calibration
 from hardware.homography import plane_homography
 from hardware.panda_arm import HOME_Q
@@ -59,6 +59,33 @@ def test_touch_off_that_touches_nothing_or_holds_something() -> None:
     with pytest.raises(SafetyViolation, match="workspace x"):
         touch_off(SafeRobot(spy, limits), [*CORNERS, (0.9, 0.0)])
     assert not spy.lines
+
+
+def test_a_touch_in_mid_air_is_no_table() -> None:
+    limits = SafetyLimits(table=TablePlane(-0.015))
+
+    class Jerky(TouchedTable):
+        true = TablePlane(-0.015 + 0.06 - 0.004 - 0.009)
+
+    spy = Jerky(object_width=0.0)
+    with pytest.raises(MotionError, match=r"4\.0 mm below where its descent to point 1 began"):
+        touch_off(SafeRobot(spy, limits), CORNERS)
+    assert ARM.pose(spy.q)[2, 3] == pytest.approx(0.045, abs=1e-4)  # up again
+
+
+@pytest.mark.parametrize(("felt", "refused"), [(1.4, False), (1.6, True)])
+def test_a_hand_that_feels_something_in_the_air_does_not_go_down(
+    felt: float, refused: bool
+) -> None:
+    """The threshold is one of forces, not of changes: what is felt already is missing from it."""
+    spy = TouchedTable(object_width=0.0, force=np.array([0.0, felt, 0.0, 0.0, 0.0, 0.0]))
+    robot = SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015)))
+    if refused:
+        with pytest.raises(MotionError, match=r"feels 1\.6 N in the air, 1\.5 N are allowed; set"):
+            touch_off(robot, CORNERS)
+        assert len(spy.lines) == 1
+    else:
+        assert len(touch_off(robot, CORNERS)) == len(CORNERS)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3e-3])
