@@ -20,6 +20,7 @@ from warp_deform.errors import InputError
 from .motion_checks import MotionChecks, Planner
 from .panda_arm import GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
 from .robot import (
+    HomesGripper,
     MotionError,
     MoveResult,
     ReflexError,
@@ -212,6 +213,14 @@ class SafeRobot:
         """Move the fingers; see `Robot.open_gripper`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
         self._command(lambda: self._robot.open_gripper(width_m))
+
+    def home_gripper(self) -> bool:
+        """Let the fingers find their zero; False where this backend cannot, see `HomesGripper`."""
+        backend = self._robot
+        if not isinstance(backend, HomesGripper):
+            return False
+        self._command(backend.home_gripper)
+        return True
 
     def grasp(self, *, width_m: float, force_N: float) -> bool:
         """Close the fingers; returns whether both the backend and the measured width say "held".

@@ -27,6 +27,7 @@ from .hand_eye import calibrate_hand_eye
 from .homography import board_on_table, fit_homography, plane_homography
 from .human import Terminal
 from .json_file import write_json
+from .operators import until_cleared
 from .panda_arm import HOME_Q
 from .rig import open_camera, open_robot, read_calibration, read_intrinsics, read_table
 from .rig_config import REAL_ROBOTS, RigConfig
@@ -90,31 +91,46 @@ def measure_lens(
 
 
 def measure_table(
-    config: RigConfig, *, provisional_z: float | None, touch: Callable[..., np.ndarray] = touch_off
+    config: RigConfig,
+    *,
+    provisional_z: float | None,
+    touch: Callable[..., np.ndarray] = touch_off,
+    robot: SafeRobot | None = None,
+    operator: Terminal | None = None,
 ) -> dict[str, Any]:
-    """Touch the foam at the workspace's corners and fit a plane; the arm moves.
+    """Home the fingers, touch the foam at the workspace's corners and fit a plane; the arm moves.
 
     A calibration made before is refused from then on: it holds the old table as its floor.
 
     Raises:
-        InputError: nothing that moves, no provisional height, or no plane
+        InputError: nothing that moves, no provisional height, stopped, or no plane
         RobotError: see `touch_off`
     """
     if provisional_z is None:
         raise InputError(
             "give --table-z, a height [m] in the base frame that is 1 to 3 cm below the foam's top"
         )
-    arm = _arm(config, TablePlane(provisional_z))
-    limits = arm.limits
-    (x0, x1), (y0, y1) = limits.x, limits.y
-    corners = [(x, y) for x, y in ((x0, y0), (x0, y1), (x1, y1), (x1, y0), ((x0 + x1) / 2, 0.0))]
-    middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
-    inside = [tuple(np.add(c, _INSET * np.sign(middle - c)).tolist()) for c in corners]
-    with arm as robot:
-        robot.home()
-        points = touch(robot, inside)
-        robot.home()
-        robot.open_gripper()
+    operator = operator or Terminal()
+    with robot or _arm(config, TablePlane(provisional_z)) as arm:
+        (x0, x1), (y0, y1) = arm.limits.x, arm.limits.y
+        corners = [(x0, y0), (x0, y1), (x1, y1), (x1, y0), ((x0 + x1) / 2, 0.0)]
+        middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
+        inside = [tuple(np.add(c, _INSET * np.sign(middle - c)).tolist()) for c in corners]
+        _wait(
+            operator,
+            "clear the foam, nothing between the fingers, hand on the stop; the arm then goes "
+            "home, homes its fingers and touches the foam at five points",
+        )
+        until_cleared(arm, operator, arm.home)
+        if not arm.home_gripper():
+            _wait(
+                operator,
+                f"home the hand in Desk, if it was switched on since: {config.robot} cannot do "
+                "that from here",
+            )
+        points = touch(arm, inside)
+        until_cleared(arm, operator, arm.home)
+        arm.open_gripper()
     plane, residuals = fit_table_plane(points)
     path = config.setup / "table.json"
     record = {
@@ -266,6 +282,12 @@ def photograph_empty(config: RigConfig) -> dict[str, Any]:
     path = config.setup / "empty_view.png"
     write_picture(path, view)
     return {"empty": path}
+
+
+def _wait(operator: Terminal, text: str) -> None:
+    """Wait until something is done by hand; InputError where the operator stops instead."""
+    if not operator.wait(text):
+        raise InputError("stopped; nothing was written")
 
 
 def _arm(config: RigConfig, table: TablePlane) -> SafeRobot:

@@ -1,4 +1,4 @@
-"""The camera on the hand, found by a person who guides it around a board."""
+"""Measuring a setup: what is asked, what moves, and what is written."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 from board_photographs import BOARD, INTRINSICS, TABLE, photograph, rotation, transform
 from safety_spy import ARM, HOME, SpyRobot
+from test_calibration_file import TouchedTable
 
 from hardware.calibration import Calibration
 from hardware.camera import Frame
 from hardware.homography import plane_homography
 from hardware.human import Terminal
+from hardware.rig import read_table
 from hardware.rig_config import RigConfig
 from hardware.safety import SafeRobot
 from hardware.safety_limits import SafetyLimits
-from hardware.setting_up import measure_hand_eye
+from hardware.setting_up import measure_hand_eye, measure_table
+from hardware.table_plane import TablePlane
 from warp_deform.errors import InputError
 
 TCP_T_CAMERA = transform(rotation(0.02, -0.03, 0.05), [0.05, 0.0, -0.06])
@@ -104,3 +107,50 @@ def test_stopping_writes_nothing(tmp_path: Path) -> None:
         measure_hand_eye(config, BOARD)
     assert [path.name for path in tmp_path.iterdir()] == ["table.json"]
     assert not robot.joints and not robot.lines
+
+
+class Homing(TouchedTable):
+    def home_gripper(self) -> None:
+        self.log.append("home_gripper")
+        self.width = 0.08
+
+
+@pytest.mark.parametrize("kind", [Homing, TouchedTable])
+def test_the_table_is_asked_for_then_touched_with_homed_fingers(
+    tmp_path: Path, kind: type[TouchedTable]
+) -> None:
+    spy = kind(object_width=0.0)
+    asked: list[tuple[str, int]] = []
+
+    def answer(text: str) -> str:
+        asked.append((text, len(spy.log)))
+        return ""
+
+    found = measure_table(
+        RigConfig(setup=tmp_path, robot="fr3"), provisional_z=-0.015,
+        robot=SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015))), operator=Terminal(answer),
+    )  # fmt: skip
+    table = read_table(tmp_path / "table.json")
+    assert table.z(np.array([0.5, 0.1])) == pytest.approx(
+        spy.true.z(np.array([0.5, 0.1])), abs=1e-4
+    )
+    assert "calibrate camera or hand" in found["next"]
+    assert "five points" in asked[0][0] and asked[0][1] == 1  # recovered, nothing else
+    if kind is Homing:
+        assert spy.log[:4] == ["recover", "move_joints", "home_gripper", "grasp"]
+        assert len(asked) == 1
+    else:
+        assert spy.log[:3] == ["recover", "move_joints", "grasp"]
+        assert "Desk" in asked[1][0] and asked[1][1] == 2 and len(asked) == 2
+    assert spy.log[-3:] == ["move_joints", "open_gripper", "close"]
+
+
+def test_a_table_that_is_not_confirmed_moves_nothing(tmp_path: Path) -> None:
+    spy = Homing(object_width=0.0)
+    safe = SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015)))
+    with pytest.raises(InputError, match="nothing was written"):
+        measure_table(
+            RigConfig(setup=tmp_path), provisional_z=-0.015, robot=safe,
+            operator=Terminal(lambda _: "q"),
+        )  # fmt: skip
+    assert spy.log == ["recover", "stop", "close"] and not list(tmp_path.iterdir())
