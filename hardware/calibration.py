@@ -15,7 +15,7 @@ from warp_deform.errors import InputError
 
 from .camera import CameraIntrinsics
 from .frozen import freeze_arrays
-from .homography import apply_homography
+from .homography import MAX_ERROR, apply_homography
 from .json_file import read_json, read_numbers, require, write_json
 from .table_plane import TablePlane
 
@@ -24,7 +24,6 @@ __all__ = ["SCHEMA", "Calibration"]
 SCHEMA = 1
 """Version of the calibration file that this package writes and reads."""
 _METHODS = ("charuco", "touched points", "hand-eye")
-_MAX_ERROR = 3e-3  # [m]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,9 +59,9 @@ class Calibration:
     def __post_init__(self) -> None:
         if self.method not in _METHODS:
             raise InputError(f"calibration: method {self.method!r} is none of {_METHODS}")
-        if not 0.0 <= self.error_m <= _MAX_ERROR:
+        if not 0.0 <= self.error_m <= MAX_ERROR:
             raise InputError(
-                f"calibration: its error is {self.error_m} m, {_MAX_ERROR} m are allowed; "
+                f"calibration: its error is {self.error_m} m, {MAX_ERROR} m are allowed; "
                 "calibrate anew"
             )
         H = np.asarray(self.base_H_pixel)

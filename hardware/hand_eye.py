@@ -19,10 +19,12 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-__all__ = ["HandEye", "calibrate_hand_eye"]
+from .homography import MAX_ERROR
 
-_MIN_POSES = 8
-_MAX_ERROR = 4e-3  # [m], rms over the poses
+__all__ = ["MIN_POSES", "HandEye", "calibrate_hand_eye"]
+
+MIN_POSES = 8
+"""Fewest poses that give a result."""
 # Turns between poses that tell a camera's place: along two axes, by this much [rad], 11 degrees.
 _MIN_TURN = 0.2
 # Noise of a board's pose relative to its place: 2 mrad go with 0.7 mm [m/rad].
@@ -67,13 +69,13 @@ def calibrate_hand_eye(base_T_tcp: np.ndarray, camera_T_board: np.ndarray) -> Ha
         camera_T_board: poses of the board in the pictures taken there [m], (n, 4, 4)
 
     Raises:
-        InputError: too few poses, too much alike, or the board does not stand still to 4 mm rms
+        InputError: too few poses, too much alike, or the board does not stand still to 3 mm rms
     """
     hand, seen = np.asarray(base_T_tcp, dtype=float), np.asarray(camera_T_board, dtype=float)
     if hand.shape != seen.shape or hand.ndim != 3 or hand.shape[1:] != (4, 4):
         raise InputError(f"poses need shape (n, 4, 4) both, not {hand.shape} and {seen.shape}")
-    if len(hand) < _MIN_POSES:
-        raise InputError(f"hand-eye needs {_MIN_POSES} poses, better 15; {len(hand)} were given")
+    if len(hand) < MIN_POSES:
+        raise InputError(f"hand-eye needs {MIN_POSES} poses, better 15; {len(hand)} were given")
     if not (np.isfinite(hand).all() and np.isfinite(seen).all()):
         raise InputError("a pose is not finite; take that picture again")
     _check_turns(hand)
@@ -97,9 +99,9 @@ def calibrate_hand_eye(base_T_tcp: np.ndarray, camera_T_board: np.ndarray) -> Ha
         np.linalg.norm(errors[:, :3], axis=1),
         np.linalg.norm(errors[:, 3:], axis=1),
     )
-    if not found.error_m <= _MAX_ERROR:
+    if not found.error_m <= MAX_ERROR:
         raise InputError(
-            f"{found.report()}; allowed: {1e3 * _MAX_ERROR:g} mm rms, so it is refused; take "
+            f"{found.report()}; allowed: {1e3 * MAX_ERROR:g} mm rms, so it is refused; take "
             f"picture {int(np.argmax(found.residuals_m)) + 1} again first, and fix board and camera"
         )
     return found

@@ -21,12 +21,13 @@ from .camera import CameraIntrinsics
 from .charuco import BoardSpec, Corners
 from .table_plane import TablePlane
 
-__all__ = ["HomographyFit", "apply_homography", "board_on_table", "fit_homography",
+__all__ = ["MAX_ERROR", "HomographyFit", "apply_homography", "board_on_table", "fit_homography",
            "plane_homography"]  # fmt: skip
 
 # Four points always fit: a fifth is the first that says whether they fit well.
 _MIN_POINTS = 5
-_MAX_ERROR = 3e-3  # [m], leave one out, rms: half of a cable's width
+MAX_ERROR = 3e-3
+"""Greatest error of a calibration [m], rms, by its own measure: half of a cable's width."""
 _MIN_SPREAD = 0.02  # [m], standard deviation across the narrow side of the points
 _MAX_BOARD_ERROR = 2e-3  # [m]
 
@@ -101,10 +102,10 @@ def fit_homography(
         predicted = apply_homography(_solve(straight[others], base_xy[others]), straight[i : i + 1])
         left_out[i] = np.linalg.norm(predicted[0] - base_xy[i])
     fit = HomographyFit(H, residuals, left_out)
-    if not fit.error_m <= _MAX_ERROR:
+    if not fit.error_m <= MAX_ERROR:
         worst = int(np.argmax(left_out))
         raise InputError(
-            f"{fit.report()}; allowed: {1e3 * _MAX_ERROR:g} mm rms, so it is refused; measure "
+            f"{fit.report()}; allowed: {1e3 * MAX_ERROR:g} mm rms, so it is refused; measure "
             f"point {worst + 1} again first"
         )
     return fit

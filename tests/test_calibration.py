@@ -189,6 +189,10 @@ def test_bad_hand_eye_poses_are_refused() -> None:
     moved[3, :3, 3] += [0.03, 0.0, 0.0]
     with pytest.raises(InputError, match="take picture 4 again"):
         calibrate_hand_eye(hands, moved)
+    # More than the calibration file takes is refused here, where it says which picture was worst.
+    shaky, seen_shaky, _ = hand_eye_poses(0, place=2.2e-3)
+    with pytest.raises(InputError, match=r"stands still to 3\.\d+ mm rms.* allowed: 3 mm rms"):
+        calibrate_hand_eye(shaky, seen_shaky)
     turned = np.array([transform(rotation(0, 0, 0.05 * i), hands[i, :3, 3]) for i in range(15)])
     with pytest.raises(InputError, match="one axis only"):
         calibrate_hand_eye(turned, seen)
