@@ -17,11 +17,14 @@ from warp_deform.errors import InputError
 
 from .camera import CameraIntrinsics
 
-__all__ = ["BoardSpec", "Corners", "board_pose", "calibrate_intrinsics", "find_corners"]
+__all__ = ["MIN_VIEWS", "BoardSpec", "Corners", "board_pose", "calibrate_intrinsics",
+           "find_corners"]  # fmt: skip
 
 _MIN_CORNERS = 6
 _MAX_POSE_ERROR = 2.0  # [px], root mean square
-_MIN_VIEWS, _MAX_INTRINSICS_ERROR = 8, 1.0  # [px]
+MIN_VIEWS = 8
+"""Fewest views that give intrinsics."""
+_MAX_INTRINSICS_ERROR = 1.0  # [px]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,8 +135,8 @@ def calibrate_intrinsics(
 
     Source: Zhang, "A flexible new technique for camera calibration", 2000.
     """
-    if len(views) < _MIN_VIEWS:
-        raise InputError(f"intrinsics need {_MIN_VIEWS} views of the board, not {len(views)}")
+    if len(views) < MIN_VIEWS:
+        raise InputError(f"intrinsics need {MIN_VIEWS} views of the board, not {len(views)}")
     objects = [board.corners_m[view.ids].astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     rms, K, distortion, _, _ = cv2.calibrateCamera(objects, pixels, size, None, None)

@@ -21,9 +21,16 @@ from warp_deform.errors import InputError
 
 from .calibration import Calibration
 from .camera import Camera, CameraIntrinsics
-from .charuco import BoardSpec, Corners, board_pose, calibrate_intrinsics, find_corners
+from .charuco import (
+    MIN_VIEWS,
+    BoardSpec,
+    Corners,
+    board_pose,
+    calibrate_intrinsics,
+    find_corners,
+)
 from .goal_file import write_picture
-from .hand_eye import calibrate_hand_eye
+from .hand_eye import MIN_POSES, calibrate_hand_eye
 from .homography import board_on_table, fit_homography, plane_homography
 from .human import Terminal
 from .json_file import write_json
@@ -35,7 +42,7 @@ from .safety import SafeRobot
 from .safety_limits import SafetyLimits
 from .table_plane import TablePlane, fit_table_plane
 from .top_down_view import TopDownView
-from .touch_off import touch_off
+from .touch_off import close_fingers, touch_off
 
 __all__ = ["measure_camera", "measure_hand_eye", "measure_lens", "measure_table",
            "photograph_empty", "print_board"]  # fmt: skip
@@ -68,6 +75,7 @@ def measure_lens(
         InputError: too few good views, or stopped
         CameraError: the device cannot be opened
     """
+    _check_views(views, MIN_VIEWS)
     operator = operator or Terminal()
     rough = CameraIntrinsics(
         size,
@@ -161,7 +169,8 @@ def measure_camera(
 ) -> dict[str, Any]:
     """Find the board on the table and the arm's touches of its corners; fit and save.
 
-    The arm goes home for the picture. Then a person guides the closed fingertips onto each corner.
+    The arm goes home for the picture and closes its fingers. Then a person guides their tips onto
+    each corner.
 
     Raises:
         InputError: the board is not seen, or the fit is worse than 3 mm
@@ -171,9 +180,13 @@ def measure_camera(
     table = read_table(config.setup / "table.json")
     lens = _lens(config)
     with robot or _arm(config, table) as arm:
-        if not operator.wait("lay the board flat into the workspace; the arm then goes home"):
-            raise InputError("stopped; nothing was written")
-        arm.home()
+        _wait(
+            operator,
+            "lay the board flat into the workspace, nothing between the fingers; the arm then goes "
+            "home and closes them",
+        )
+        until_cleared(arm, operator, arm.home)
+        close_fingers(arm)
         with camera or open_camera(config, lens) as device:
             frame = device.read()
         corners = find_corners(frame.rgb, board)
@@ -182,9 +195,7 @@ def measure_camera(
             raise InputError(f"corners {hidden} are not seen; choose others with --corners")
         touched = []
         for corner in corner_ids:
-            text = f"guide the closed fingertips onto corner {corner} of the board"
-            if not operator.wait(text):
-                raise InputError("stopped; nothing was written")
+            _wait(operator, f"guide the closed fingertips onto corner {corner} of the board")
             touched.append(arm.state().base_T_tcp[:2, 3])
     on_table = board_on_table(corners, board, np.array(corner_ids), np.array(touched))
     fit = fit_homography(corners.pixels, on_table, frame.intrinsics)
@@ -218,9 +229,10 @@ def measure_hand_eye(
     in the camera's picture from there follows from its height.
 
     Raises:
-        InputError: stopped, or the board does not stand still to 4 mm rms
+        InputError: too few views, stopped, or the board does not stand still to 3 mm rms
         RobotError, CameraError: robot or camera fail
     """
+    _check_views(views, MIN_POSES)
     operator = operator or Terminal()
     table = read_table(config.setup / "table.json")
     lens = _lens(config)
@@ -246,9 +258,9 @@ def measure_hand_eye(
             hands.append(arm.state().base_T_tcp)
             seen.append(found)
         hand_eye = calibrate_hand_eye(np.array(hands), np.array(seen))
-        if not operator.wait("the arm now goes home"):
-            raise InputError("stopped; nothing was written")
-        arm.home()
+        _wait(operator, "release the user stop; the arm then goes home")
+        # What a person has guided and looked through must not be lost to a stop still pressed.
+        until_cleared(arm, operator, arm.home)
         base_T_camera = arm.state().base_T_tcp @ hand_eye.tcp_T_camera
         intrinsics = device.read().intrinsics
     calibration = _calibration(
@@ -282,6 +294,11 @@ def photograph_empty(config: RigConfig) -> dict[str, Any]:
     path = config.setup / "empty_view.png"
     write_picture(path, view)
     return {"empty": path}
+
+
+def _check_views(views: int, least: int) -> None:
+    if views < least:
+        raise InputError(f"--views is {views}; {least} are needed, 15 are better")
 
 
 def _wait(operator: Terminal, text: str) -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from board_photographs import BOARD, INTRINSICS, TABLE, photograph, rotation, transform
-from safety_spy import ARM, HOME, SpyRobot
+from safety_spy import ARM, HOME, SpyRobot, joints_at, pose
 from test_calibration_file import TouchedTable
 
+from hardware import GraspError, RobotMode
 from hardware.calibration import Calibration
 from hardware.camera import Frame
 from hardware.homography import plane_homography
@@ -19,12 +21,18 @@ from hardware.rig import read_table
 from hardware.rig_config import RigConfig
 from hardware.safety import SafeRobot
 from hardware.safety_limits import SafetyLimits
-from hardware.setting_up import measure_hand_eye, measure_table
+from hardware.setting_up import measure_camera, measure_hand_eye, measure_lens, measure_table
 from hardware.table_plane import TablePlane
 from warp_deform.errors import InputError
 
 TCP_T_CAMERA = transform(rotation(0.02, -0.03, 0.05), [0.05, 0.0, -0.06])
 VIEWS = 10
+
+
+BASE_T_BOARD = transform(
+    rotation(np.pi, 0, 0),
+    (ARM.pose(HOME) @ TCP_T_CAMERA)[:3, 3] * [1, 1, 0] + [-0.08, 0.06, TABLE.height_m],
+)
 
 
 class GuidedRobot(SpyRobot):
@@ -40,12 +48,10 @@ class HandCamera:
 
     def __init__(self, robot: SpyRobot, rng: np.random.Generator) -> None:
         self.robot, self.rng = robot, rng
-        x, y, _ = (ARM.pose(HOME) @ TCP_T_CAMERA)[:3, 3]
-        self.base_T_board = transform(rotation(np.pi, 0, 0), [x - 0.08, y + 0.06, TABLE.height_m])
 
     def read(self) -> Frame:
         camera = self.robot.state().base_T_tcp @ TCP_T_CAMERA
-        rgb = photograph(self.rng, np.linalg.inv(camera) @ self.base_T_board)
+        rgb = photograph(self.rng, np.linalg.inv(camera) @ BASE_T_BOARD)
         return Frame(rgb, None, INTRINSICS, 0.0)
 
     def close(self) -> None:
@@ -72,21 +78,26 @@ def setup(folder: Path) -> RigConfig:
     return RigConfig(setup=folder, camera="realsense")
 
 
-def test_a_camera_on_the_hand_is_found(tmp_path: Path) -> None:
+def test_a_camera_on_the_hand_is_found_by_someone_who_forgets_the_user_stop(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     robot = GuidedRobot()
     said: list[str] = []
 
     def guide(text: str) -> str:
         said.append(text)
-        robot.guide(rng)
+        if "user stop" not in text:
+            robot.guide(rng)
+        pressed = len(said) < 2 or "release the user stop" not in said[-2]
+        robot.mode = RobotMode.USER_STOPPED if pressed else RobotMode.IDLE
         return ""
 
     found = measure_hand_eye(
         setup(tmp_path), BOARD, views=VIEWS, camera=HandCamera(robot, rng),
         robot=SafeRobot(robot, SafetyLimits(table=TABLE)), operator=Terminal(guide),
     )  # fmt: skip
-    assert len(said) >= VIEWS + 1 and "home" in said[-1] and robot.log.count("move_joints") == 1
+    assert len(said) >= VIEWS + 2 and robot.log.count("move_joints") == 1
+    assert "release the user stop; the arm then goes home" in said[-2]
+    assert "the user stop is pressed" in said[-1]
     calibration = Calibration.load(tmp_path / "calibration.json")
     assert calibration.method == "hand-eye" and found["error_m"] < 1e-3
     H = plane_homography(INTRINSICS, ARM.pose(HOME) @ TCP_T_CAMERA, TABLE)
@@ -94,6 +105,50 @@ def test_a_camera_on_the_hand_is_found(tmp_path: Path) -> None:
     at = [np.column_stack([pixels, np.ones(5)]) @ each.T for each in (calibration.base_H_pixel, H)]
     mine, true = (each[:, :2] / each[:, 2:] for each in at)
     assert np.linalg.norm(mine - true, axis=1).max() < 1.5e-3
+
+
+def test_too_few_views_are_refused_before_the_first(tmp_path: Path) -> None:
+    def never(text: str) -> str:
+        raise AssertionError(text)
+
+    for measure in (measure_hand_eye, measure_lens):
+        with pytest.raises(InputError, match="--views is 7; 8 are needed"):
+            measure(RigConfig(setup=tmp_path), BOARD, views=7, operator=Terminal(never))
+
+
+class TouchingRobot(SpyRobot):
+    """An arm whose closed fingertips a person guides onto the board's corners."""
+
+    def __init__(self, *, object_width: float) -> None:
+        super().__init__(object_width=object_width)
+        self.asked: list[str] = []
+
+    def answer(self, text: str) -> str:
+        self.asked.append(text)
+        if "corner" in text:
+            assert self.width < 1e-3 and self.log == ["recover", "move_joints", "grasp"]
+            corner = BOARD.corners_m[int(text.split("corner ")[1].split()[0])]
+            x, y, _ = BASE_T_BOARD[:3, :3] @ corner + BASE_T_BOARD[:3, 3]
+            self.q = joints_at(pose(x, y, 0.35))
+        return ""
+
+
+def test_the_board_s_corners_are_touched_with_closed_fingers(tmp_path: Path) -> None:
+    config = setup(tmp_path)
+    for width in (0.01, 0.0):
+        robot = TouchingRobot(object_width=width)
+        camera = HandCamera(robot, np.random.default_rng(0))
+        measure = functools.partial(
+            measure_camera, config, BOARD, corner_ids=(0, 5, 18, 23), camera=camera,
+            robot=SafeRobot(robot, SafetyLimits(table=TABLE)), operator=Terminal(robot.answer),
+        )  # fmt: skip
+        if width:
+            with pytest.raises(GraspError, match="not closed; take out"):
+                measure()
+            assert len(robot.asked) == 1 and not (tmp_path / "calibration.json").exists()
+        else:
+            assert measure()["error_m"] < 1.5e-3 and len(robot.asked) == 5
+    assert Calibration.load(tmp_path / "calibration.json").method == "charuco"
 
 
 def test_stopping_writes_nothing(tmp_path: Path) -> None:
