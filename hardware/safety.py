@@ -207,6 +207,12 @@ class SafeRobot:
         kept = points[int(np.argmin(outside.any(axis=1))) :]
         self.move_joints(kept, speed=speed or self.limits.max_joint_speed)
 
+    def stands_at(self, q: np.ndarray) -> bool:
+        """Whether the TCP is where joint positions q (7,) [rad] put it, as near as an arrival."""
+        off, turned = distance(self.state().base_T_tcp, self._arm.pose(np.asarray(q)))
+        limits = self.limits
+        return off <= limits.arrival_tolerance_m and turned <= limits.arrival_tolerance_rad
+
     # The gripper.
 
     def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:

@@ -8,7 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +49,7 @@ from hardware.episode import (
     run_episode,
 )
 from hardware.human import Terminal
+from hardware.panda_arm import HOME_Q
 from hardware.pick_place import PickPlaceAction
 from hardware.recording import Recording
 from hardware.replaying import replay_recording
@@ -88,13 +89,14 @@ def episode(
     *,
     where: Callable[[], float] = lambda: 0.45,
     operator: object = None,
+    home_q: Sequence[float] = HOME_Q,
     **settings: object,
 ) -> tuple[EpisodeResult, Listed]:
     chooser = Listed(actions)
     with recorder(folder) as made, drawn_camera(where) as camera:
         result = run_episode(
-            SafeRobot(arm, LIMITS), camera, CALIBRATION, chooser, recorder=made, goal=GOAL,
-            config=EpisodeConfig(**settings), operator=operator,
+            SafeRobot(arm, LIMITS, home_q=home_q), camera, CALIBRATION, chooser, recorder=made,
+            goal=GOAL, config=EpisodeConfig(**settings), operator=operator,
         )  # fmt: skip
     return result, chooser
 

@@ -11,6 +11,8 @@ from test_episode import Arm, Person, episode
 
 from hardware import MotionError, ReflexError, RobotMode, RobotState, UserStopped
 from hardware.operators import Answer
+from hardware.panda_arm import HOME_Q
+from warp_deform.errors import InputError
 
 REFLEX = ReflexError("met something", reflexes=("cartesian_reflex",))
 
@@ -76,6 +78,37 @@ def test_only_recoveries_without_an_operator_count(tmp_path: Path) -> None:
         max_actions=many,
     )  # fmt: skip
     assert result.error is None and result.outcomes == ("aborted",) * many
+
+
+class RoughArm(Arm):
+    """Ends a motion to the home pose off by the next of `misses` [rad] in joint 7."""
+
+    misses: tuple[float, ...] = ()
+
+    def move_joints(self, q: np.ndarray, *, speed: float) -> None:
+        super().move_joints(q, speed=speed)
+        miss, *self.misses = self.misses or (0.0,)
+        self._q[6] += miss
+
+
+@pytest.mark.parametrize(
+    ("misses", "homed"),
+    [((0.0,), 1), ((0.004,), 1), ((0.004, 0.004), 1), ((0.02, 0.0), 2), ((0.02, 0.02), 2)],
+)
+def test_an_arm_that_arrives_roughly_is_sent_home_once_more(
+    tmp_path: Path, misses: tuple[float, ...], homed: int
+) -> None:
+    """What counts as an arrival is at home, even where the second motion misses as well."""
+    arm = RoughArm()
+    arm.misses = misses
+    result, _ = episode(tmp_path / "a", arm, [ACTION], max_actions=1)
+    assert result.outcome == "limit" and arm.count("move_joints") == homed
+
+
+def test_another_home_pose_than_the_calibration_s_is_refused(tmp_path: Path) -> None:
+    home = np.add(HOME_Q, [0.0, 0.0, 0.0, 0.1, 0.0, 0.1, 0.0])
+    with pytest.raises(InputError, match="home pose of the calibration"):
+        episode(tmp_path / "a", Arm(), [ACTION], home_q=home)
 
 
 def test_who_gives_up_is_not_asked_again(tmp_path: Path) -> None:
