@@ -221,6 +221,7 @@ def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> Episo
     from .goal_file import write_picture
     from .human import Terminal
     from .recorder import EpisodeRecorder, RecorderConfig
+    from .revision import software_revision
 
     config = options.rig()
     actions = options.max_actions
@@ -245,6 +246,7 @@ def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> Episo
             "policy": None if options.policy is None else str(options.policy),
         },
         note=options.note,
+        revision=software_revision(),
     )
     mask = None if goal is None else goal.mask
     with EpisodeRecorder(folder, described, goal_mask=mask) as recorder:

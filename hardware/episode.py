@@ -324,18 +324,26 @@ class _Episode:
         return Plan(action, poses, overlay, seen.index + 1, self.recorder.show(overlay))
 
     def _do(self, action: PickPlaceAction) -> None:
+        view, config = self.config.view, self.config.pick_place
+        pick, place = (
+            tuple(view.base_to_pixel(np.array(xy)).tolist())
+            for xy in (action.pick_xy, action.place_xy)
+        )
+        self.recorder.plan(action, self._lift(action), pick_pixel=pick, place_pixel=place)
         try:
-            result = execute(self.robot, action, self.config.pick_place)
+            result = execute(self.robot, action, config)
         except MotionError as problem:
             self.say(f"action {len(self.outcomes) + 1}: {problem}")
             result = self._recovered(action, problem)
-        pick, place = (
-            tuple(self.config.view.base_to_pixel(np.array(xy)).tolist())
-            for xy in (action.pick_xy, action.place_xy)
-        )
         self.recorder.act(action, result, pick_pixel=pick, place_pixel=place)
         self.outcomes.append(result.outcome)
         self.say(f"action {len(self.outcomes)}: {result.outcome}")
+
+    def _lift(self, action: PickPlaceAction) -> float:
+        """The height at which an action carries [m]."""
+        limits = self.robot.limits
+        planned = way_points(action, limits.table, self.config.pick_place)
+        return float(limits.height(planned["lift"]))
 
     def _recovered(self, action: PickPlaceAction, problem: MotionError) -> PickPlaceResult:
         """Recover the arm, let go and go home; what became of the cable shows the next picture."""
@@ -347,10 +355,9 @@ class _Episode:
             robot.home()
 
         until_cleared(robot, self.operator, let_go, problem=problem)
-        planned = way_points(action, robot.limits.table, config)
-        height = float(robot.limits.height(planned["lift"]))
-        outcome = PickPlaceOutcome.ABORTED
-        return PickPlaceResult(outcome, planned["grasp"], None, None, None, height, force)
+        grasp = way_points(action, robot.limits.table, config)["grasp"]
+        lift, outcome = self._lift(action), PickPlaceOutcome.ABORTED
+        return PickPlaceResult(outcome, grasp, None, None, None, lift, force)
 
 
 def _solved(mask: np.ndarray, goal: np.ndarray) -> bool:

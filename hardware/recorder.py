@@ -6,12 +6,13 @@ folder and says what is in it.
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import os
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -80,6 +81,7 @@ class EpisodeRecorder:
         self._observations = self._actions = 0
         self._start = time.monotonic()
         self._writing = threading.Lock()
+        self._broken: InputError | None = None
         try:
             (folder / "frames").mkdir(parents=True)
         except FileExistsError as error:
@@ -153,6 +155,25 @@ class EpisodeRecorder:
         write_whole(path, _png(_bgr(overlay)))
         return path
 
+    def plan(
+        self,
+        action: PickPlaceAction,
+        lift_m: float,
+        *,
+        pick_pixel: tuple[float, float] | None = None,
+        place_pixel: tuple[float, float] | None = None,
+    ) -> None:
+        """Record an action that is about to begin: one that an error ends has no other line.
+
+        Args:
+            lift_m: height of carrying [m]
+            pick_pixel, place_pixel: row and column in the view, where they were chosen there
+        """
+        if self._observations != self._actions + 1:
+            raise InputError("a plan follows an observation; record the observation first")
+        row = {"kind": "plan", "index": self._actions, "action": _numbers(action, lift_m)}
+        self._append(self._steps, {**row, "pick_pixel": pick_pixel, "place_pixel": place_pixel})
+
     def act(
         self,
         action: PickPlaceAction,
@@ -174,13 +195,7 @@ class EpisodeRecorder:
             {
                 "kind": "action",
                 "index": self._actions,
-                "action": [
-                    *action.pick_xy,
-                    action.pick_yaw,
-                    *action.place_xy,
-                    action.place_yaw,
-                    result.lift_m,
-                ],
+                "action": _numbers(action, result.lift_m),
                 "pick_pixel": pick_pixel,
                 "place_pixel": place_pixel,
                 "pick_xyz": result.base_T_pick[:3, 3].tolist(),
@@ -194,35 +209,46 @@ class EpisodeRecorder:
         self._actions += 1
 
     def log_robot(self, state: RobotState) -> None:
-        """Record a reading of the robot; from any thread."""
-        self._append(
-            self._robot,
-            {
-                "q": state.q.tolist(),
-                "base_T_tcp": state.base_T_tcp.tolist(),
-                "force_N": state.force_N.tolist(),
-                "gripper_width_m": state.gripper_width_m,
-                "mode": str(state.mode),
-            },
-            sync=False,
-        )
+        """Record a reading of the robot; from any thread.
 
-    @contextmanager
+        Raises:
+            ValueError: a number that is none
+            InputError: the file cannot be written
+        """
+        self._append(self._robot, _reading(state), sync=False)
+
+    @contextlib.contextmanager
     def following(self, robot: Robot | SafeRobot, *, rate_hz: float = 10.0) -> Iterator[None]:
-        """Record the robot's readings at about `rate_hz` from another thread while inside.
+        """Record the robot's readings `rate_hz` times a second from another thread while inside.
 
-        A reading that fails is recorded as such; the thread that moves the robot gets the error.
+        Where a reading takes longer, moments are left out. A reading that fails is recorded as
+        such; the thread that moves the robot gets the error.
+
+        Raises:
+            InputError: a rate that is none; or the readings could not be written, which `observe`,
+                `plan` and `act` raise, too
         """
         if not 0.0 < rate_hz <= 100.0:
             raise InputError(f"rate_hz: above 0, at most 100 Hz, not {rate_hz}")
         ended = threading.Event()
+        period = 1.0 / rate_hz
 
         def follow() -> None:
-            while not ended.wait(1.0 / rate_hz):
+            due = time.monotonic()
+            while True:
+                due += period * max(1, math.ceil((time.monotonic() - due) / period))
+                if ended.wait(due - time.monotonic()):
+                    return
                 try:
-                    self.log_robot(robot.state())
+                    row = _reading(robot.state())
+                    json.dumps(row, allow_nan=False)
                 except (RobotError, ValueError) as error:  # ValueError: a force that is no number
-                    self._append(self._robot, {"error": str(error)}, sync=False)
+                    row = {"error": str(error)}
+                try:
+                    self._append(self._robot, row, sync=False)
+                except InputError as error:
+                    self._broken = error  # the thread that records the steps raises it
+                    return
 
         thread = threading.Thread(target=follow, daemon=True)
         thread.start()
@@ -231,6 +257,8 @@ class EpisodeRecorder:
         finally:
             ended.set()
             thread.join(timeout=5.0)
+        if self._broken is not None:
+            raise self._broken
 
     def finish(self, outcome: str) -> None:
         """Record how the episode ended: "success", "limit", "stopped", "error: ...", and close."""
@@ -239,13 +267,24 @@ class EpisodeRecorder:
         self.close()
 
     def close(self) -> None:
-        """Close the files; the outcome stays open where `finish` was not called."""
+        """Close the files; the outcome stays open where `finish` was not called.
+
+        Raises:
+            InputError: what was still to be written cannot be
+        """
+        failed: InputError | None = None
         with self._writing:
             for file in (self._steps, self._robot):
-                if not file.closed:
-                    file.flush()
-                    os.fsync(file.fileno())
+                try:
+                    if not file.closed:
+                        file.flush()
+                        os.fsync(file.fileno())
+                except OSError as error:
+                    failed = _full(file, error)
+                with contextlib.suppress(OSError):  # of the flush that it tries again
                     file.close()
+        if failed is not None:
+            raise failed
 
     def __enter__(self) -> EpisodeRecorder:
         return self
@@ -256,26 +295,54 @@ class EpisodeRecorder:
         value: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if value is not None and self._meta["outcome"] is None:
-            self.finish(f"error: {type(value).__name__}: {' '.join(str(value).split())}")
-        self.close()
+        try:
+            if value is not None and self._meta["outcome"] is None:
+                self.finish(f"error: {type(value).__name__}: {' '.join(str(value).split())}")
+        finally:
+            self.close()
 
     def _append(self, file: BinaryIO, row: dict[str, Any], *, sync: bool = True) -> None:
         row = {**row, "t": time.monotonic() - self._start}
         line = json.dumps(row, allow_nan=False).encode() + b"\n"
+        if self._broken is not None:
+            raise self._broken
         with self._writing:
             if file.closed:
                 return  # a last reading that came after the end
-            file.write(line)
-            file.flush()
-            if sync:
-                os.fsync(file.fileno())
+            try:
+                file.write(line)
+                file.flush()
+                if sync:
+                    os.fsync(file.fileno())
+            except OSError as error:
+                raise _full(file, error) from error
 
     @staticmethod
     def _write_mask(path: Path, mask: np.ndarray) -> None:
         if mask.ndim != 2 or mask.dtype != bool:
             raise InputError(f"a mask is (H, W) bool, not {mask.shape} {mask.dtype}")
         _write_png(path, np.where(mask, 255, 0).astype(np.uint8))
+
+
+def _numbers(action: PickPlaceAction, lift_m: float) -> list[float]:
+    """The action as the dataset's seven numbers."""
+    return [*action.pick_xy, action.pick_yaw, *action.place_xy, action.place_yaw, lift_m]
+
+
+def _reading(state: RobotState) -> dict[str, Any]:
+    return {
+        "q": state.q.tolist(),
+        "base_T_tcp": state.base_T_tcp.tolist(),
+        "force_N": state.force_N.tolist(),
+        "gripper_width_m": state.gripper_width_m,
+        "mode": str(state.mode),
+    }
+
+
+def _full(file: BinaryIO, error: OSError) -> InputError:
+    return InputError(
+        f"{file.name} cannot be written: {error.strerror}; make room there, or record elsewhere"
+    )
 
 
 def _named(stem: Path, name: str) -> Path:
@@ -293,11 +360,7 @@ def _bgr(rgb: np.ndarray) -> np.ndarray:
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
-    data = _png(image)
-    with path.open("xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    write_whole(path, _png(image))
 
 
 def _png(image: np.ndarray) -> bytes:

@@ -1,9 +1,10 @@
 """Reading a recorded episode, also one whose recorder was killed.
 
 A folder holds `episode.json` (what was known at the start, and the outcome), `steps.jsonl` (a line
-for each observation and each finished action), `robot.jsonl` (readings of the robot), and `frames`.
-A line is written only when the files it names are on the disk, so what the lines tell is there. A
-killed recorder leaves at most a last line without an end, which is left out.
+for each observation, each action before it begins, its plan, and each finished action),
+`robot.jsonl` (readings of the robot), and `frames`. A line is written only when the files it names
+are on the disk, so what the lines tell is there. A killed recorder leaves at most a last line
+without an end, which is left out.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ class Recording:
         meta: the contents of `episode.json`
         observations: a record for each picture, in order
         actions: a record for each finished action; action i was taken on observation i
+        plans: a record for each action that was begun, of recordings that have them
         robot: readings of the robot
         warnings: what is missing at the end, a line each
     """
@@ -44,6 +46,7 @@ class Recording:
     meta: dict[str, Any]
     observations: tuple[dict[str, Any], ...]
     actions: tuple[dict[str, Any], ...]
+    plans: tuple[dict[str, Any], ...]
     robot: tuple[dict[str, Any], ...]
     warnings: tuple[str, ...]
 
@@ -62,20 +65,37 @@ class Recording:
             warnings.append("the episode was not finished: no outcome was recorded")
         observations: list[dict[str, Any]] = []
         actions: list[dict[str, Any]] = []
+        plans: list[dict[str, Any]] = []
+        kinds = {"observation": observations, "action": actions, "plan": plans}
+        before = ""
         for number, step in enumerate(steps, start=1):
             what = f"{folder / 'steps.jsonl'}, line {number}"
-            rows = {"observation": observations, "action": actions}.get(str(step.get("kind")))
+            kind = str(step.get("kind"))
+            rows = kinds.get(kind)
             if rows is None:
                 raise InputError(f"{what}: kind {step.get('kind')!r} is unknown")
-            # Observation, action, observation, ...: each action belongs to the one before it.
-            if (len(observations) - len(actions)) != (0 if rows is observations else 1):
-                raise InputError(f"{what}: two {step['kind']}s in a row; lines are missing")
-            if require(step, "index", int, what=what) != len(rows):
-                raise InputError(f"{what}: index {step['index']}, expected {len(rows)}")
+            # Observation, plan, action, observation, ...: all three belong to the first of them.
+            seen = len(observations) - len(actions)
+            if kind == before or seen != (0 if rows is observations else 1):
+                raise InputError(f"{what}: two {kind}s in a row; lines are missing")
+            due = len(observations if rows is observations else actions)
+            if require(step, "index", int, what=what) != due:
+                raise InputError(f"{what}: index {step['index']}, expected {due}")
             rows.append(step)
+            before = kind
+        if before == "plan":
+            warnings.append(f"action {len(actions) + 1} was begun, and did not end")
         if not observations:
             raise InputError(f"{folder} was killed before its first picture; delete it")
-        return cls(folder, meta, tuple(observations), tuple(actions), tuple(robot), tuple(warnings))
+        return cls(
+            folder,
+            meta,
+            tuple(observations),
+            tuple(actions),
+            tuple(plans),
+            tuple(robot),
+            tuple(warnings),
+        )
 
     def mask(self, index: int) -> np.ndarray:
         """Return the cable's mask of an observation, (H, W) bool."""

@@ -29,7 +29,7 @@ class Replay:
 
     Attributes:
         rows: a record an observation: index, recorded overlap, overlap now, whether the masks are
-            the same, and the outcome of the action that followed
+            the same, the action that followed, and its outcome; None where it did not end
         actions: finished actions
         mismatches: observations whose mask is another now
         outcome: recorded; None where the recorder was killed
@@ -61,11 +61,13 @@ def replay_recording(folder: Path) -> Replay:
     )
     goal = recording.goal_mask()
     camera = FileCamera(folder / "frames", calibration.intrinsics)
+    planned = {plan["index"]: plan for plan in recording.plans}
     rows = []
     for index, seen in enumerate(recording.observations):
         picture = view.rectify(camera.read().rgb, calibration)
         mask = segment_cable(picture, config=segmentation, empty=empty)
         done = recording.actions[index] if index < len(recording.actions) else {}
+        begun = done or planned.get(index, {})
         rows.append(
             {
                 "index": index,
@@ -73,7 +75,7 @@ def replay_recording(folder: Path) -> Replay:
                 "iou_now": None if goal is None else mask_iou(mask, goal),
                 "same_mask": bool(np.array_equal(mask, recording.mask(index))),
                 "outcome": done.get("outcome"),
-                "action": done.get("action"),
+                "action": begun.get("action"),
             }
         )
     return Replay(

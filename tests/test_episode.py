@@ -177,7 +177,10 @@ def test_with_nobody_there_other_errors_stop_the_arm(
     result, _ = episode(tmp_path / "a", arm, [ACTION] * 2)
     assert result.error is error and result.outcomes == ()
     assert arm.count("stop") == (0 if isinstance(error, ConnectionLost) else 1)
-    assert score_recording(tmp_path / "a").success is False
+    score = score_recording(tmp_path / "a")
+    assert score.success is False and score.warnings == ("action 1 was begun, and did not end",)
+    (row,) = replay_recording(tmp_path / "a").rows
+    assert row["action"][:2] == list(ACTION.pick_xy) and row["outcome"] is None
 
 
 class Person(Unattended):

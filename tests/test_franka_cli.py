@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from hardware import RobotError
 from hardware.camera import CameraError
 from hardware.goal_file import read_goal, sampled_goal, write_goal
 from hardware.look_server import LookServer, remote_look
+from hardware.revision import software_revision
 from hardware.top_down_view import TopDownView
 from hardware.twin import TwinLook
 from warp_deform.cli import main
@@ -42,8 +45,22 @@ def test_a_dry_run_needs_nothing_and_moves_nothing(
     assert data["folder"] == "franka-episodes/0000" and "dry run: move_linear" in said
     meta = json.loads(Path("franka-episodes/0000/episode.json").read_text())
     assert (meta["robot_id"], meta["camera_id"]) == ("panda 10.0.0.1", "sim")
+    assert meta["revision"] == software_revision()
     code, data, _ = run(capfd, "score", "franka-episodes/0000")
     assert code == 0 and data["n_episodes"] == 1
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="reads a checkout")
+def test_the_revision_is_that_of_a_checkout(tmp_path: Path) -> None:
+    assert software_revision(tmp_path) == ""
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    (tmp_path / "file").write_text("1")
+    for words in (["init", "-q"], ["add", "file"], ["commit", "-q", "-m", "first"]):
+        subprocess.run([*git, *words], check=True)
+    revision = software_revision(tmp_path)
+    assert re.fullmatch("[0-9a-f]{40}", revision)
+    (tmp_path / "file").write_text("2")
+    assert software_revision(tmp_path) == f"{revision}-dirty"
 
 
 def test_a_simulated_episode_is_run_scored_replayed_and_packed(

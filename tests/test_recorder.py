@@ -7,13 +7,16 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from record_until_killed import ACTION, CONFIG, INTRINSICS, frame, mask, observe, result
 
+from hardware import RobotState
 from hardware.backends.dry_run import DryRunRobot
 from hardware.camera import FileCamera
 from hardware.packing import pack
@@ -28,6 +31,7 @@ from warp_deform.tasks.metrics import mask_iou
 TESTS = Path(__file__).resolve().parent
 
 GOAL = mask(0)
+PLANNED = json.dumps({"kind": "plan", "index": 0})
 
 
 def record(
@@ -177,6 +181,8 @@ def test_every_torn_end_can_be_read(tmp_path: Path) -> None:
         (lambda lines: [lines[0], "[]"], "line 2 is no JSON object"),
         (lambda lines: [lines[0].replace('"index": 0', '"index": 3')], "index 3, expected 0"),
         (lambda lines: [lines[0].replace("observation", "dream")], "kind 'dream'"),
+        (lambda lines: [*lines[:1], PLANNED, PLANNED], "two plans in a row"),
+        (lambda lines: [*lines[:3], PLANNED], "index 0, expected 1"),
         (lambda lines: [], "before its first picture"),
     ],
 )
@@ -209,6 +215,8 @@ def test_steps_come_in_turn(tmp_path: Path) -> None:
             recorder.act(ACTION, result())
         with pytest.raises(InputError, match="observation first"):
             recorder.show(np.zeros((4, 4, 3), np.uint8))
+        with pytest.raises(InputError, match="observation first"):
+            recorder.plan(ACTION, 0.05)
         assert observe(recorder, 0, 1) is None
         with pytest.raises(InputError, match="action first"):
             observe(recorder, 1, 1)
@@ -244,6 +252,99 @@ def test_the_robot_is_followed(tmp_path: Path) -> None:
             pass
     rows = Recording.read(tmp_path / "a").robot
     assert len(rows) >= 3 and rows[0]["mode"] == "idle" and len(rows[0]["force_N"]) == 6
+
+
+def test_an_action_that_does_not_end_leaves_its_plan(tmp_path: Path) -> None:
+    with EpisodeRecorder(tmp_path / "a", CONFIG, goal_mask=GOAL) as recorder:
+        for number in range(2):
+            observe(recorder, number, 4 - number)
+            recorder.plan(ACTION, 0.08, pick_pixel=(1.0, 2.0))
+            if number == 0:
+                recorder.act(ACTION, result())
+        recorder.finish("error: MotionError: ended elsewhere")
+    recording = Recording.read(tmp_path / "a")
+    assert len(recording.actions) == 1 and len(recording.plans) == 2
+    assert recording.plans[1]["action"] == recording.actions[0]["action"]
+    assert recording.plans[1]["pick_pixel"] == [1.0, 2.0]
+    assert recording.warnings == ("action 2 was begun, and did not end",)
+    assert score_recording(tmp_path / "a").warnings == recording.warnings
+    episode = pack(tmp_path / "a", seed=0)
+    assert episode.info.actions == 1 and episode.info.extra["actions_after_last_picture"] == 0
+
+
+class Clock:
+    """Time that passes while the robot is read and while the next reading is waited for [s]."""
+
+    def __init__(self, *, reading: float, readings: int) -> None:
+        self.now, self.reading, self.left = 0.0, reading, readings
+        self.done = threading.Event()
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def wait(self, seconds: float) -> bool:
+        """As the event that ends the following does."""
+        self.now += max(seconds, 0.0)
+        self.left -= 1
+        if self.left < 0:
+            self.done.set()
+        return self.left < 0
+
+    def set(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("reading", "apart"), [(0.0, 0.1), (0.04, 0.1), (0.13, 0.2)])
+def test_readings_keep_their_rate_whatever_one_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reading: float, apart: float
+) -> None:
+    clock = Clock(reading=reading, readings=6)
+
+    class Slow(DryRunRobot):
+        def state(self) -> RobotState:
+            clock.now += clock.reading
+            return super().state()
+
+    with EpisodeRecorder(tmp_path / "a", CONFIG) as recorder:
+        observe(recorder, 0, 1)
+        monkeypatch.setattr("hardware.recorder.time", clock)
+        names = SimpleNamespace(Event=lambda: clock, Thread=threading.Thread)
+        monkeypatch.setattr("hardware.recorder.threading", names)
+        recorder._start = 0.0
+        with recorder.following(Slow()):
+            assert clock.done.wait(30.0)
+        monkeypatch.undo()
+        recorder.finish("limit")
+    times = [row["t"] for row in Recording.read(tmp_path / "a").robot]
+    np.testing.assert_allclose(np.diff(times), apart, atol=1e-9)
+    assert len(times) == 6
+
+
+def test_a_full_disk_is_said(tmp_path: Path) -> None:
+    with (
+        Path("/dev/full").open("wb") as full,
+        pytest.raises(InputError, match="No space left on device; make room"),
+        EpisodeRecorder(tmp_path / "a", CONFIG) as recorder,
+    ):
+        observe(recorder, 0, 1)
+        recorder._robot.close()
+        recorder._robot = full
+        with recorder.following(DryRunRobot(), rate_hz=100.0):
+            for _ in range(3000):
+                if recorder._broken is not None:
+                    break
+                time.sleep(0.01)
+            with pytest.raises(InputError, match="No space left"):
+                recorder.plan(ACTION, 0.05)
+    with (
+        Path("/dev/full").open("wb") as full,
+        pytest.raises(InputError, match="No space left on device; make room"),
+        EpisodeRecorder(tmp_path / "b", CONFIG) as recorder,
+    ):
+        recorder._steps.close()
+        recorder._steps = full
+        observe(recorder, 0, 1)
+    assert json.loads((tmp_path / "b" / "episode.json").read_text())["outcome"].startswith("error")
 
 
 @pytest.mark.parametrize("images", ["mask", "view"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -69,3 +70,20 @@ def test_a_calibration_is_of_one_robot_and_one_camera(
     )
     with pytest.raises(InputError, match=message) if message else contextlib.nullcontext():
         assert read_calibration(replace(config, **change)).camera_id == "uvc"
+
+
+def test_a_picture_is_written_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill or a full disk in the middle leaves the goal or the empty foam that was there."""
+    path = tmp_path / "goal.png"
+    write_picture(path, np.zeros((4, 4, 3), np.uint8))
+    before = path.read_bytes()
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_picture(path, np.full((4, 4, 3), 255, np.uint8))
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
