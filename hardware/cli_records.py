@@ -32,8 +32,14 @@ def score(options: ScoreOptions) -> Outcome:
         raise InputError("no episode is named; name folders that `franka run` recorded")
     rows: list[dict[str, Any]] = []
     lines = []
+    failed: list[dict[str, Any]] = []
     for folder in options.episodes:
-        found = score_recording(folder)
+        try:
+            found = score_recording(folder)
+        except InputError as error:
+            failed.append({"folder": folder, "error": str(error)})
+            lines.append(f"{folder}  not scored: {error}")
+            continue
         rows.append(
             {
                 "folder": folder,
@@ -54,11 +60,16 @@ def score(options: ScoreOptions) -> Outcome:
         "episodes": rows,
         "n_episodes": len(rows),
         "n_success": len(won),
+        "failed": failed,
         "mean_actions_solved": mean,
     }
     after = "" if mean is None else f", after {mean:.1f} actions on average"
     lines.append(f"{len(won)} of {len(rows)} episodes succeeded{after}")
-    return Outcome(data=data, text="\n".join(lines))
+    failure = None
+    if failed:
+        count = f"{len(failed)} of {len(options.episodes)} folders cannot be scored"
+        failure = f"{count}; {failed[0]['error']}"
+    return Outcome(data=data, text="\n".join(lines), failure=failure, failure_code=2)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from board_photographs import BOARD
-from franka_episodes import ACTION, CALIBRATION, GOAL, chain
+from franka_episodes import ACTION, CALIBRATION, GOAL, chain, recorder
 from test_episode import Arm, episode
 
 import hardware.robot as robot_module
@@ -80,6 +80,23 @@ def test_a_simulated_episode_is_run_scored_replayed_and_packed(
     code, replayed, _ = run(capfd, "replay", folder, "--video", str(film))
     assert code == 0 and replayed["mismatches"] == 0 and film.stat().st_size > 1000
     assert [row["iou"] for row in replayed["rows"]] == scored["episodes"][0]["iou"]
+
+
+def test_a_folder_without_a_picture_does_not_hide_the_other_scores(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folders = [tmp_path / name for name in "abc"]
+    for folder in (folders[0], folders[2]):
+        episode(folder, Arm(), [ACTION], max_actions=1)
+    recorder(folders[1]).finish("stopped")
+    code, data, said = run(capfd, "score", *map(str, folders))
+    assert code == 2 and "1 of 3 folders cannot be scored" in said
+    assert [row["folder"] for row in data["episodes"]] == [str(folders[0]), str(folders[2])]
+    assert data["n_episodes"] == 2 and data["failed"][0]["folder"] == str(folders[1])
+    assert main(["franka", "score", *map(str, folders)]) == 2
+    lines = capfd.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[:3]] == [str(folder) for folder in folders]
+    assert "before its first picture" in lines[1]
 
 
 def test_a_replay_finds_a_changed_mask(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -72,12 +72,13 @@ class Outcome:
     """What a verb found out: `data` is its JSON object, `text` says the same to people.
 
     `failure`, one line, means that the run did not do what was asked: it goes to stderr and the
-    exit code is 1.
+    exit code is `failure_code`: 1, or 2 where some of the input was wrong.
     """
 
     data: Mapping[str, Any]
     text: str
     failure: str | None = None
+    failure_code: int = 1
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -143,7 +144,9 @@ def _dispatch(arguments: list[str]) -> int:
         json.dumps(outcome.data, allow_nan=False, default=_plain) if options.json else outcome.text
     )
     sys.stdout.flush()
-    return 0 if outcome.failure is None else _complain(outcome.failure, code=1)
+    if outcome.failure is None:
+        return 0
+    return _complain(outcome.failure, code=outcome.failure_code)
 
 
 def _usage() -> str:
