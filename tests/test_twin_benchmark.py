@@ -1,0 +1,103 @@
+"""The benchmark on the twin counts every episode, also one that never began."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+from franka_episodes import CALIBRATION, LIMITS, drawn_camera
+from test_episode import Arm
+
+from hardware.camera import CameraError, Frame
+from hardware.safety import SafeRobot
+from hardware.top_down_view import TopDownView
+from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def twin() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("twin_benchmark", ROOT / "benchmarks" / "twin.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+class Blind:
+    def read(self) -> Frame:
+        raise CameraError("no picture")
+
+
+@contextlib.contextmanager
+def bad_toss(config: object) -> Iterator[None]:
+    raise PhysicsError((Problem(ProblemKind.STRETCH, 0, 2.1, 2.0),))
+    yield
+
+
+@contextlib.contextmanager
+def blind(config: object) -> Iterator[SimpleNamespace]:
+    robot = SafeRobot(Arm(), LIMITS)
+    yield SimpleNamespace(
+        robot=robot, camera=Blind(), calibration=CALIBRATION, view=TopDownView(), look=None
+    )
+
+
+@pytest.mark.parametrize("rig", [bad_toss, blind])
+def test_an_episode_without_a_picture_is_a_failed_one(
+    twin: ModuleType, monkeypatch: pytest.MonkeyPatch, rig: object
+) -> None:
+    monkeypatch.setattr(twin, "open_rig", rig)
+    played = twin.play("random", 0, 0)
+    assert not played.success and played.actions == 10
+    assert (played.outcomes, played.overlaps) == ((), (0.0,))
+    assert "| random | 0 / 1 |" in twin._line("random", [played])
+
+
+def test_an_episode_is_played(twin: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextlib.contextmanager
+    def drawn(config: object) -> Iterator[SimpleNamespace]:
+        with blind(config) as rig, drawn_camera(lambda: 0.45) as camera:
+            rig.camera = camera
+            yield rig
+
+    monkeypatch.setattr(twin, "open_rig", drawn)
+    monkeypatch.setattr(twin, "run_episode", _short(twin.run_episode))
+    played = twin.play("random", 0, 0)
+    assert played.actions == len(played.outcomes) == len(played.overlaps) - 1 == 1
+
+
+def _short(run_episode: object) -> object:
+    from hardware.episode import EpisodeConfig
+
+    return lambda *a, **k: run_episode(*a, **k, config=EpisodeConfig(max_actions=1))
+
+
+def test_mean_actions_are_of_all_and_of_the_solved(twin: ModuleType) -> None:
+    solved = twin.Played("a", 0, 0, True, 4, (), (0.0, 0.3), 2.0)
+    failed = replace(solved, toss=1, success=False, actions=10, overlaps=(0.0, 0.1))
+    line = twin._line("a", [solved, failed])
+    assert "| 1 / 2 |" in line and "| 7.00 ± 4.16 | 4.00 ± 0.00 | 0.20 | 0.3 |" in line
+    assert "| 10.00 ± 0.00 | - |" in twin._line("a", [failed])
+
+
+def test_the_documented_means_are_those_of_the_rows(twin: ModuleType) -> None:
+    rows = [
+        twin.Played(**json.loads(line))
+        for line in (ROOT / "benchmarks" / "results" / "twin.jsonl").read_text().splitlines()
+    ]
+    table = (ROOT / "docs" / "hardware.md").read_text()
+    for agent in ("planner", "policy", "scripted"):
+        cells = twin._line(agent, [row for row in rows if row.agent == agent]).split("|")
+        (documented,) = [line for line in table.splitlines() if line.startswith(f"| `{agent}`")
+                         and "±" in line]  # fmt: skip
+        assert f"|{cells[4]}|{cells[5]}|" in documented
