@@ -38,7 +38,7 @@ from hardware import (
 )
 from hardware.backends.dry_run import DryRunConfig, DryRunRobot
 from hardware.cameras.sim import SimCamera, sim_calibration
-from hardware.choosers import ScriptedChooser
+from hardware.choosers import PolicyChooser
 from hardware.emulator import EmulatorProcess
 from hardware.episode import (
     Answer,
@@ -63,6 +63,7 @@ from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
 
 FAR = PickPlaceAction((0.45, 0.5), 0.0, (0.5, 0.0), 0.0)
 TESTS = Path(__file__).resolve().parent
+POLICY = TESTS.parent / "benchmarks/results/learning/policies/cable-mask-goal-goal-split-500"
 
 
 class Arm(DryRunRobot):
@@ -297,7 +298,7 @@ def test_goal_and_calibration_must_fit(tmp_path: Path) -> None:
 @pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler")
 @pytest.mark.timeout(240)
 def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
-    """Chooser, safety, panda-python, emulator, twin, camera, mask, overlap; recorded and read."""
+    """Policy, safety, panda-python, emulator, twin, camera, mask, overlap; recorded and read."""
     import emulator_client  # noqa: F401  skips where the vendor has no wheels
 
     from hardware.backends.franka_config import NetworkedConfig
@@ -312,7 +313,7 @@ def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
         emulator.call_world("lay", beads=chain(0.45))
         calibration = sim_calibration(config, SMALL)
         camera = SimCamera(look, twin=config, config=SMALL)
-        chooser = ScriptedChooser(look, targets)
+        chooser = PolicyChooser(POLICY)
         with (
             PandaRobot(NetworkedConfig(host=emulator.host)) as panda,
             recorder(tmp_path / "a", goal=goal) as made,
