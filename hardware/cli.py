@@ -217,9 +217,10 @@ def _collect(options: CollectOptions) -> Outcome:
 
 def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> EpisodeResult:
     from .agents import make_chooser
-    from .episode import EpisodeConfig, Unattended, run_episode
+    from .episode import EpisodeConfig, run_episode
     from .goal_file import write_picture
     from .human import Terminal
+    from .operators import Unattended
     from .recorder import EpisodeRecorder, RecorderConfig
     from .revision import software_revision
 

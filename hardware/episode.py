@@ -49,8 +49,7 @@ from .scoring import MAX_ACTIONS, SUCCESS_IOU, EpisodeScore, score_masks
 from .segmentation import SegmentationConfig, SegmentationError, segment_cable
 from .top_down_view import TopDownView
 
-__all__ = ["Answer", "Chooser", "EpisodeConfig", "EpisodeResult", "Observation", "Operator",
-           "Plan", "Unattended", "refusal", "run_episode"]  # fmt: skip
+__all__ = ["Chooser", "EpisodeConfig", "EpisodeResult", "Observation", "refusal", "run_episode"]
 
 # A joint farther than this from home is sent there once more before a picture is taken [rad]: an
 # arrival may miss by 2 degrees, which a camera on the hand sees as a shift of up to 2 cm.

@@ -62,6 +62,10 @@ class MoveResult:
     contact: bool
 
 
+# What clears an error for those at a prompt, and for programs; connecting recovers the arm, too.
+_GO_ON = "then press Enter, or start the command again (in Python: recover())"
+
+
 class RobotError(WarpDeformError):
     """Something went wrong with the robot; the message is one line and ends with what to do.
 
@@ -70,7 +74,7 @@ class RobotError(WarpDeformError):
         advice: what to do about it; default: the class's own
     """
 
-    default_advice = "read the state, clear the cause and call recover()"
+    default_advice = f"look at the arm, clear the cause, {_GO_ON}"
 
     def __init__(self, what: str, *, advice: str | None = None) -> None:
         self.advice = advice or self.default_advice
@@ -122,7 +126,7 @@ class ReflexError(MotionError):
         reflexes: the robot's names for the reasons
     """
 
-    default_advice = "look at the arm, clear the cause, then call recover()"
+    default_advice = f"look at the arm, clear the cause, {_GO_ON}"
 
     def __init__(
         self, what: str, *, reflexes: tuple[str, ...] = (), advice: str | None = None
@@ -141,19 +145,19 @@ def _reflex_advice(reflexes: tuple[str, ...]) -> str | None:
 # By a part of the reflex's name; the first that fits counts.
 REFLEX_ADVICE = {
     "communication_constraints": (
-        "connect the arm directly, use a real-time kernel, close other programs, then recover()"
+        f"connect the arm directly, use a real-time kernel, close other programs, {_GO_ON}"
     ),
-    "position_limits": "guide the arm away from its joint limits by hand, then recover()",
-    "velocity": "move more slowly, then recover()",
-    "discontinuity": "move more slowly, then recover()",
-    "_reflex": "the arm touched something: clear it, then recover()",
+    "position_limits": f"guide the arm away from its joint limits by hand, {_GO_ON}",
+    "velocity": f"move more slowly, {_GO_ON}",
+    "discontinuity": f"move more slowly, {_GO_ON}",
+    "_reflex": f"the arm touched something: clear it, {_GO_ON}",
 }
 
 
 class UserStopped(MotionError):
     """Somebody pressed the user stop (or it was pressed before)."""
 
-    default_advice = "make sure the workspace is clear, release the user stop, then call recover()"
+    default_advice = f"make sure the workspace is clear, release the user stop, {_GO_ON}"
 
 
 class GraspError(RobotError):

@@ -305,7 +305,11 @@ class SafeRobot:
         if state.mode == RobotMode.REFLEX:
             raise ReflexError("the robot stands in a reflex")
         if state.mode != RobotMode.IDLE:
-            raise MotionError(f"the robot is in mode {state.mode.value} and accepts no motion")
+            raise MotionError(
+                f"the robot is in mode {state.mode.value} and accepts no motion",
+                advice="let go of the guiding button, end other programs that have the arm, then "
+                "press Enter, or start the command again",
+            )
         self._checks.check_start(state.base_T_tcp)
         return state
 

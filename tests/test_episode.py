@@ -40,15 +40,9 @@ from hardware.backends.dry_run import DryRunConfig, DryRunRobot
 from hardware.cameras.sim import SimCamera, sim_calibration
 from hardware.choosers import PolicyChooser
 from hardware.emulator import EmulatorProcess
-from hardware.episode import (
-    Answer,
-    EpisodeConfig,
-    EpisodeResult,
-    Plan,
-    Unattended,
-    run_episode,
-)
+from hardware.episode import EpisodeConfig, EpisodeResult, run_episode
 from hardware.human import Terminal
+from hardware.operators import Answer, Plan, Unattended
 from hardware.panda_arm import HOME_Q
 from hardware.pick_place import PickPlaceAction
 from hardware.recording import Recording

@@ -16,6 +16,7 @@ from test_episode import Arm, episode
 
 import hardware.robot as robot_module
 from hardware import RobotError
+from hardware.backends.panda import BUSY
 from hardware.camera import CameraError
 from hardware.goal_file import read_goal, sampled_goal, write_goal
 from hardware.look_server import LookServer, remote_look
@@ -224,5 +225,11 @@ def test_the_documentation_names_every_error_and_says_what_was_not_tried() -> No
     assert len(names) > 9 and [name for name in names if f"`{name}`" not in text] == []
     for name in ("CameraError", "SegmentationError", "InputError", "PhysicsError"):
         assert f"`{name}`" in text
+    begins = ("accepts no motion", "after recovery", "the arm stands beyond", "too near its limit")
+    assert [words for words in (*begins, BUSY) if words not in text] == []
+    pictures = re.findall(r"\(images/([\w.]+)\)", text)
+    assert len(pictures) == 4
+    sizes = [(ROOT / "docs" / "images" / name).stat().st_size for name in pictures[:2]]
+    assert max(sizes) < 60_000
     assert "ever run on a physical robot" in " ".join(text.split())
     assert text.index("## Safety first") < text.index("## What you need")

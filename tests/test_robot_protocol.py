@@ -16,7 +16,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hardware
-from hardware import ReflexError, Robot, RobotError, RobotMode, SafetyViolation, UnreachablePose
+from hardware import (
+    ReflexError,
+    Robot,
+    RobotError,
+    RobotMode,
+    SafetyViolation,
+    UnreachablePose,
+    UserStopped,
+)
 from hardware.backends.bounded import run_bounded
 from hardware.backends.dry_run import DryRunConfig, DryRunRobot, RecordedCommand
 from hardware.backends.libfranka_errors import reflex_names, typed_error
@@ -68,6 +76,12 @@ def test_an_error_is_one_line_that_ends_with_advice(kind: type[RobotError]) -> N
     assert error.advice
     assert str(error) == f"the arm did something; {error.advice}"
     assert str(kind("it broke", advice="mend it")) == "it broke; mend it"
+
+
+def test_advice_for_programs_says_what_to_do_at_the_prompt_too() -> None:
+    kinds = (RobotError, ReflexError, UserStopped)
+    advice = [*(kind.default_advice for kind in kinds), *REFLEX_ADVICE.values()]
+    assert all("press Enter, or start the command again" in text for text in advice)
 
 
 @pytest.mark.parametrize("part", REFLEX_ADVICE)
