@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -76,6 +81,77 @@ def test_the_vendors_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None
     with pytest.raises(BackendMissing, match=r"pip install 'warp-deform\[panda\]'") as caught:
         PandaRobot(NetworkedConfig(host="127.0.79.1"))
     assert says_what_to_do(caught.value)
+
+
+@contextmanager
+def silent(emulator: EmulatorProcess) -> Iterator[None]:
+    """The robot says nothing inside; another process wakes it should ours be frozen for 20 s."""
+    pid = emulator._process.pid
+    waker = subprocess.Popen([sys.executable, "-c", WAKER, str(pid)])
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+        waker.kill()
+        waker.wait()
+
+
+WAKER = "import os, signal, sys, time; time.sleep(20); os.kill(int(sys.argv[1]), signal.SIGCONT)"
+BOUND = 8.0
+"""What a silent robot may cost [s]: it is heard for 1 s, a motion for 5 s; the machine is busy."""
+
+
+def test_a_silent_robot_freezes_nothing() -> None:
+    """The vendor waits for a command's answer with Python's lock held, up to a minute."""
+    with (
+        EmulatorProcess(free_host=True) as emulator,
+        PandaRobot(NetworkedConfig(host=emulator.host)) as robot,
+    ):
+        robot.move_joints(HOME, speed=0.2)
+        for call in (
+            robot.stop,
+            robot.recover,
+            lambda: robot.grasp(width_m=0.01, force_N=10.0),
+        ):
+            with silent(emulator):
+                clock = time.monotonic()
+                with pytest.raises(ConnectionLost) as caught:
+                    call()
+                assert time.monotonic() - clock < BOUND and says_what_to_do(caught.value)
+        robot.recover()  # it is back
+
+
+def test_a_robot_that_falls_silent_in_mid_motion_freezes_nothing() -> None:
+    with (
+        EmulatorProcess(free_host=True) as emulator,
+        PandaRobot(NetworkedConfig(host=emulator.host)) as robot,
+    ):
+        ended: list[Exception] = []
+
+        def move() -> None:
+            try:
+                robot.move_joints(OFF_HOME, speed=0.02)
+            except ConnectionLost as error:
+                ended.append(error)
+
+        motion = threading.Thread(target=move, daemon=True)
+        motion.start()
+        until = time.monotonic() + 20.0
+        while emulator.snapshot()["ticks"] < 500 and time.monotonic() < until:
+            time.sleep(0.005)
+        with silent(emulator):
+            clock = time.monotonic()
+            with pytest.raises(ConnectionLost):
+                robot.stop()
+            assert time.monotonic() - clock < BOUND
+            motion.join(BOUND)
+            assert len(ended) == 1 and says_what_to_do(ended[0])
+            for call in (robot.state, robot.recover, lambda: robot.move_joints(HOME, speed=0.2)):
+                with pytest.raises(ConnectionLost):
+                    call()
+            robot.close()
+            assert time.monotonic() - clock < BOUND
 
 
 KILLED = """

@@ -16,17 +16,26 @@ STOP_TIMEOUT = 3.0
 
 
 def run_bounded(
-    call: Callable[[], T], *, timeout_s: float, stop: Callable[[], None] | None = None
+    call: Callable[[], T],
+    *,
+    timeout_s: float,
+    stop: Callable[[], None] | None = None,
+    watch: Callable[[], None] | None = None,
 ) -> T:
     """Return `call()`, made in another thread and waited for at most `timeout_s`.
 
     On a timeout, and on Ctrl-C, `stop()` is called and the call gets a moment to end; where it does
-    not, or there is no `stop`, its thread is left behind.
+    not, or there is no `stop`, its thread is left behind. Where `watch`, called while waiting,
+    raises an error, the call is given up without `stop`.
+
+    The limit holds for calls that let go of Python's lock while they wait. One that keeps it stops
+    this thread as well, and Ctrl-C, until it returns: whoever makes it has to know that it will. It
+    then counts as ended, however late.
 
     Raises:
         TimeoutError: the call did not end in time
         KeyboardInterrupt: on Ctrl-C, after stopping
-        Exception: whatever the call raises
+        Exception: whatever the call raises, or `watch`
     """
     results: list[T] = []
     errors: list[BaseException] = []
@@ -50,11 +59,12 @@ def run_bounded(
     try:
         threading.Thread(target=run, daemon=True).start()
         while not ended.wait(POLL) and time.monotonic() < deadline:
-            pass
+            if watch is not None:
+                watch()
     except KeyboardInterrupt:
         give_up()
         raise
-    if not ended.is_set():
+    if not ended.wait(POLL):  # a call that kept the lock has only now let this thread look
         give_up()
         raise TimeoutError(f"no answer in {timeout_s:g} s")
     if errors:

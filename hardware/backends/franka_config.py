@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["FrankaConfig", "NetworkedConfig"]
+__all__ = ["RECOVERY_TIMEOUT", "FrankaConfig", "NetworkedConfig"]
+
+RECOVERY_TIMEOUT = 30.0
+"""Longest wait for a recovery [s]; users measured 0.2 to 16 s (franka_ros, issues 308 and 317)."""
 
 
 @dataclass(frozen=True, kw_only=True)
