@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 
@@ -62,8 +62,8 @@ class MoveResult:
     contact: bool
 
 
-# What clears an error for those at a prompt, and for programs; connecting recovers the arm, too.
-_GO_ON = "then press Enter, or start the command again (in Python: recover())"
+RECOVER = "recover: press Enter if asked, else start the command again (from Python: recover())"
+"""What to do once the cause of a stop is cleared: every command that moves recovers first."""
 
 
 class RobotError(WarpDeformError):
@@ -74,7 +74,7 @@ class RobotError(WarpDeformError):
         advice: what to do about it; default: the class's own
     """
 
-    default_advice = f"look at the arm, clear the cause, {_GO_ON}"
+    default_advice = f"clear the cause, then {RECOVER}"
 
     def __init__(self, what: str, *, advice: str | None = None) -> None:
         self.advice = advice or self.default_advice
@@ -126,7 +126,7 @@ class ReflexError(MotionError):
         reflexes: the robot's names for the reasons
     """
 
-    default_advice = f"look at the arm, clear the cause, {_GO_ON}"
+    default_advice = f"look at the arm, clear the cause, then {RECOVER}"
 
     def __init__(
         self, what: str, *, reflexes: tuple[str, ...] = (), advice: str | None = None
@@ -145,19 +145,19 @@ def _reflex_advice(reflexes: tuple[str, ...]) -> str | None:
 # By a part of the reflex's name; the first that fits counts.
 REFLEX_ADVICE = {
     "communication_constraints": (
-        f"connect the arm directly, use a real-time kernel, close other programs, {_GO_ON}"
+        f"connect the arm directly, use a real-time kernel, close other programs, then {RECOVER}"
     ),
-    "position_limits": f"guide the arm away from its joint limits by hand, {_GO_ON}",
-    "velocity": f"move more slowly, {_GO_ON}",
-    "discontinuity": f"move more slowly, {_GO_ON}",
-    "_reflex": f"the arm touched something: clear it, {_GO_ON}",
+    "position_limits": f"guide the arm away from its joint limits by hand, then {RECOVER}",
+    "velocity": f"{RECOVER}, then move more slowly",
+    "discontinuity": f"{RECOVER}, then move more slowly",
+    "_reflex": f"the arm touched something: clear it, then {RECOVER}",
 }
 
 
 class UserStopped(MotionError):
     """Somebody pressed the user stop (or it was pressed before)."""
 
-    default_advice = f"make sure the workspace is clear, release the user stop, {_GO_ON}"
+    default_advice = f"make sure the workspace is clear, release the user stop, then {RECOVER}"
 
 
 class GraspError(RobotError):
@@ -240,7 +240,10 @@ class Robot(Closing, Protocol):
         ...
 
     def recover(self) -> None:
-        """Clear a reflex, so that motions are accepted again; moves nothing.
+        """Have the robot recover from what stopped it, so that it accepts motions; moves nothing.
+
+        Needed after a reflex and after a user stop, also where the state does not show that any
+        more; harmless otherwise.
 
         Raises:
             UserStopped: the user stop is pressed
@@ -251,20 +254,6 @@ class Robot(Closing, Protocol):
 
     def close(self) -> None:
         """End the connection; moves nothing, and may be called twice."""
-        ...
-
-
-@runtime_checkable
-class HomesGripper(Protocol):
-    """A backend whose fingers can find their zero; not every vendor's interface offers that."""
-
-    def home_gripper(self) -> None:
-        """Close and open the fingers to find their zero; needed once after the hand was powered.
-
-        Raises:
-            GraspError: they did not get through
-            ConnectionLost: the gripper does not answer
-        """
         ...
 
 

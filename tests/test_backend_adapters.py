@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
 import numpy as np
@@ -171,14 +171,27 @@ def test_connecting_to_an_fr3_fails_in_two_ways(franky: SimpleNamespace) -> None
         FR3Robot()
 
 
-def test_an_fr3_recovers_from_a_reflex_and_not_from_the_user_stop(franky: SimpleNamespace) -> None:
+def test_an_fr3_recovers_whatever_its_state_says_and_not_from_the_user_stop(
+    franky: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits: list[float] = []
+
+    def spy(call: Callable[[], object], *, timeout_s: float) -> object:
+        limits.append(timeout_s)
+        return call()
+
     robot = FR3Robot()
-    franky.mode = "Reflex"
-    robot.recover()
-    assert robot.state().mode is RobotMode.IDLE
-    franky.mode = "UserStopped"
-    with pytest.raises(UserStopped):
+    monkeypatch.setattr("hardware.backends.fr3.run_bounded", spy)
+    for number, mode in enumerate(("Reflex", "Other", "Idle"), start=1):
+        franky.mode = mode
         robot.recover()
+        assert robot.state().mode is RobotMode.IDLE and franky.recoveries == number
+    assert limits.count(30.0) == 3  # users measured 16 s
+    for mode, kind in (("UserStopped", UserStopped), ("Guiding", ReflexError)):
+        franky.mode = mode
+        with pytest.raises(kind):
+            robot.recover()
+    assert franky.recoveries == 3
     robot.stop()
     assert franky.stops == 1
 

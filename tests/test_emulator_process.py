@@ -32,13 +32,21 @@ pytestmark = [
 # User stop, time, and the process.
 
 
-def test_user_stop_until_it_is_released(panda: SimpleNamespace, emulator: EmulatorProcess) -> None:
+def test_user_stop_until_it_is_released_and_recovered_from(
+    panda: SimpleNamespace, emulator: EmulatorProcess
+) -> None:
     emulator.user_stop()
     with pytest.raises(RuntimeError, match="rejected"):
         panda.robot.automatic_error_recovery()
     assert not panda.panda.move_to_joint_position(OFF_HOME, speed_factor=0.2)
     np.testing.assert_array_equal(emulator.snapshot()["q"], HOME)
     emulator.user_stop(False)
+    assert emulator.snapshot()["mode"] == "idle"
+    assert not panda.panda.move_to_joint_position(OFF_HOME, speed_factor=0.2)
+    with pytest.raises(RuntimeError, match="not possible in the current mode"):
+        panda.panda.raise_error()
+    np.testing.assert_array_equal(emulator.snapshot()["q"], HOME)
+    panda.robot.automatic_error_recovery()
     assert panda.panda.move_to_joint_position(OFF_HOME, speed_factor=0.2)
 
 

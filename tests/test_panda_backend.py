@@ -6,7 +6,10 @@ import shutil
 import signal
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -270,8 +273,63 @@ def test_user_stop(emulator: EmulatorProcess, robot: PandaRobot) -> None:
         with pytest.raises(UserStopped):
             command()
     emulator.user_stop(False)
+    assert robot.state().mode == RobotMode.IDLE  # the state shows nothing any more
+    with pytest.raises(UserStopped, match="not possible") as caught:
+        robot.move_joints(HOME, speed=0.5)
+    assert says_what_to_do(caught.value) and "start the command again" in caught.value.advice
     robot.recover()
     robot.move_joints(HOME, speed=0.5)
+
+
+class SaidLink:
+    """A connection to a robot of a given mode and errors, which recovers."""
+
+    def __init__(self, mode: str, errors: str = "[]") -> None:
+        self.mode, self.errors, self.limits = mode, errors, []
+
+    def read(self) -> SimpleNamespace:
+        errors = None if self.errors == "[]" else self.errors
+        mode = SimpleNamespace(name=self.mode)
+        return SimpleNamespace(robot_mode=mode, current_errors=errors, last_motion_errors="[]")
+
+    def command(self, call: Callable[[MagicMock], None], *, timeout_s: float = 5.0) -> None:
+        robot = MagicMock()
+        call(robot)
+        if robot.automatic_error_recovery.called:
+            self.limits.append(timeout_s)
+            self.mode, self.errors = "kIdle", "[]"
+
+
+def said(mode: str, errors: str = "[]") -> tuple[PandaRobot, SaidLink]:
+    robot, link = PandaRobot.__new__(PandaRobot), SaidLink(mode, errors)
+    robot.config, robot._link, robot._thresholds_set = NetworkedConfig(), link, True
+    return robot, link
+
+
+@pytest.mark.parametrize("mode", ["kIdle", "kOther", "kReflex", "kAutomaticErrorRecovery"])
+def test_a_recovery_is_asked_for_whatever_the_state_says_and_given_time(mode: str) -> None:
+    robot, link = said(mode)
+    robot.recover()
+    assert link.limits == [30.0]  # users measured 16 s
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind"),
+    [("kUserStopped", UserStopped), ("kMove", ReflexError), ("kGuiding", ReflexError)],
+)
+def test_a_robot_in_somebodys_hands_is_not_recovered(mode: str, kind: type) -> None:
+    robot, link = said(mode)
+    with pytest.raises(kind) as caught:
+        robot.recover()
+    assert link.limits == [] and says_what_to_do(caught.value)
+
+
+def test_an_idle_robot_that_reports_errors_accepts_no_motion_until_it_has_recovered() -> None:
+    robot, link = said("kIdle", '["self_collision_avoidance_violation"]')
+    with pytest.raises(ReflexError, match="reports self_collision_avoidance_violation"):
+        robot.move_linear(ABOVE_TABLE, speed=0.1)
+    robot.recover()
+    assert link.limits == [30.0]
 
 
 def test_stop_from_another_thread(emulator: EmulatorProcess, robot: PandaRobot) -> None:

@@ -30,6 +30,9 @@ from hardware.backends.franka_config import NetworkedConfig
 from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.server import EmulatorConfig
+from hardware.safety import SafeRobot
+from hardware.safety_limits import SafetyLimits
+from hardware.table_plane import TablePlane
 
 ROOT = Path(__file__).resolve().parent.parent
 pytestmark = [
@@ -52,6 +55,15 @@ def test_a_robot_in_reflex_can_be_connected_to() -> None:
         with pytest.raises(ConnectionLost, match="closed"):
             robot.state()
         robot.close()
+
+
+def test_taking_hold_of_a_robot_recovers_it_from_a_user_stop_that_no_state_shows() -> None:
+    with EmulatorProcess(free_host=True) as emulator:
+        emulator.user_stop()
+        emulator.user_stop(False)
+        with PandaRobot(NetworkedConfig(host=emulator.host)) as robot:
+            SafeRobot(robot, SafetyLimits(table=TablePlane(0.0)))
+            robot.move_joints(OFF_HOME, speed=0.5)
 
 
 def test_nothing_listens() -> None:

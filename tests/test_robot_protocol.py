@@ -292,3 +292,11 @@ def test_backends_have_the_protocols_methods() -> None:
 
 def test_a_safety_violation_is_a_robot_error() -> None:
     assert issubclass(SafetyViolation, RobotError)
+
+
+def test_advice_to_recover_serves_whoever_has_no_python_at_hand() -> None:
+    kinds = [RobotError, ReflexError, UserStopped]
+    said = [kind("stopped").advice for kind in kinds]
+    said += [ReflexError("stopped", reflexes=(name,)).advice for name in REFLEX_ADVICE]
+    assert len(said) == 8
+    assert [text for text in said if "Enter" not in text or "command again" not in text] == []

@@ -46,7 +46,7 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
     world = SimpleNamespace(
         q=np.array(HOME_Q), T=ARM.pose(np.array(HOME_Q)), force=np.zeros(6), mode="Idle",
         width=0.08, object=0.0, moves=[], grasps=[], fail=None, contact=False, offset=0.0,
-        connect=None, thresholds=None, stops=0,
+        connect=None, thresholds=None, stops=0, recoveries=0,
     )  # fmt: skip
     franky = ModuleType("franky")
 
@@ -140,6 +140,7 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
 
         def recover_from_errors(self) -> bool:
             world.mode = "Idle"
+            world.recoveries += 1
             return True
 
     class Gripper:

@@ -38,7 +38,7 @@ from ..robot import (
 )
 from ..straight_line import distance
 from .bounded import run_bounded
-from .franka_config import NetworkedConfig
+from .franka_config import RECOVERY_TIMEOUT, NetworkedConfig
 from .libfranka_errors import typed_error
 
 __all__ = ["FR3_Q_MAX", "FR3_Q_MIN", "FR3Robot"]
@@ -207,7 +207,15 @@ class FR3Robot(Closing):
         mode = self.state().mode
         if mode == RobotMode.USER_STOPPED:
             raise UserStopped("the user stop is pressed")
-        if mode == RobotMode.REFLEX and not self._quick(lambda: self._robot.recover_from_errors()):
+        if mode in (RobotMode.MOVING, RobotMode.GUIDING):
+            raise ReflexError(
+                f"the robot is in mode {mode.value}", advice="let it come to rest, then try again"
+            )
+        # Also where the state looks right: a user stop that was released does not show there.
+        recovered = self._quick(
+            lambda: self._robot.recover_from_errors(), timeout_s=RECOVERY_TIMEOUT
+        )
+        if not recovered:
             raise ReflexError("the robot does not recover", advice="recover it by hand in Desk")
 
     def close(self) -> None:
@@ -226,11 +234,11 @@ class FR3Robot(Closing):
             return ConnectionLost(f"{self.config.host}: {error}")
         return typed_error(str(error), host=self.config.host)
 
-    def _quick(self, call: Callable[[], T]) -> T:
+    def _quick(self, call: Callable[[], T], *, timeout_s: float = _QUICK) -> T:
         if self._closed:
             raise ConnectionLost("this connection was closed", advice="connect anew")
         try:
-            return run_bounded(call, timeout_s=_QUICK)
+            return run_bounded(call, timeout_s=timeout_s)
         except TimeoutError as error:
             raise ConnectionLost(f"{self.config.host}: {error}") from error
         except self._errors() as error:

@@ -17,6 +17,9 @@ def typed_error(message: str, *, host: str) -> RobotError:
         return UserStopped(message)
     if "reflex" in message.lower():
         return ReflexError(message, reflexes=reflex_names(message))
+    if "Move" in message and "not possible in the current mode" in message:
+        # A robot whose user stop was pressed and released says so; its state looks like any other.
+        return UserStopped(message)
     if any(word in message for word in GONE):
         return ConnectionLost(f"{host}: {message}")
     return MotionError(message)

@@ -29,7 +29,7 @@ from ..robot import (
     check_range,
 )
 from ..straight_line import distance, straight_line
-from .franka_config import NetworkedConfig
+from .franka_config import RECOVERY_TIMEOUT, NetworkedConfig
 from .libfranka_errors import reflex_names
 from .panda_link import BUSY, PandaLink
 
@@ -56,7 +56,9 @@ class PandaRobot(Closing):
 
     Connecting loads the robot's model and reads a state; it moves nothing. A robot that stands in a
     reflex or with its user stop pressed connects all the same: state() says so, motions are refused
-    until recover(). state() and stop() may be called from other threads while the arm moves.
+    until recover(). After a user stop that was released the state says nothing, yet motions are
+    refused: call recover() once after connecting, as `SafeRobot` does. state() and stop() may be
+    called from other threads while the arm moves.
 
     Raises:
         BackendMissing: panda-python is not installed
@@ -150,23 +152,42 @@ class PandaRobot(Closing):
         self._link.command(lambda robot: robot.stop())
 
     def recover(self) -> None:
-        """Clear a reflex; see `Robot.recover`."""
+        """Have the robot recover; see `Robot.recover`.
+
+        It takes up to some ten seconds, during which Python's threads stand still.
+        """
         mode = self._mode(self._link.read())
         if mode == RobotMode.USER_STOPPED:
             raise UserStopped("the user stop is pressed")
-        if mode == RobotMode.REFLEX:
-            self._link.command(lambda robot: robot.automatic_error_recovery())
-        mode = self._mode(self._link.read())
-        if mode != RobotMode.IDLE:
+        if mode in (RobotMode.MOVING, RobotMode.GUIDING):
             raise ReflexError(
-                f"the robot is still in mode {mode.value} after recovery",
-                advice="recover it by hand in Desk",
+                f"the robot is in mode {mode.value}", advice="let it come to rest, then try again"
             )
+        # Also where the state looks right: a user stop that was released does not show there.
+        self._clear()
+        reading = self._link.read()
+        mode = self._mode(reading)
+        by_hand = "recover it by hand in Desk"
+        if mode != RobotMode.IDLE:
+            what = f"the robot is still in mode {mode.value} after recovery"
+            raise ReflexError(what, advice=by_hand)
+        if reading.current_errors:
+            raise self._errors(reading, advice=by_hand)
         self._set_collision_force(self.config.collision_force_N)
 
     def close(self) -> None:
         """End the connection; see `Robot.close`."""
         self._link.close()
+
+    def _clear(self) -> None:
+        self._link.command(
+            lambda robot: robot.automatic_error_recovery(), timeout_s=RECOVERY_TIMEOUT
+        )
+
+    @staticmethod
+    def _errors(reading: Any, *, advice: str | None = None) -> ReflexError:
+        names = reflex_names(str(reading.current_errors))
+        return ReflexError(f"the robot reports {', '.join(names)}", reflexes=names, advice=advice)
 
     @staticmethod
     def _mode(reading: Any) -> RobotMode:
@@ -185,6 +206,8 @@ class PandaRobot(Closing):
         if mode == RobotMode.REFLEX:
             reflexes = reflex_names(str(reading.last_motion_errors))
             raise ReflexError(f"the robot stands in a reflex: {reflexes}", reflexes=reflexes)
+        if reading.current_errors:
+            raise self._errors(reading)
         if mode != RobotMode.IDLE:
             raise MotionError(f"the robot is in mode {mode.value} and accepts no motion")
         if not self._thresholds_set:
@@ -222,7 +245,7 @@ class PandaRobot(Closing):
         except ReflexError as error:
             if "cartesian_reflex" not in error.reflexes:
                 raise
-            self._link.command(lambda robot: robot.automatic_error_recovery())
+            self._clear()
             return True
         finally:
             if self._mode(self._link.read()) == RobotMode.IDLE:

@@ -64,6 +64,7 @@ class EmulatedRobot:
         self._force_threshold = np.full(6, DEFAULT_FORCE_THRESHOLD)
         self._reflex: tuple[str, int] | None = None
         self._answered: list[bool] = []
+        self._locked = False
         self._end_motion()
 
     def _end_motion(self) -> None:
@@ -92,13 +93,18 @@ class EmulatedRobot:
         self._reflex = (name, self.ticks + after_ticks)
 
     def user_stop(self, pressed: bool) -> bytes:
-        """Press or release the user stop; returns what the client is told over TCP."""
+        """Press or release the user stop; returns what the client is told over TCP.
+
+        Released, the state looks like any other, but motions are refused until the client has had
+        the robot recover (seen by users of a real one: franka_ros, issue 308).
+        """
         if not pressed:
             if self.mode == RobotMode.USER_STOPPED:
                 self.mode = RobotMode.IDLE
             return b""
         reply = self._finish(MoveStatus.EMERGENCY_ABORTED) if self._move else b""
         self.mode = RobotMode.USER_STOPPED
+        self._locked = True
         return reply
 
     def receive(self, received: bytes) -> tuple[bytes, int | None]:
@@ -132,7 +138,7 @@ class EmulatedRobot:
             if self.mode not in (RobotMode.IDLE, RobotMode.REFLEX):
                 return self._reply(request, REJECTED)
             self._state["errors"] = False
-            self.mode = RobotMode.IDLE
+            self.mode, self._locked = RobotMode.IDLE, False
             return self._reply(request, 0)
         if request.command == RobotCommand.LOAD_MODEL_LIBRARY:
             return self._reply(request, 0, self._model.binary)
@@ -159,7 +165,7 @@ class EmulatedRobot:
 
     def _start_motion(self, request: Request) -> bytes:
         controller, generator = struct.unpack_from("<2I", request.body)
-        if self.mode != RobotMode.IDLE:
+        if self.mode != RobotMode.IDLE or self._locked:
             return self._reply(request, MoveStatus.NOT_POSSIBLE)
         if controller > ControllerMode.EXTERNAL or generator + 1 not in tuple(GeneratorMode):
             return self._reply(request, MoveStatus.INVALID_ARGUMENT)
