@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hardware.emulator import Contact, Hand, TableWorld
+from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
 
 TABLE_Z = 0.10
 
@@ -22,6 +23,10 @@ class RecordingWorld(TableWorld):
         self.hands.append(hand)
         self.forces.append(contact.wrench[2])
         return contact
+
+    def overstretch(self) -> None:
+        """Fail as a simulation fails that cannot be trusted."""
+        raise PhysicsError((Problem(ProblemKind.STRETCH, 0, 2.0, 1.5),))
 
     def take(self) -> dict[str, np.ndarray]:
         """Positions (N, 3) [m], speeds (N,) [m/s], widths (N,) [m] and forces (N,) [N]."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shutil
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hardware.emulator.arm import Arm
 from hardware.emulator.gripper import Gripper
-from hardware.emulator.model_library import CompilerMissing, model_library
+from hardware.emulator.model_library import CompilerMissing, find_compiler, model_library
 from hardware.emulator.protocol import (
     ROBOT_COMMAND,
     ROBOT_STATE,
@@ -230,3 +231,26 @@ def test_a_stop_aborts_what_the_fingers_do() -> None:
     ended = gripper.start(stop)
     assert ended == [(moving, GripperStatus.ABORTED), (stop, GripperStatus.SUCCESS)]
     assert not gripper.busy
+
+
+@pytest.mark.parametrize(
+    ("script", "message"),
+    [
+        (
+            "echo 'model.c:2:10: fatal error: math.h: No such file' >&2; exit 1",
+            "fatal error: math.h",
+        ),
+        ("exit 4", "exit code 4"),
+    ],
+)
+def test_a_compiler_without_headers_is_as_good_as_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str, message: str
+) -> None:
+    compiler = tmp_path / "gcc"
+    compiler.write_text(f"#!/bin/sh\n{script}\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert find_compiler() == str(compiler)
+    with pytest.raises(CompilerMissing, match=rf"{message}.*; install one") as caught:
+        model_library.__wrapped__()
+    assert "\n" not in str(caught.value)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -21,6 +23,7 @@ from emulator_worlds import RecordingWorld
 from hardware.emulator import EmulatorFailed, EmulatorProcess, TableWorld
 from hardware.emulator.server import AddressTaken, EmulatorConfig
 from warp_deform.errors import InputError
+from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
 
 ROOT = Path(__file__).resolve().parent.parent
 pytestmark = [
@@ -175,12 +178,38 @@ def test_questions_that_have_no_answer(emulator: EmulatorProcess) -> None:
         TableWorld(object_width=0.1)
 
 
+def test_a_world_that_fails_is_an_answer_and_not_the_end(emulator: EmulatorProcess) -> None:
+    with pytest.raises(PhysicsError) as caught:
+        emulator.call_world("overstretch")
+    problem = Problem(ProblemKind.STRETCH, 0, 2.0, 1.5)
+    assert caught.value.problems == (problem,) and str(caught.value) == str(problem)
+    assert emulator.snapshot()["mode"] == "idle"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.7", "example.org", ""])
+def test_only_this_machine_is_served(host: str) -> None:
+    with pytest.raises(InputError, match=r"not an address of this machine alone.*127\.0\.0\.1"):
+        EmulatorConfig(host=host)
+
+
 def test_a_killed_emulator_says_so() -> None:
     process = EmulatorProcess(free_host=True)
     process.kill()
-    with pytest.raises(EmulatorFailed, match="has ended"):
+    with pytest.raises(EmulatorFailed, match=r"has ended; .*start another"):
         process.snapshot()
     process.close()
+
+
+def test_an_emulator_that_is_too_slow_says_so() -> None:
+    with pytest.raises(EmulatorFailed, match=r"did not start in 0\.01 s; give it longer"):
+        EmulatorProcess(free_host=True, start_timeout_s=0.01)
+    slow = EmulatorProcess(free_host=True)
+    os.kill(slow._process.pid, signal.SIGSTOP)
+    try:
+        with pytest.raises(EmulatorFailed, match=r"did not answer 'world' in 0\.1 s; give it"):
+            slow.call_world("place_object", timeout_s=0.1, width=0.0)
+    finally:
+        slow.kill()
 
 
 def test_command_line() -> None:
@@ -208,8 +237,9 @@ def test_command_line() -> None:
         running.kill()
         running.stderr.close()
         running.wait()
-    wrong = subprocess.run(
-        [*command, "--object-width", "1"], capture_output=True, text=True, cwd=ROOT, check=False
-    )
-    assert wrong.returncode == 2
-    assert wrong.stderr.startswith("error: object_width") and wrong.stderr.count("\n") == 1
+    for mistake in (["--object-width", "1"], ["--host", "0.0.0.0"]):
+        wrong = subprocess.run(
+            [*command, *mistake], capture_output=True, text=True, cwd=ROOT, check=False
+        )
+        assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1
+        assert wrong.stderr.startswith(("error: object_width", "error: host"))

@@ -149,6 +149,7 @@ def test_a_goal_is_captured_and_read(tmp_path: Path, capfd: pytest.CaptureFixtur
         (["score", "nowhere"], "nowhere"),
         (["replay", "nowhere"], "nowhere"),
         (["emulate", "--chain", "1", "--table-z", "0.1"], "exclude"),
+        (["emulate", "--host", "0.0.0.0"], "not an address of this machine"),
         (["calibrate", "table"], "--table-z"),
         (["calibrate", "table", "--table-z", "0.0"], "--execute"),
         (["calibrate", "empty", "--setup", "nowhere"], "calibration"),

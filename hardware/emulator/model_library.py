@@ -23,7 +23,10 @@ from warp_deform.errors import WarpDeformError
 
 from ..panda_arm import DH_A, DH_ALPHA, DH_D, FLANGE
 
-__all__ = ["INERTIA", "CompilerMissing", "ModelLibrary", "model_library"]
+__all__ = ["INERTIA", "CompilerMissing", "ModelLibrary", "find_compiler", "model_library"]
+
+_INSTALL = "install one with the C library's headers (Debian, Ubuntu: apt install gcc libc6-dev)"
+_COMPILING = 60.0  # [s], on a busy machine
 
 # Joint inertias [kg m^2] of the size of the Panda's mass matrix at its ready pose.
 INERTIA = (1.0, 1.0, 0.8, 0.8, 0.2, 0.15, 0.06)
@@ -112,7 +115,7 @@ void g_NE(const double *q, const double *g, double m, const double *c, double *o
 
 
 class CompilerMissing(WarpDeformError):
-    """The machine has no C compiler, which the emulator needs for the robot's model library."""
+    """No C compiler that works, which the emulator needs for the robot's model library."""
 
 
 class ModelLibrary:
@@ -146,18 +149,22 @@ class ModelLibrary:
         return out
 
 
+def find_compiler() -> str | None:
+    """Return the path of the C compiler that `model_library` takes; None where there is none."""
+    return shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+
+
 @cache
 def model_library() -> ModelLibrary:
     """Compile and load the model library; once per process, about 0.2 s.
 
     Raises:
-        CompilerMissing: no C compiler is on the path
+        CompilerMissing: no C compiler is on the path, or it does not get through
     """
-    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    compiler = find_compiler()
     if compiler is None:
         raise CompilerMissing(
-            "the emulator compiles the robot's model library and found no C compiler; "
-            "install one (Debian, Ubuntu: apt install gcc)"
+            f"the emulator compiles the robot's model library and found no C compiler; {_INSTALL}"
         )
     numbers = {"a": DH_A, "d": DH_D, "alpha": DH_ALPHA, "inertia": INERTIA}
     listed = {name: ", ".join(f"{x!r}" for x in values) for name, values in numbers.items()}
@@ -166,5 +173,15 @@ def model_library() -> ModelLibrary:
         source.write_text(_SOURCE % {**listed, "flange": repr(FLANGE)})
         # Fused multiply-add would make the bits depend on the processor.
         options = ("-O2", "-ffp-contract=off", "-shared", "-fPIC")
-        subprocess.run([compiler, *options, "-o", path, source, "-lm"], check=True)
+        command = [compiler, *options, "-o", str(path), str(source), "-lm"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, text=True, timeout=_COMPILING)
+        except subprocess.CalledProcessError as error:
+            said = error.stderr.strip().splitlines() or [f"exit code {error.returncode}"]
+            raise CompilerMissing(
+                f"{compiler} does not compile the robot's model library: {said[-1].strip()}; "
+                f"{_INSTALL}"
+            ) from error
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise CompilerMissing(f"{compiler} does not run: {error}; {_INSTALL}") from error
         return ModelLibrary(path.read_bytes(), path)

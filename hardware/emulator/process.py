@@ -26,7 +26,7 @@ ANSWER_TIMEOUT = 10.0  # [s]
 
 
 class EmulatorFailed(WarpDeformError):
-    """The emulator's process did not start, or answers no more."""
+    """The emulator's process did not start, or answers no more; the message says what to do."""
 
 
 def serve_emulator(config: EmulatorConfig, *, world: World | None = None) -> None:
@@ -100,11 +100,17 @@ class EmulatorProcess(Closing):
         theirs.close()
         answer: str | WarpDeformError
         try:
-            answer = EmulatorFailed("the emulator's process did not start in time")
+            answer = EmulatorFailed(
+                f"the emulator's process did not start in {start_timeout_s:g} s; give it longer "
+                "(start_timeout_s), or look what keeps the machine busy"
+            )
             if self._control.poll(start_timeout_s):
                 answer = self._control.recv()
         except EOFError:
-            answer = EmulatorFailed("the emulator's process ended before it served")
+            answer = EmulatorFailed(
+                "the emulator's process ended before it served; what it printed says why, and so "
+                "does `warp-deform franka emulate` in a shell"
+            )
         if isinstance(answer, WarpDeformError):
             self.kill()
             raise answer
@@ -114,10 +120,15 @@ class EmulatorProcess(Closing):
         try:
             self._control.send((verb, arguments))
             if not self._control.poll(timeout_s):
-                raise EmulatorFailed(f"the emulator did not answer {verb!r} in {timeout_s:g} s")
+                raise EmulatorFailed(
+                    f"the emulator did not answer {verb!r} in {timeout_s:g} s; give it longer "
+                    "(timeout_s), or close it and start another"
+                )
             answer = self._control.recv()
         except (EOFError, OSError) as error:
-            raise EmulatorFailed("the emulator's process has ended") from error
+            raise EmulatorFailed(
+                "the emulator's process has ended; what it printed says why: start another"
+            ) from error
         if isinstance(answer, WarpDeformError):
             raise answer
         return answer

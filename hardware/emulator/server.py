@@ -15,22 +15,21 @@ import socket
 import struct
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from warp_deform.errors import InputError, WarpDeformError
 
-from ..panda_arm import GRIPPER_MAX_WIDTH, HOME_Q
+from ..panda_arm import GRIPPER_MAX_WIDTH
 from .arm import DT
+from .config import EmulatorConfig
 from .gripper import Gripper
 from .model_library import ModelLibrary
 from .protocol import (
     GRIPPER_COMMAND_PORT,
     GRIPPER_VERSION,
     ROBOT_COMMAND_PORT,
-    ROBOT_VERSION,
     GripperCommand,
     Request,
     Stream,
@@ -62,30 +61,6 @@ class Control(Protocol):
     def fileno(self) -> int: ...
     def recv(self) -> Any: ...
     def send(self, obj: Any) -> None: ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class EmulatorConfig:
-    """Where the emulator listens, how its time runs and how the arm stands at first."""
-
-    host: str = "127.0.0.1"
-    """Address to listen on; any 127.x.y.z works on Linux, so several emulators run side by side."""
-    paced: bool = False
-    """1 kHz by the wall clock, as a robot; default: lock-step, deterministic and fast."""
-    q: tuple[float, ...] = HOME_Q
-    """Joint positions at the start [rad]."""
-    gripper_width: float = GRIPPER_MAX_WIDTH
-    """Opening of the fingers at the start [m]."""
-    version: int = ROBOT_VERSION
-    """Version that the robot port claims to speak; another shows what a mismatch looks like."""
-
-    def __post_init__(self) -> None:
-        if len(self.q) != 7:
-            raise InputError(f"q: seven joint positions [rad], not {len(self.q)}")
-        if not 0.0 <= self.gripper_width <= GRIPPER_MAX_WIDTH:
-            raise InputError(
-                f"gripper_width: within 0 and {GRIPPER_MAX_WIDTH} m, not {self.gripper_width}"
-            )
 
 
 class _Client:
@@ -358,7 +333,7 @@ class FciServer:
         }
         try:
             answer = verbs[name](**arguments)
-        except InputError as error:
+        except WarpDeformError as error:
             answer = error
         control.send(answer)
 

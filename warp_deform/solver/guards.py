@@ -90,3 +90,7 @@ class PhysicsError(WarpDeformError):
         super().__init__("; ".join(map(str, problems)) + where)
         self.problems = problems
         self.bundle = bundle
+
+    def __reduce__(self) -> tuple[type[PhysicsError], tuple[tuple[Problem, ...], Path | None]]:
+        """Cross processes whole: an exception is otherwise made anew from its message."""
+        return type(self), (self.problems, self.bundle)
