@@ -77,12 +77,70 @@ def test_a_camera_that_hangs_is_given_up_in_time(hang_at: int) -> None:
                 camera.read()
         assert time.monotonic() - clock < 3.0
         if hang_at == 9:
-            with pytest.raises(CameraError, match="stopped answering"):
-                camera.read()
             camera.close()
         assert device.released == 0, "its thread may still hold the device"
     finally:
         device.let_go.set()
+    until = time.monotonic() + 5.0
+    while not device.released and time.monotonic() < until:
+        time.sleep(0.005)
+    assert device.released == 1, "and lets it go when it comes back"
+
+
+class Unplugged(FakeDevice):
+    """Gives no picture from a reading on, as after its cable was pulled out."""
+
+    def grab(self) -> tuple[np.ndarray, None]:
+        if self.count >= 8:
+            raise CameraError("the fake gave no picture; check its cable, then try again")
+        return super().grab()
+
+    def release(self) -> None:
+        super().release()
+        raise RuntimeError("no such device")
+
+
+@pytest.mark.parametrize("broken", [FakeDevice(hang_at=8), Unplugged()], ids=["hangs", "unplugged"])
+def test_a_camera_that_failed_is_opened_anew_by_the_next_reading(broken: FakeDevice) -> None:
+    working = FakeDevice()
+    there: list[FakeDevice | None] = [broken, None, working]
+    opened: list[FakeDevice] = []
+
+    def open_device() -> tuple[FakeDevice, CameraIntrinsics]:
+        device = there[len(opened)] if len(opened) < 2 else working
+        if device is None:
+            there[1] = working
+            raise CameraError("no device; plug it in")
+        opened.append(device)
+        return device, INTRINSICS
+
+    try:
+        with StreamingCamera("fake", open_device, config=QUICK) as camera:
+            camera.read()
+            for wrong in ("gave no picture", "plug it in"):
+                with pytest.raises(CameraError, match=wrong):
+                    camera.read()
+            assert camera.read().rgb[0, 0, 0] == 5, "warmed up, frozen, and a picture in between"
+            assert opened == [broken, working] and working.frozen_at == 3
+            camera.read()
+    finally:
+        broken.let_go.set()
+    assert working.released == 1
+    with pytest.raises(CameraError, match="closed"):
+        camera.read()
+
+
+def test_another_camera_in_its_place_is_refused() -> None:
+    other = CameraIntrinsics(SIZE, np.diag([70.0, 70, 1]), np.zeros(5))
+    devices = [(Unplugged(), INTRINSICS), (FakeDevice(), other), (FakeDevice(), INTRINSICS)]
+    waiting = iter(devices)
+    with StreamingCamera("fake", lambda: next(waiting), config=QUICK) as camera:
+        camera.read()
+        for wrong in ("gave no picture", "other intrinsics"):
+            with pytest.raises(CameraError, match=wrong):
+                camera.read()
+        np.testing.assert_array_equal(camera.read().intrinsics.matrix, INTRINSICS.matrix)
+    assert [device.released for device, _ in devices] == [1, 1, 1]
 
 
 def test_a_camera_that_does_not_open() -> None:
@@ -251,3 +309,61 @@ def test_nothing_opens_a_window_and_importing_loads_no_vendor() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True
     )
     assert done.stdout == "[]\n[]\n"
+
+
+def make_realsense(model: str, coeffs: list[float], log: list[str]) -> types.SimpleNamespace:
+    """A stand-in for pyrealsense2 with one device."""
+    found = types.SimpleNamespace(
+        width=1280, height=720, fx=640.0, fy=640.0, ppx=640.0, ppy=360.0, model=model, coeffs=coeffs
+    )
+    stream = types.SimpleNamespace(get_intrinsics=lambda: found)
+    color = types.SimpleNamespace(get_data=lambda: np.full((720, 1280, 3), 7, np.uint8))
+    depth = types.SimpleNamespace(get_data=lambda: np.full((720, 1280), 500, np.uint16))
+    frames = types.SimpleNamespace(get_color_frame=lambda: color, get_depth_frame=lambda: depth)
+    sensor = types.SimpleNamespace(supports=lambda option: False, get_depth_scale=lambda: 1e-3)
+    device = types.SimpleNamespace(
+        first_depth_sensor=lambda: sensor, first_color_sensor=lambda: sensor
+    )
+    profile = types.SimpleNamespace(
+        get_device=lambda: device,
+        get_stream=lambda kind: types.SimpleNamespace(as_video_stream_profile=lambda: stream),
+    )
+    pipeline = types.SimpleNamespace(
+        start=lambda config: profile,
+        stop=lambda: log.append("stop"),
+        wait_for_frames=lambda limit: frames,
+    )
+    return types.SimpleNamespace(
+        config=lambda: types.SimpleNamespace(enable_stream=lambda *_: None),
+        pipeline=lambda: pipeline,
+        align=lambda kind: types.SimpleNamespace(process=lambda frames: frames),
+        stream=types.SimpleNamespace(color=0, depth=1),
+        format=types.SimpleNamespace(rgb8=0, z16=1),
+        option=types.SimpleNamespace(enable_auto_exposure=0, enable_auto_white_balance=1),
+        distortion=types.SimpleNamespace(brown_conrady="distortion.brown_conrady"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "coeffs", "taken"),
+    [
+        ("distortion.brown_conrady", [0.1, -0.2, 0.001, 0.0, 0.0], True),
+        ("distortion.inverse_brown_conrady", [0.0] * 5, True),  # a D435
+        ("distortion.inverse_brown_conrady", [-0.055, 0.066, -0.001, 0.001, -0.021], False),
+        ("distortion.kannala_brandt4", [0.1, 0.0, 0.0, 0.0, 0.0], False),
+    ],
+)
+def test_a_realsense_whose_lens_opencv_cannot_describe_is_refused(
+    monkeypatch: pytest.MonkeyPatch, model: str, coeffs: list[float], taken: bool
+) -> None:
+    log: list[str] = []
+    monkeypatch.setitem(sys.modules, "pyrealsense2", make_realsense(model, coeffs, log))
+    if taken:
+        with RealSenseCamera(config=QUICK) as camera:
+            frame = camera.read()
+        assert frame.depth_m is not None and frame.depth_m[0, 0] == np.float32(0.5)
+        np.testing.assert_array_equal(frame.intrinsics.distortion, coeffs)
+    else:
+        with pytest.raises(CameraError, match=rf"{model}.*--camera uvc.*calibrate lens"):
+            RealSenseCamera(config=QUICK)
+    assert log == ["stop"]

@@ -1,6 +1,6 @@
 """RealSense cameras through pyrealsense2; depth is aligned to colour, intrinsics are the device's.
 
-Never tried on a device by the authors; tests cover a missing package and a missing device.
+Never tried on a device by the authors; tested against a stand-in for the vendor's package.
 """
 
 from __future__ import annotations
@@ -46,6 +46,13 @@ class _RealSense:
     def intrinsics(self) -> CameraIntrinsics:
         stream = self._profile.get_stream(self._rs.stream.color).as_video_stream_profile()
         found: Any = stream.get_intrinsics()
+        if any(found.coeffs) and found.model != self._rs.distortion.brown_conrady:
+            # D405 and D455 tell those of the inverse model: from distorted pixels to straight ones.
+            raise CameraError(
+                f"the RealSense describes its lens by {found.model}, not by OpenCV's Brown-Conrady "
+                "model; use it as --camera uvc, and measure its lens first with `warp-deform "
+                "franka calibrate lens --camera uvc`"
+            )
         K = np.array([[found.fx, 0.0, found.ppx], [0.0, found.fy, found.ppy], [0.0, 0.0, 1.0]])
         return CameraIntrinsics((found.width, found.height), K, np.array(found.coeffs, dtype=float))
 
@@ -81,7 +88,8 @@ class RealSenseCamera(StreamingCamera):
         config: time limits and warm-up
 
     Raises:
-        CameraError: the package is missing, or the device does not start or hangs
+        CameraError: the package is missing, the device does not start or hangs, or its lens is
+            described by a model that OpenCV does not have
     """
 
     def __init__(
@@ -94,6 +102,10 @@ class RealSenseCamera(StreamingCamera):
     ) -> None:
         def open_device() -> tuple[_RealSense, CameraIntrinsics]:
             device = _RealSense(serial, size, fps)
-            return device, device.intrinsics()
+            try:
+                return device, device.intrinsics()
+            except CameraError:
+                device.release()
+                raise
 
         super().__init__(f"RealSense {serial or ''}".strip(), open_device, config=config)

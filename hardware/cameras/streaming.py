@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -58,15 +60,15 @@ class Device(Protocol):
 
 
 class StreamingCamera(Closing):
-    """A `Camera` over a device that may hang.
+    """A `Camera` over a device that may hang or be unplugged.
 
-    A device that once gave no answer in time is given up: its thread may still hold it.
+    A device that failed is let go, one that hangs as soon as it comes back; the next reading opens
+    it anew.
 
     Args:
         name: for messages: "camera /dev/video0"
-        open_device: opens the device; raises CameraError where it cannot
-        intrinsics: of the pictures; None where the device tells them, which `open_device` then
-            returns beside it
+        open_device: opens the device, at first and after a failure; returns it and the intrinsics
+            of its pictures; raises CameraError where it cannot
 
     Raises:
         CameraError: it did not open or gave no picture
@@ -81,19 +83,11 @@ class StreamingCamera(Closing):
     ) -> None:
         self._name = name
         self._config = config or StreamConfig()
+        self._open_device = open_device
         self._device: Device | None = None
-        self._gone = False
-        timeout = self._config.open_timeout_s
+        self._intrinsics: CameraIntrinsics | None = None
+        self._closed = False
         try:
-            self._device, self._intrinsics = run_bounded(open_device, timeout_s=timeout)
-        except TimeoutError as error:
-            raise CameraError(
-                f"{name} did not open in {timeout:g} s; unplug it, plug it in, close other programs"
-            ) from error
-        try:
-            for _ in range(self._config.warm_up_frames):
-                self._grab()
-            self._bounded(self._device.freeze)
             self.read()
         except BaseException:
             self.close()
@@ -101,33 +95,84 @@ class StreamingCamera(Closing):
 
     def read(self) -> Frame:
         """Return a picture taken after this call; see `Camera.read`."""
+        if self._closed:
+            raise CameraError(f"{self._name} is closed; open it again")
+        if self._device is None:
+            self._open()
         for _ in range(self._config.stale_frames):
             self._grab()
         rgb, depth = self._grab()
+        assert self._intrinsics is not None
         return Frame(rgb, depth, self._intrinsics, time.time())
 
     def close(self) -> None:
         """Let the device go; see `Camera.close`."""
-        device, self._device = self._device, None
-        if device is not None and not self._gone:
-            try:
-                run_bounded(device.release, timeout_s=_CLOSE_TIMEOUT)
-            except TimeoutError:
-                self._gone = True
+        self._closed = True
+        self._let_go()
+
+    def _open(self) -> None:
+        timeout = self._config.open_timeout_s
+        try:
+            self._device, intrinsics = run_bounded(self._open_device, timeout_s=timeout)
+        except TimeoutError as error:
+            raise CameraError(
+                f"{self._name} did not open in {timeout:g} s; unplug it, plug it in, close other "
+                "programs"
+            ) from error
+        before, self._intrinsics = self._intrinsics or intrinsics, intrinsics
+        if before.to_record() != intrinsics.to_record():
+            self._intrinsics = before
+            self._let_go()
+            raise CameraError(
+                f"{self._name} came back with other intrinsics; plug in the camera that was there, "
+                "or start again and calibrate"
+            )
+        for _ in range(self._config.warm_up_frames):
+            self._grab()
+        self._bounded(lambda device: device.freeze())
 
     def _grab(self) -> tuple[np.ndarray, np.ndarray | None]:
-        if self._device is None:
-            raise CameraError(f"{self._name} is closed; open it again")
-        return self._bounded(self._device.grab)
+        return self._bounded(lambda device: device.grab())
 
-    def _bounded(self, call: Callable[[], T]) -> T:
-        if self._gone:
-            raise CameraError(f"{self._name} stopped answering earlier; open it again")
+    def _bounded(self, call: Callable[[Device], T]) -> T:
+        """Return `call(device)`; a device that fails or hangs is ours no more."""
+        device = self._device
+        assert device is not None
+        deciding = threading.Lock()
+        ended = abandoned = False
+
+        def made() -> T:
+            nonlocal ended
+            try:
+                return call(device)
+            finally:
+                with deciding:
+                    ended = True
+                if abandoned:
+                    device.release()
+
         try:
-            return run_bounded(call, timeout_s=self._config.read_timeout_s)
+            return run_bounded(made, timeout_s=self._config.read_timeout_s)
         except TimeoutError as error:
-            self._gone = True
+            with deciding:
+                abandoned = not ended
+            if abandoned:
+                self._device = None  # its thread holds it, and lets it go
+            else:
+                self._let_go()
             raise CameraError(
                 f"{self._name} gave no picture in {self._config.read_timeout_s:g} s; "
-                "check its cable and open it again"
+                "check its cable, then try again: it is opened anew"
             ) from error
+        except CameraError:
+            self._let_go()
+            raise
+
+    def _let_go(self) -> None:
+        device, self._device = self._device, None
+        if device is None:
+            return
+        try:
+            run_bounded(device.release, timeout_s=_CLOSE_TIMEOUT)
+        except Exception as error:  # whatever a vendor raises for a device that was pulled out
+            logging.getLogger(__name__).warning("letting %s go: %s", self._name, error)

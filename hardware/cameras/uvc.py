@@ -34,7 +34,7 @@ class _VideoDevice:
     def grab(self) -> tuple[np.ndarray, None]:
         done, image = self._capture.read()
         if not done:
-            raise CameraError("the video device gave no picture; check its cable and open it again")
+            raise CameraError("the video device gave no picture; check its cable, then try again")
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)), None
 
     def freeze(self) -> None:
