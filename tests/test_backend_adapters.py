@@ -38,6 +38,8 @@ HOME = np.array(HOME_Q)
 LOWER = ARM.pose(HOME)
 LOWER[2, 3] -= 0.1
 ACTION = PickPlaceAction((0.45, 0.0), 0.3, (0.5, 0.1), 0.3)
+STATUS = "get_current_franka_interface_status_server"
+STATUS_SERVER = f"/{STATUS}_node_1/{STATUS}"
 LIMITS = SafetyLimits(table=TablePlane(0.0))
 
 
@@ -61,7 +63,7 @@ def frankapy(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
 
 
 def slow_free() -> FrankapyRobot:
-    return FrankapyRobot(sleep=lambda seconds: None)
+    return FrankapyRobot(sleep=lambda seconds: None, say=lambda line: None)
 
 
 @pytest.mark.parametrize("cls", [FR3Robot, FrankapyRobot])
@@ -213,6 +215,29 @@ def test_frankapy_reads_moves_and_places(frankapy: SimpleNamespace) -> None:
         robot.state()
 
 
+@pytest.mark.parametrize(
+    ("absent", "named"),
+    [
+        ("master", "get_current_robot_state_server"),
+        (STATUS_SERVER, STATUS_SERVER),
+        ("/franka_gripper_1/move", "/franka_gripper_1/move"),
+    ],
+)
+def test_frankapys_servers_are_not_waited_for_without_end(
+    frankapy: SimpleNamespace, absent: str, named: str
+) -> None:
+    frankapy.absent = (absent,)
+    said: list[str] = []
+    config = FrankapyConfig(connect_timeout_s=0.2)
+    with pytest.raises(ConnectionFailed, match=rf"{named} is not there after 0\.2 s.*roscore"):
+        FrankapyRobot(config, say=said.append)
+    assert frankapy.made == 0, "its own wait has no end"
+    assert len(said) == 1 and "waiting" in said[0] and named in said[0]
+    frankapy.absent = ()
+    FrankapyRobot(say=said.append)
+    assert len(said) == 1 and frankapy.made == 1
+
+
 def test_frankapys_durations_keep_the_speed(frankapy: SimpleNamespace) -> None:
     """A minimum-jerk motion's greatest speed is 1.875 of its mean."""
     slow_free().move_linear(LOWER, speed=0.05, stop_force_N=8.0)
@@ -256,7 +281,7 @@ def test_frankapys_exceptions_get_our_types(frankapy: SimpleNamespace) -> None:
         assert type(raised.value) is kind
     frankapy.fail = known.FrankaArmCommException("no control PC")
     with pytest.raises(ConnectionFailed, match="control PC"):
-        FrankapyRobot(FrankapyConfig(robot_num=2))
+        FrankapyRobot()
     frankapy.fail = None
     frankapy.busy = True
     assert robot.state().mode is RobotMode.MOVING

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -178,7 +180,7 @@ def make_frankapy() -> tuple[dict[str, ModuleType], SimpleNamespace]:
     """The modules by name, and what the robot does."""
     world = SimpleNamespace(
         q=np.array(HOME_Q), T=ARM.pose(np.array(HOME_Q)), force=np.zeros(6), width=0.08,
-        object=0.0, calls=[], fail=None, offset=0.0, settling=2, busy=False,
+        object=0.0, calls=[], fail=None, offset=0.0, settling=2, busy=False, absent=(), made=0,
     )  # fmt: skip
 
     class RigidTransform:
@@ -198,6 +200,7 @@ def make_frankapy() -> tuple[dict[str, ModuleType], SimpleNamespace]:
             import signal
 
             signal.signal(signal.SIGINT, lambda *_: None)  # as the real one does
+            world.made += 1
             if world.fail is not None:
                 raise world.fail
 
@@ -253,7 +256,25 @@ def make_frankapy() -> tuple[dict[str, ModuleType], SimpleNamespace]:
             world.busy = False
             world.calls.append(("stop_skill",))
 
+    rospy = ModuleType("rospy")
+    rospy.ROSException = type("ROSException", (Exception,), {})
+
+    def wait_for_service(name: str, timeout: float) -> None:
+        assert timeout > 0.0, "0 or None would wait for ever"
+        if "master" in world.absent:
+            threading.Event().wait(20.0)
+        if name in world.absent:
+            time.sleep(timeout)
+            raise rospy.ROSException(f"timeout exceeded while waiting for service {name}")
+
+    def get_published_topics() -> list[list[str]]:
+        actions = ["/execute_skill_action_server_node_1/execute_skill"]
+        actions += [f"/franka_gripper_1/{name}" for name in ("homing", "move", "grasp")]
+        return [[f"{name}/status", "type"] for name in actions if name not in world.absent]
+
+    rospy.wait_for_service, rospy.get_published_topics = wait_for_service, get_published_topics
     package, core = ModuleType("frankapy"), ModuleType("autolab_core")
     package.FrankaArm, package.exceptions = FrankaArm, exceptions
     core.RigidTransform = RigidTransform
-    return {"frankapy": package, "frankapy.exceptions": exceptions, "autolab_core": core}, world
+    modules = {"frankapy": package, "frankapy.exceptions": exceptions, "autolab_core": core}
+    return {**modules, "rospy": rospy}, world

@@ -3,7 +3,8 @@
 frankapy swallows errors unless told otherwise, does not say whether a grasp holds, and its
 gripper call returns before the fingers stand. Here every motion is made with
 `ignore_errors=False`, its arrival is measured, and the fingers are watched until they stand.
-It has no call that clears a reflex: franka-interface does that itself.
+It has no call that clears a reflex: franka-interface does that itself. It waits without end for the
+control PC's servers; here they are looked for first, within a limit.
 
 Never run on a physical robot by the authors; tested against a stand-in for frankapy. Stopping by
 software is no safety function.
@@ -13,7 +14,9 @@ Source: iamlab-cmu/frankapy, `franka_arm.py` and `franka_arm_state_client.py`.
 
 from __future__ import annotations
 
+import functools
 import signal
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,6 +42,7 @@ from ..robot import (
     check_range,
 )
 from ..straight_line import distance
+from .bounded import run_bounded
 from .franka_config import FrankaConfig
 from .libfranka_errors import typed_error
 
@@ -51,6 +55,17 @@ _TURN_SPEED = 0.5  # [rad/s]
 _SHORTEST = 0.5  # [s]
 _STANDS = 2e-4  # [m] between two looks at fingers that stand
 _POLL = 0.1  # [s]
+# What FrankaArm() waits for, by number of the robot: ROS services, and actions with their topics.
+_SERVICES = (
+    "/get_current_robot_state_server_node_{}/get_current_robot_state_server",
+    "/get_current_franka_interface_status_server_node_{}/get_current_franka_interface_status_server",
+)
+_ACTIONS = (
+    "/execute_skill_action_server_node_{}/execute_skill",
+    "/franka_gripper_{}/homing",
+    "/franka_gripper_{}/move",
+    "/franka_gripper_{}/grasp",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +74,8 @@ class FrankapyConfig(FrankaConfig):
 
     robot_num: int = 1
     """Number of the robot on the control PC."""
+    connect_timeout_s: float = 10.0
+    """Longest wait for the control PC's servers [s]."""
     gripper_timeout_s: float = 5.0
     """Longest wait for the fingers to stand [s]."""
 
@@ -69,20 +86,27 @@ class FrankapyRobot(Closing):
     Args:
         config: what to expect
         sleep: waits [s]
+        say: told what is still being waited for; default: prints it on stderr
 
     Raises:
-        BackendMissing: frankapy or ROS is not installed
+        BackendMissing: frankapy or ROS 1 is not installed
         ConnectionFailed: the control PC does not answer, or the robot is not ready
     """
 
     def __init__(
-        self, config: FrankapyConfig | None = None, *, sleep: Callable[[float], None] = time.sleep
+        self,
+        config: FrankapyConfig | None = None,
+        *,
+        sleep: Callable[[float], None] = time.sleep,
+        say: Callable[[str], None] | None = None,
     ) -> None:
         self.config = config or FrankapyConfig()
+        self._say = say or (lambda line: print(line, file=sys.stderr, flush=True))
         self._sleep = sleep
         self._closed = False
         try:
             import frankapy
+            import rospy
             from autolab_core import RigidTransform
             from frankapy import exceptions
         except ImportError as error:
@@ -92,6 +116,7 @@ class FrankapyRobot(Closing):
             ) from error
         self._transform = RigidTransform
         self._exceptions = exceptions
+        self._find_servers(rospy)
         # FrankaArm makes Ctrl-C leave the process at once; here it has to stop the arm first.
         handler = signal.getsignal(signal.SIGINT)
         try:
@@ -106,6 +131,44 @@ class FrankapyRobot(Closing):
             ) from error
         finally:
             signal.signal(signal.SIGINT, handler)
+
+    def _find_servers(self, rospy: Any) -> None:
+        """Return once everything is there that FrankaArm() would wait for without end."""
+        until = time.monotonic() + self.config.connect_timeout_s
+
+        def left() -> float:
+            return max(until - time.monotonic(), _POLL)
+
+        def published(topic: str) -> None:
+            while topic not in {name for name, _ in rospy.get_published_topics()}:
+                if time.monotonic() > until:
+                    raise TimeoutError
+                time.sleep(_POLL)
+
+        n = self.config.robot_num
+        for service in (name.format(n) for name in _SERVICES):
+            self._wait(service, functools.partial(rospy.wait_for_service, service, left()), rospy)
+        for action in (name.format(n) for name in _ACTIONS):
+            self._wait(action, functools.partial(published, f"{action}/status"), rospy)
+
+    def _wait(self, server: str, wait: Callable[[], None], rospy: Any) -> None:
+        limit = self.config.connect_timeout_s
+        told: list[str] = []
+
+        def tell() -> None:
+            if not told:
+                told.append(f"frankapy: waiting up to {limit:g} s for {server}")
+                self._say(told[0])
+
+        try:
+            # In a thread: the name server itself may be a machine that does not answer.
+            run_bounded(wait, timeout_s=limit + 1.0, watch=tell)
+        except (TimeoutError, OSError, rospy.ROSException) as error:
+            raise ConnectionFailed(
+                f"frankapy: {server} is not there after {limit:g} s",
+                advice="start roscore, and franka-interface with its gripper on the control PC; see "
+                "that ROS_MASTER_URI and ROS_IP name the right machines",
+            ) from error
 
     def state(self) -> RobotState:
         """Read the robot now; see `Robot.state`.
