@@ -166,8 +166,8 @@ class FrankapyRobot(Closing):
         except (TimeoutError, OSError, rospy.ROSException) as error:
             raise ConnectionFailed(
                 f"frankapy: {server} is not there after {limit:g} s",
-                advice="start roscore, and franka-interface with its gripper on the control PC; see "
-                "that ROS_MASTER_URI and ROS_IP name the right machines",
+                advice="start roscore, and franka-interface with its gripper on the control PC; "
+                "see that ROS_MASTER_URI and ROS_IP name the right machines",
             ) from error
 
     def state(self) -> RobotState:
