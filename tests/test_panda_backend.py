@@ -343,6 +343,46 @@ def test_stop_from_another_thread(emulator: EmulatorProcess, robot: PandaRobot) 
     robot.move_joints(HOME, speed=0.5)
 
 
+class Planning:
+    """The vendor's object, which plans for a while before it moves."""
+
+    def __init__(self, panda: object) -> None:
+        self._panda, self.begun = panda, threading.Event()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._panda, name)
+
+    def move_to_joint_position(self, *arguments: object, **settings: object) -> bool:
+        self.begun.set()
+        time.sleep(0.3)
+        return self._panda.move_to_joint_position(*arguments, **settings)
+
+
+@pytest.mark.parametrize("by", ["stop", "Ctrl-C"])
+def test_a_stop_while_the_vendor_plans_keeps_the_arm_from_setting_out(
+    emulator: EmulatorProcess, robot: PandaRobot, monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
+    slow = Planning(robot._link._panda)
+    monkeypatch.setattr(robot._link, "_panda", slow)
+
+    def interrupt() -> None:
+        assert slow.begun.wait(10.0)
+        if by == "stop":
+            robot.stop()
+        else:
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    watcher = Background(interrupt)
+    way = np.array([HOME + 0.2 * np.eye(7)[0], HOME])  # two pieces: there and back
+    with pytest.raises(MotionError if by == "stop" else KeyboardInterrupt):
+        robot.move_joints(way, speed=0.02)
+    assert watcher.join() is None
+    stands = emulator.snapshot()["q"]
+    assert np.abs(stands - HOME).max() < 0.05 and emulator.snapshot()["mode"] == "idle"
+    time.sleep(0.3)
+    np.testing.assert_array_equal(emulator.snapshot()["q"], stands)
+
+
 @pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals")
 def test_ctrl_c_stops_the_arm(emulator: EmulatorProcess, robot: PandaRobot) -> None:
     def interrupt() -> None:

@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-__all__ = ["run_bounded"]
+__all__ = ["POLL", "run_bounded"]
 
 T = TypeVar("T")
-# How often the waiting thread looks for Ctrl-C [s], and how long a stopped call may take to end.
 POLL = 0.05
-STOP_TIMEOUT = 3.0
+"""How often a waiting thread looks for Ctrl-C [s]."""
+STOP_TIMEOUT = 3.0  # [s] for a stopped call to end
 
 
 def run_bounded(

@@ -149,7 +149,7 @@ class PandaRobot(Closing):
 
     def stop(self) -> None:
         """End the motion in progress; see `Robot.stop`."""
-        self._link.command(lambda robot: robot.stop())
+        self._link.stop()
 
     def recover(self) -> None:
         """Have the robot recover; see `Robot.recover`.
@@ -218,8 +218,11 @@ class PandaRobot(Closing):
         """Go through `points` (N, 7) and check that the TCP arrived (at `target`)."""
         start = np.array(self._ready().q)
         target = self.pose(points[-1]) if target is None else target
+        self._link.stopped = False
         for begin, piece in path_pieces(start, points):
             for left in reversed(range(STARTS)):
+                if self._link.stopped:
+                    raise MotionError("the motion was stopped before its last way-point")
                 try:
                     self._link.follow(begin, piece, factor)
                     break

@@ -28,7 +28,7 @@ from ..robot import (
     MotionError,
     RobotError,
 )
-from .bounded import run_bounded
+from .bounded import POLL, run_bounded
 from .franka_config import NetworkedConfig
 from .libfranka_errors import typed_error
 
@@ -57,6 +57,7 @@ class PandaLink:
 
     Attributes:
         host: the robot's address
+        stopped: whether `stop` was called; whoever begins a path sets it back
         frames: F_T_EE and EE_T_K as the vendor's model takes them, 16 numbers each
 
     Raises:
@@ -77,7 +78,8 @@ class PandaLink:
         logging.getLogger("panda").addHandler(logging.NullHandler())
         logging.getLogger("motion").addHandler(logging.NullHandler())
         self._closed = self._lost = False
-        self._following = False
+        self._following = self.stopped = False
+        self._ended = threading.Event()
         self._begun = 0.0
         self._reading = threading.Lock()
         self._panda = self._connect(lambda: panda_py.Panda(self.host))
@@ -197,9 +199,17 @@ class PandaLink:
         self._forget_error()
         with self._reading:  # a reading in another thread would make the vendor refuse the motion
             self._following, self._begun = True, time.monotonic()
+            self._ended.clear()
+
+        def move() -> bool:
+            try:
+                return bool(self._panda.move_to_joint_position(columns, speed_factor=factor))
+            finally:
+                self._ended.set()
+
         try:
             ok = run_bounded(
-                lambda: self._panda.move_to_joint_position(columns, speed_factor=factor),
+                move,
                 timeout_s=2.0 * float(longest.sum()) + PLANNING_TIMEOUT,
                 stop=self._halt,
                 watch=self._watch(),
@@ -249,10 +259,23 @@ class PandaLink:
         except RuntimeError as error:
             logging.getLogger(__name__).info("an earlier motion ended with: %s", error)
 
+    def stop(self) -> None:
+        """End the motion in progress, if any; from any thread.
+
+        Raises:
+            ConnectionLost: the robot is silent
+        """
+        self.stopped = True
+        until = time.monotonic() + PLANNING_TIMEOUT
+        self.command(lambda robot: robot.stop())
+        # While the vendor still plans a motion a stop does nothing, and then the arm would set out.
+        while self._following and not self._ended.wait(POLL) and time.monotonic() < until:
+            self.command(lambda robot: robot.stop())
+
     def _halt(self) -> None:
         """Stop a motion that runs in another thread, as well as that can be done."""
         try:
-            self.command(lambda robot: robot.stop())
+            self.stop()
         except RobotError as error:
             logging.getLogger(__name__).warning("stopping the motion failed: %s", error)
 
