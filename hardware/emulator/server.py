@@ -15,21 +15,23 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from warp_deform.errors import InputError, WarpDeformError
 
-from ..panda_arm import GRIPPER_MAX_WIDTH
+from ..panda_arm import GRIPPER_MAX_WIDTH, HOME_Q
 from .arm import DT
-from .config import EmulatorConfig
+from .clients import Client, is_loopback, send
 from .gripper import Gripper
 from .model_library import ModelLibrary
 from .protocol import (
     GRIPPER_COMMAND_PORT,
     GRIPPER_VERSION,
     ROBOT_COMMAND_PORT,
+    ROBOT_VERSION,
     GripperCommand,
     Request,
     Stream,
@@ -63,35 +65,34 @@ class Control(Protocol):
     def send(self, obj: Any) -> None: ...
 
 
-class _Client:
-    """One connected client: its TCP socket, and UDP once it has named its port."""
+@dataclass(frozen=True, kw_only=True)
+class EmulatorConfig:
+    """Where the emulator listens, how its time runs and how the arm stands at first."""
 
-    def __init__(self, tcp: socket.socket, address: tuple[str, int], host: str) -> None:
-        tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.tcp = tcp
-        self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.udp.bind((host, 0))
-        self._address = address[0]
-        self.udp_address: tuple[str, int] | None = None
+    host: str = "127.0.0.1"
+    """Address of this machine's loopback to listen on, 127.x.y.z: it asks nobody for a password. On
+    Linux all of them work, so several emulators run side by side."""
+    paced: bool = False
+    """1 kHz by the wall clock, as a robot; default: lock-step, deterministic and fast."""
+    q: tuple[float, ...] = HOME_Q
+    """Joint positions at the start [rad]."""
+    gripper_width: float = GRIPPER_MAX_WIDTH
+    """Opening of the fingers at the start [m]."""
+    version: int = ROBOT_VERSION
+    """Version that the robot port claims to speak; another shows what a mismatch looks like."""
 
-    def connect_udp(self, port: int) -> None:
-        self.udp_address = (self._address, port)
-
-    def send_state(self, datagram: bytes) -> None:
-        if self.udp_address is not None:
-            self.udp.sendto(datagram, self.udp_address)
-
-    def close(self) -> None:
-        self.tcp.close()
-        self.udp.close()
-
-
-def _send(tcp: socket.socket, frame: bytes) -> None:
-    """Send a reply that was not asked for just now."""
-    try:
-        tcp.sendall(frame)
-    except OSError:
-        pass  # the client has gone; reading from it will say so and clean up
+    def __post_init__(self) -> None:
+        if not is_loopback(self.host):
+            raise InputError(
+                f"host: {self.host!r} is not an address of this machine alone; the emulator takes "
+                "commands from whoever reaches it: choose 127.0.0.1 to 127.255.255.254"
+            )
+        if len(self.q) != 7:
+            raise InputError(f"q: seven joint positions [rad], not {len(self.q)}")
+        if not 0.0 <= self.gripper_width <= GRIPPER_MAX_WIDTH:
+            raise InputError(
+                f"gripper_width: within 0 and {GRIPPER_MAX_WIDTH} m, not {self.gripper_width}"
+            )
 
 
 class FciServer:
@@ -115,7 +116,7 @@ class FciServer:
         self.sim_seconds = 0.0
         self._message_id = 0
         self._listeners: dict[socket.socket, str] = {}
-        self._clients: dict[str, _Client] = {}
+        self._clients: dict[str, Client] = {}
         self._gripper_stream = Stream(command="H", status="H")
         self._command: bytes | None = None
         self._states_unanswered = 0
@@ -189,7 +190,7 @@ class FciServer:
         if name in self._clients:
             tcp.close()
             return
-        self._clients[name] = _Client(tcp, address, self._config.host)
+        self._clients[name] = Client(tcp, address, self._config.host)
 
     def _read(self, source: socket.socket) -> None:
         for name, client in list(self._clients.items()):
@@ -200,7 +201,7 @@ class FciServer:
             elif source is client.tcp:
                 self._read_tcp(name, client)
 
-    def _read_tcp(self, name: str, client: _Client) -> None:
+    def _read_tcp(self, name: str, client: Client) -> None:
         handle = self._robot_requests if name == "robot" else self._gripper_requests
         try:
             received = client.tcp.recv(65536)
@@ -216,7 +217,7 @@ class FciServer:
         else:
             self._gripper_stream = Stream(command="H", status="H")
 
-    def _robot_requests(self, client: _Client, received: bytes) -> None:
+    def _robot_requests(self, client: Client, received: bytes) -> None:
         was_moving = self.robot.moving
         replies, udp_port = self.robot.receive(received)
         client.tcp.sendall(replies)
@@ -226,7 +227,7 @@ class FciServer:
             self._command, self._states_unanswered = None, 0
             self._send_robot_state(time.perf_counter())
 
-    def _gripper_requests(self, client: _Client, received: bytes) -> None:
+    def _gripper_requests(self, client: Client, received: bytes) -> None:
         for request in self._gripper_stream.requests(received):
             if request.command == GripperCommand.CONNECT:
                 version, port = struct.unpack("<2H", request.body)
@@ -244,7 +245,7 @@ class FciServer:
         client = self._clients.get("gripper")
         if client is not None:
             frame = self._gripper_stream.reply(request.command, request.command_id, status, payload)
-            _send(client.tcp, frame)
+            send(client.tcp, frame)
 
     # What time brings.
 
@@ -290,7 +291,7 @@ class FciServer:
         """Send a reply that ends a motion; a state that shows the end goes before it."""
         if reply and "robot" in self._clients:
             self._send_robot_state(time.perf_counter())
-            _send(self._clients["robot"].tcp, reply)
+            send(self._clients["robot"].tcp, reply)
 
     def _send_robot_state(self, now: float) -> None:
         client = self._clients.get("robot")
