@@ -153,6 +153,7 @@ def test_a_robot_that_falls_silent_in_mid_motion_freezes_nothing() -> None:
         while emulator.snapshot()["ticks"] < 500 and time.monotonic() < until:
             time.sleep(0.005)
         with silent(emulator):
+            time.sleep(0.2)  # what was under way has arrived; the vendor notices after 1 s
             clock = time.monotonic()
             with pytest.raises(ConnectionLost):
                 robot.stop()

@@ -47,7 +47,7 @@ SILENCE = 2.0
 # It then ends its control loop, a second where the robot's machine is off, but up to a minute where
 # that only says nothing: a motion is given up after this [s].
 GIVEN_UP = 5.0
-TICK = 5e-3  # [s]
+TICK = 2.5e-3  # [s]
 BUSY = "another control or read operation is running"
 """What a refusal says for which another thread is to blame."""
 
@@ -149,7 +149,8 @@ class PandaLink:
         """Return once a state has come, also in the middle of a motion."""
         until = time.monotonic() + SILENCE
         while time.monotonic() < until:
-            if self._following and self._ticks():
+            # Twice: the first may have waited in a buffer, as in `_fresh`.
+            if self._following and self._ticks() and self._ticks():
                 return
             try:
                 with self._reading:
