@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -254,6 +254,20 @@ class Robot(Closing, Protocol):
 
     def close(self) -> None:
         """End the connection; moves nothing, and may be called twice."""
+        ...
+
+
+@runtime_checkable
+class HomesGripper(Protocol):
+    """A backend whose fingers can find their zero; not every vendor's interface offers that."""
+
+    def home_gripper(self) -> None:
+        """Close and open the fingers to find their zero; needed once after the hand was powered.
+
+        Raises:
+            GraspError: they did not get through
+            ConnectionLost: the gripper does not answer
+        """
         ...
 
 

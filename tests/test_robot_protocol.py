@@ -81,7 +81,7 @@ def test_an_error_is_one_line_that_ends_with_advice(kind: type[RobotError]) -> N
 def test_advice_for_programs_says_what_to_do_at_the_prompt_too() -> None:
     kinds = (RobotError, ReflexError, UserStopped)
     advice = [*(kind.default_advice for kind in kinds), *REFLEX_ADVICE.values()]
-    assert all("press Enter, or start the command again" in text for text in advice)
+    assert all("press Enter if asked, else start the command again" in text for text in advice)
 
 
 @pytest.mark.parametrize("part", REFLEX_ADVICE)
