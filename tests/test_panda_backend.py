@@ -251,6 +251,8 @@ def test_a_reflex_is_raised_and_recovered_from(
         robot.move_joints(OFF_HOME, speed=0.2)
     assert caught.value.reflexes == ("joint_velocity_violation",)
     assert says_what_to_do(caught.value) and "more slowly" in str(caught.value)
+    cause = caught.value.__cause__  # frames of the vendor's call would keep its objects alive
+    assert cause is not None and cause.__traceback__ is None
     stands = emulator.snapshot()["q"]
     assert 0.0 < np.abs(stands - HOME).max() < np.abs(OFF_HOME - HOME).max()
     assert robot.state().mode == RobotMode.REFLEX

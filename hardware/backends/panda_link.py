@@ -182,7 +182,7 @@ class PandaLink:
         except TimeoutError as error:
             raise ConnectionLost(f"{self.host}: {error}") from error
         except RuntimeError as error:
-            raise typed_error(str(error), host=self.host) from error
+            raise typed_error(str(error), host=self.host) from _bare(error)
 
     # Motions.
 
@@ -220,7 +220,7 @@ class PandaLink:
         except TimeoutError as error:
             raise MotionError("the motion did not end in time and was stopped") from error
         except RuntimeError as error:
-            raise typed_error(str(error), host=self.host) from error
+            raise typed_error(str(error), host=self.host) from _bare(error)
         finally:
             self._following = False
         if not ok:
@@ -305,7 +305,9 @@ class PandaLink:
             raise GraspError("the fingers did not stop in time") from error
         except RuntimeError as error:
             lost = typed_error(str(error), host=self.host)
-            raise lost if isinstance(lost, ConnectionLost) else GraspError(str(error)) from error
+            raise lost if isinstance(lost, ConnectionLost) else GraspError(str(error)) from _bare(
+                error
+            )
 
     def _halt_fingers(self) -> None:
         try:
@@ -331,3 +333,8 @@ class PandaLink:
         del self._panda, self._robot
         self._gripper = None
         ctypes.pythonapi.Py_DecRef(ctypes.py_object(panda))
+
+
+def _bare(error: RuntimeError) -> RuntimeError:
+    """Without the frames of the call, which would keep the vendor's objects after close()."""
+    return error.with_traceback(None)
