@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from learning.report import read_runs, write_report
+from learning.schedules import SCHEDULES
 from learning.share import share_run
 from learning.snapshots import RunFolder, read_json, write_json
 
@@ -32,6 +33,9 @@ def main() -> None:
         print(note)
     for run in found:
         name = f"{run.task}-{run.agent}-{run.demos}-{run.seed}"
+        steps = run.settings["schedule"]["steps"]
+        if steps != SCHEDULES[run.settings["preset"]].steps:
+            name += f"-{steps}-steps"
         target = RunFolder(options.out / "runs" / name)
         target.path.mkdir(parents=True, exist_ok=True)
         settings = {key: value for key, value in run.settings.items() if key != "data"}
