@@ -281,7 +281,10 @@ def _publish(path: Path, write: Callable[[Path], object]) -> None:
     """Have a file written under a temporary name, then give it its name."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
+        temporary.touch()
+        mode = temporary.stat().st_mode
         write(temporary)
+        temporary.chmod(mode)  # safetensors keeps its files from others
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)

@@ -51,6 +51,8 @@ def test_the_same_command_gives_the_same_bits(
     again = train(config(folder, tmp_path))
     assert again.weights_hash == report.weights_hash
     assert report.snapshots == (2, 4) and report.steps == 4
+    modes = {path.stat().st_mode for path in out.rglob("*.*") if path.is_file()}
+    assert len(modes) == 1, "whoever may read one file may read all"
     for step in report.snapshots:
         files = [RunFolder(run).snapshot(step).read_bytes() for run in (out, tmp_path)]
         assert files[0] == files[1]
