@@ -33,7 +33,7 @@ demo: $(STAMP)
 
 # Neighbours share kernels and fixtures: a worker begins with a run of them, and steals later.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n auto --dist worksteal tests
+	$(BIN)/python -m pytest -n auto --dist worksteal --durations 20 tests
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -48,6 +48,9 @@ STARTS = {"bag-alone-open": 24, "bag-items-1": 24, "bag-items-2": 24, "bag-color
 GOAL_SCORE = {"fabric-flat-notarget": 0.97, "bag-color-goal": 0.97}
 # Of eight seeds, where the demonstrator solves fewer than seven; the visible one acts for bags.
 LEAST_SOLVED = {"bag-items-1": 6, "bag-items-2": 5}
+# One task of each kind of scene: what gymnasium's checker looks at is the same code for all.
+CHECKED = ("cable-ring", "cable-line-notarget", "fabric-flat-notarget", "bag-alone-open",
+           "block-notarget")  # fmt: skip
 every_task = pytest.mark.parametrize("name", TASKS)
 goal_task = pytest.mark.parametrize("name", [n for n, t in TASKS.items() if t.goal_conditioned])
 
@@ -85,7 +88,7 @@ def fastest(worlds: Worlds, slot: int) -> float:
     return float(np.linalg.norm(linear, axis=1).max())
 
 
-@every_task
+@pytest.mark.parametrize("name", CHECKED)
 def test_environment_follows_gymnasium(name: str) -> None:
     env = gymnasium.make(env_id(name))
     with warnings.catch_warnings(record=True) as caught:
@@ -99,7 +102,7 @@ def test_environment_follows_gymnasium(name: str) -> None:
 
 @every_task
 def test_same_seed_and_actions_same_bits_in_any_lane_and_company(name: str) -> None:
-    seeds, count = (3, 11, 24), slots(name)
+    seeds, count = (3, 11) if is_bag(name) else (3, 11, 24), slots(name)
     plans = {seed: [] for seed in seeds}
 
     def play(size: int, order: dict[int, int]) -> dict[int, list[str]]:
