@@ -103,14 +103,15 @@ def test_environment_follows_gymnasium(name: str) -> None:
 @every_task
 def test_same_seed_and_actions_same_bits_in_any_lane_and_company(name: str) -> None:
     seeds, count = (3, 11) if is_bag(name) else (3, 11, 24), slots(name)
+    steps = 1 if is_bag(name) and name != "bag-alone-open" else 2  # several objects take long
     plans = {seed: [] for seed in seeds}
 
     def play(size: int, order: dict[int, int]) -> dict[int, list[str]]:
-        """Hashes by seed of the start and two steps: first near an object, then anywhere."""
+        """Hashes by seed of the start and the steps: first near an object, then anywhere."""
         side = worlds(name, size)
         side.reset(order)
         hashes = {seed: [side.hash(slot)] for slot, seed in order.items()}
-        for step in range(2):
+        for step in range(steps):
             actions = {}
             for slot, seed in order.items():
                 if len(plans.setdefault(seed, [])) == step:
