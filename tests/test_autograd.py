@@ -167,7 +167,7 @@ def test_a_batch_is_its_worlds_one_by_one() -> None:
         return out.positions.detach().numpy(), x.grad.numpy()
 
     start = lines(3, 0.01)
-    together = derivatives(cables(3, 4, "float32"), start, [0, 1, 2])
+    together = derivatives(cables(3, 8, "float32"), start, [0, 1, 2])
     alone = cables(3, 1, "float32")
     for w in range(3):
         for a, b in zip(together, derivatives(alone, start[w : w + 1], [w]), strict=True):
@@ -187,7 +187,7 @@ def test_derivatives_have_the_precision_of_what_they_are_by() -> None:
 
 @pytest.mark.parametrize("storage", ["full", "replay"])
 def test_what_happens_to_the_worlds_in_between_does_not_matter(storage: str) -> None:
-    solver = cables(2, 4)
+    solver = cables(2, 8, "float32")
 
     def act() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, TensorRollout]:
         x, knots, friction = tensor(lines(1, 0.01)), tensor(led(lines()[0, 1]).positions), [0.3]

@@ -95,30 +95,33 @@ ALONE = {seed: seed for seed in range(COUNT)}
 def reference() -> dict[tuple[str, str], dict[int, bytes]]:
     """Every world of every scene by itself, one lane."""
     out = {}
-    for name, world in (("cable", cable_world()), ("boxes", box_world())):
-        for precision in ("float32", "float64"):
-            states: dict[int, bytes] = {}
-            for seed in range(COUNT):
-                solver = solver_of(world, 1, 1, precision)
-                scatter(solver, {0: seed})
-                states |= play(solver, {0: seed})
-            out[name, precision] = states
+    cable, boxes = cable_world(), box_world()
+    for scene, precision, world in (
+        ("cable", "float32", cable), ("cable", "float64", cable), ("boxes", "float32", boxes)
+    ):  # fmt: skip
+        states: dict[int, bytes] = {}
+        for seed in range(COUNT):
+            solver = solver_of(world, 1, 1, precision)
+            scatter(solver, {0: seed})
+            states |= play(solver, {0: seed})
+        out[scene, precision] = states
     return out
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("lanes", [1, 4, 8, 16])
+@pytest.mark.parametrize(
+    ("lanes", "precision"), [(1, "float32"), (4, "float32"), (8, "float32"), (16, "float32"),
+                             (8, "float64")],
+)  # fmt: skip
 def test_cables_have_the_same_bits_in_every_width(reference, lanes, precision):
     solver = solver_of(cable_world(), COUNT, lanes, precision)
     scatter(solver, ALONE)
     assert play(solver, ALONE) == reference["cable", precision]
 
 
-@pytest.mark.parametrize(("lanes", "precision"), [(4, "float32"), (8, "float32"), (8, "float64")])
-def test_boxes_have_the_same_bits_in_every_width(reference, lanes, precision):
-    solver = solver_of(box_world(), COUNT, lanes, precision)
+def test_boxes_have_the_same_bits_in_lanes(reference):
+    solver = solver_of(box_world(), COUNT, 8, "float32")
     scatter(solver, ALONE)
-    assert play(solver, ALONE) == reference["boxes", precision]
+    assert play(solver, ALONE) == reference["boxes", "float32"]
 
 
 def test_the_reference_worlds_differ(reference):
