@@ -19,7 +19,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from .homography import MAX_ERROR
+from .homography import MAX_ERROR, PoorFit
 
 __all__ = ["MIN_POSES", "HandEye", "calibrate_hand_eye"]
 
@@ -69,7 +69,8 @@ def calibrate_hand_eye(base_T_tcp: np.ndarray, camera_T_board: np.ndarray) -> Ha
         camera_T_board: poses of the board in the pictures taken there [m], (n, 4, 4)
 
     Raises:
-        InputError: too few poses, too much alike, or the board does not stand still to 3 mm rms
+        InputError: too few poses, or too much alike
+        PoorFit: the board does not stand still to 3 mm rms
     """
     hand, seen = np.asarray(base_T_tcp, dtype=float), np.asarray(camera_T_board, dtype=float)
     if hand.shape != seen.shape or hand.ndim != 3 or hand.shape[1:] != (4, 4):
@@ -100,9 +101,11 @@ def calibrate_hand_eye(base_T_tcp: np.ndarray, camera_T_board: np.ndarray) -> Ha
         np.linalg.norm(errors[:, 3:], axis=1),
     )
     if not found.error_m <= MAX_ERROR:
-        raise InputError(
+        worst = int(np.argmax(found.residuals_m))
+        raise PoorFit(
             f"{found.report()}; allowed: {1e3 * MAX_ERROR:g} mm rms, so it is refused; take "
-            f"picture {int(np.argmax(found.residuals_m)) + 1} again first, and fix board and camera"
+            f"picture {worst + 1} again first, and fix board and camera",
+            worst=worst,
         )
     return found
 

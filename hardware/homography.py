@@ -21,15 +21,27 @@ from .camera import CameraIntrinsics
 from .charuco import BoardSpec, Corners
 from .table_plane import TablePlane
 
-__all__ = ["MAX_ERROR", "HomographyFit", "apply_homography", "board_on_table", "fit_homography",
-           "plane_homography"]  # fmt: skip
+__all__ = ["MAX_ERROR", "MIN_POINTS", "HomographyFit", "PoorFit", "apply_homography",
+           "board_on_table", "fit_homography", "plane_homography", "solve_homography"]  # fmt: skip
 
-# Four points always fit: a fifth is the first that says whether they fit well.
-_MIN_POINTS = 5
+MIN_POINTS = 5
+"""Fewest points that give a result: four always fit, a fifth says whether they fit well."""
 MAX_ERROR = 3e-3
 """Greatest error of a calibration [m], rms, by its own measure: half of a cable's width."""
 _MIN_SPREAD = 0.02  # [m], standard deviation across the narrow side of the points
 _MAX_BOARD_ERROR = 2e-3  # [m]
+
+
+class PoorFit(InputError):
+    """Measurements do not fit together well enough; the message is one line.
+
+    Attributes:
+        worst: index of the one to measure again first; None where they do not tell which
+    """
+
+    def __init__(self, message: str, *, worst: int | None) -> None:
+        self.worst = worst
+        super().__init__(message)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,16 +52,40 @@ class HomographyFit:
         base_H_pixel: from undistorted pixels (column, row, 1) to base x, y [m], shape (3, 3)
         residuals_m: of every point, shape (n,)
         left_out_m: error at every point of the fit to all others, shape (n,)
+        others_m: how well all others fit one another, root mean square, shape (n,)
     """
 
     base_H_pixel: np.ndarray
     residuals_m: np.ndarray
     left_out_m: np.ndarray
+    others_m: np.ndarray
 
     @property
     def error_m(self) -> float:
         """Root mean square of `left_out_m` [m]."""
         return math.sqrt(float((self.left_out_m**2).mean()))
+
+    @property
+    def worst(self) -> int | None:
+        """Index of the point without which the others fit best; None where any four do.
+
+        A wrong point also bends the fit that predicts the right ones at the rim, so the largest of
+        `left_out_m` is often that of a right one.
+        """
+        return None if len(self.others_m) <= MIN_POINTS else int(np.argmin(self.others_m))
+
+    def check(self) -> None:
+        """Raise PoorFit where the error exceeds `MAX_ERROR`."""
+        if self.error_m <= MAX_ERROR:
+            return
+        if self.worst is None:
+            advice = f"{len(self.left_out_m)} points do not tell which is wrong: measure more"
+        else:
+            advice = f"measure point {self.worst + 1} again first"
+        raise PoorFit(
+            f"{self.report()}; allowed: {1e3 * MAX_ERROR:g} mm rms, so it is refused; {advice}",
+            worst=self.worst,
+        )
 
     def report(self) -> str:
         """Return the figures as a line for people."""
@@ -70,6 +106,20 @@ def apply_homography(H: np.ndarray, points: np.ndarray) -> np.ndarray:
 def fit_homography(
     pixels: np.ndarray, base_xy: np.ndarray, intrinsics: CameraIntrinsics
 ) -> HomographyFit:
+    """Return what `solve_homography` does, if it is good enough.
+
+    Raises:
+        InputError: see `solve_homography`
+        PoorFit: more than 3 mm off, left out
+    """
+    fit = solve_homography(pixels, base_xy, intrinsics)
+    fit.check()
+    return fit
+
+
+def solve_homography(
+    pixels: np.ndarray, base_xy: np.ndarray, intrinsics: CameraIntrinsics
+) -> HomographyFit:
     """Return the homography through points seen at `pixels` and standing at `base_xy`, (n, 2) each.
 
     Args:
@@ -78,14 +128,14 @@ def fit_homography(
         intrinsics: of the camera
 
     Raises:
-        InputError: fewer than five points, all near a line, or more than 3 mm off, left out
+        InputError: fewer than five points, all near a line, or seen from below
     """
     pixels, base_xy = np.asarray(pixels, dtype=float), np.asarray(base_xy, dtype=float)
     if pixels.shape != base_xy.shape or pixels.ndim != 2 or pixels.shape[1] != 2:
         raise InputError(f"pixels {pixels.shape} and points {base_xy.shape} need shape (n, 2) both")
-    if len(pixels) < _MIN_POINTS:
+    if len(pixels) < MIN_POINTS:
         raise InputError(
-            f"{len(pixels)} points: four fit any homography, so {_MIN_POINTS} are needed to see "
+            f"{len(pixels)} points: four fit any homography, so {MIN_POINTS} are needed to see "
             "whether they are right; touch more"
         )
     if not (np.isfinite(pixels).all() and np.isfinite(base_xy).all()):
@@ -95,20 +145,22 @@ def fit_homography(
         raise InputError("the points lie near a line; spread them over the workspace")
     straight = intrinsics.undistort(pixels)
     H = _solve(straight, base_xy)
+    # Rows run downwards, so a table seen from above is mirrored: its Jacobian's determinant,
+    # det(H) / w^3, is negative.
+    if np.linalg.det(H) * (H[2] @ [*straight.mean(axis=0), 1.0]) > 0.0:
+        raise InputError(
+            "the points run the wrong way round, as if seen from below; are column and row, or x "
+            "and y, swapped?"
+        )
     residuals = np.linalg.norm(apply_homography(H, straight) - base_xy, axis=1)
-    left_out = np.empty(len(pixels))
+    left_out, among_others = np.empty(len(pixels)), np.empty(len(pixels))
     for i in range(len(pixels)):
         others = np.arange(len(pixels)) != i
-        predicted = apply_homography(_solve(straight[others], base_xy[others]), straight[i : i + 1])
-        left_out[i] = np.linalg.norm(predicted[0] - base_xy[i])
-    fit = HomographyFit(H, residuals, left_out)
-    if not fit.error_m <= MAX_ERROR:
-        worst = int(np.argmax(left_out))
-        raise InputError(
-            f"{fit.report()}; allowed: {1e3 * MAX_ERROR:g} mm rms, so it is refused; measure "
-            f"point {worst + 1} again first"
-        )
-    return fit
+        predicted = apply_homography(_solve(straight[others], base_xy[others]), straight)
+        errors = np.linalg.norm(predicted - base_xy, axis=1)
+        left_out[i] = errors[i]
+        among_others[i] = math.sqrt(float((errors[others] ** 2).mean()))
+    return HomographyFit(H, residuals, left_out, among_others)
 
 
 def board_on_table(

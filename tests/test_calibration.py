@@ -19,10 +19,12 @@ from board_photographs import (
 from hardware.charuco import Corners, board_pose, calibrate_intrinsics, find_corners
 from hardware.hand_eye import calibrate_hand_eye
 from hardware.homography import (
+    PoorFit,
     apply_homography,
     board_on_table,
     fit_homography,
     plane_homography,
+    solve_homography,
 )
 from hardware.table_plane import TablePlane
 from warp_deform.errors import InputError
@@ -74,7 +76,8 @@ def test_homography_of_touched_points() -> None:
     fit = fit_homography(pixels, xy, INTRINSICS)
     assert fit.error_m < 1e-6 and fit.residuals_m.max() < 1e-6
     for spoilt, message in (
-        (xy + np.eye(6)[:, :1] * [0.03, 0.0], r"allowed: 3 mm rms.*point \d"),
+        (xy + np.eye(6)[:, :1] * [0.03, 0.0], r"allowed: 3 mm rms.*measure point 1 again"),
+        (xy[:, ::-1], "wrong way round"),
         (xy * [1.0, 0.0] + [0.0, 0.01], "near a line"),
         (np.where(np.eye(6)[:, :2] > 0, np.nan, xy), "not finite"),
     ):
@@ -82,6 +85,31 @@ def test_homography_of_touched_points() -> None:
             fit_homography(pixels, spoilt, INTRINSICS)
     with pytest.raises(InputError, match="four fit any homography"):
         fit_homography(pixels[:4], xy[:4], INTRINSICS)
+
+
+def test_the_wrong_one_of_touched_points_is_named() -> None:
+    """The point that the others predict worst is a right one in a fifth of these cases."""
+    true = plane_homography(INTRINSICS, camera_above(), TablePlane(0.0))
+    grid = np.stack(np.meshgrid([0.36, 0.485, 0.61], [-0.25, 0.0, 0.25]), axis=-1).reshape(-1, 2)
+    named = predicted_worst = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        xy = grid + rng.normal(0.0, 0.01, (9, 2))
+        pixels = INTRINSICS.distort(apply_homography(np.linalg.inv(true), xy))
+        pixels += rng.normal(0.0, 0.7, (9, 2))
+        touched = xy + rng.normal(0.0, 0.4e-3, (9, 2))
+        assert fit_homography(pixels, touched, INTRINSICS).error_m < 2.5e-3
+        wrong, turn = seed % 9, rng.uniform(0.0, 2 * np.pi)
+        touched[wrong] += 0.012 * np.array([np.cos(turn), np.sin(turn)])
+        with pytest.raises(PoorFit, match=r"measure point \d again") as caught:
+            fit_homography(pixels, touched, INTRINSICS)
+        fit = solve_homography(pixels, touched, INTRINSICS)
+        named += caught.value.worst == wrong
+        predicted_worst += int(np.argmax(fit.left_out_m)) == wrong
+    assert named == 60 and predicted_worst < 54
+    with pytest.raises(PoorFit, match="5 points do not tell which") as caught:
+        fit_homography(pixels[[0, 2, 6, 8, 5]], touched[[0, 2, 6, 8, 5]], INTRINSICS)
+    assert caught.value.worst is None
 
 
 def test_a_board_touched_wrongly_is_refused() -> None:
@@ -187,8 +215,9 @@ def test_bad_hand_eye_poses_are_refused() -> None:
         calibrate_hand_eye(hands[:7], seen[:7])
     moved = seen.copy()
     moved[3, :3, 3] += [0.03, 0.0, 0.0]
-    with pytest.raises(InputError, match="take picture 4 again"):
+    with pytest.raises(PoorFit, match="take picture 4 again") as caught:
         calibrate_hand_eye(hands, moved)
+    assert caught.value.worst == 3
     # More than the calibration file takes is refused here, where it says which picture was worst.
     shaky, seen_shaky, _ = hand_eye_poses(0, place=2.2e-3)
     with pytest.raises(InputError, match=r"stands still to 3\.\d+ mm rms.* allowed: 3 mm rms"):
