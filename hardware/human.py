@@ -65,7 +65,16 @@ class Terminal:
 
     def wait(self, text: str) -> bool:
         """Wait for something to be done by hand; False where the operator stops instead."""
-        return self._ask(f"{text}\n  Enter: done, q: stop > ").strip().lower() != "q"
+        return self.answer(text, "Enter: done") is not None
+
+    def answer(self, text: str, choices: str) -> str | None:
+        """Return what the operator says to a text, "" for Enter; None to stop.
+
+        Args:
+            choices: what may be said, for people: "Enter: done"
+        """
+        said = self._ask(f"{text}\n  {choices}, q: stop > ").strip()
+        return None if said.lower() == "q" else said
 
 
 def _prompt(text: str, source: TextIO | None = None) -> str:

@@ -201,7 +201,7 @@ def read_calibration(config: RigConfig) -> Calibration:
     if touched.is_file() and read_table(touched) != calibration.table:
         raise InputError(
             f"{touched} is another table than the calibration's, whose floor would be wrong; "
-            "calibrate camera (or hand) again"
+            "calibrate camera (or points, or hand) again"
         )
     if config.robot in REAL_ROBOTS:
         pairs = [("robot", "--robot and --host", calibration.robot_id, config.robot_id)]

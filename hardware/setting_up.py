@@ -14,12 +14,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from warp_deform.errors import InputError
 
-from .calibration import Calibration
 from .camera import Camera, CameraIntrinsics
 from .charuco import (
     MIN_VIEWS,
@@ -29,17 +27,18 @@ from .charuco import (
     calibrate_intrinsics,
     find_corners,
 )
+from .gathering import gather
 from .goal_file import write_picture
-from .hand_eye import MIN_POSES, calibrate_hand_eye
-from .homography import board_on_table, fit_homography, plane_homography
+from .hand_eye import MIN_POSES, HandEye, calibrate_hand_eye
+from .hand_views import HandView, kept_views
+from .homography import PoorFit, board_on_table, fit_homography, plane_homography
 from .human import Terminal
 from .json_file import write_json
+from .measuring import confirm, lens_of, make_calibration, marked, open_arm
 from .operators import until_cleared
-from .panda_arm import HOME_Q
-from .rig import open_camera, open_robot, read_calibration, read_intrinsics, read_table
-from .rig_config import REAL_ROBOTS, RigConfig
+from .rig import open_camera, read_calibration, read_table
+from .rig_config import RigConfig
 from .safety import SafeRobot
-from .safety_limits import SafetyLimits
 from .table_plane import TablePlane, fit_table_plane
 from .top_down_view import TopDownView
 from .touch_off import close_fingers, touch_off
@@ -119,19 +118,19 @@ def measure_table(
             "give --table-z, a height [m] in the base frame that is 1 to 3 cm below the foam's top"
         )
     operator = operator or Terminal()
-    with robot or _arm(config, TablePlane(provisional_z)) as arm:
+    with robot or open_arm(config, TablePlane(provisional_z)) as arm:
         (x0, x1), (y0, y1) = arm.limits.x, arm.limits.y
         corners = [(x0, y0), (x0, y1), (x1, y1), (x1, y0), ((x0 + x1) / 2, 0.0)]
         middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
         inside = [tuple(np.add(c, _INSET * np.sign(middle - c)).tolist()) for c in corners]
-        _wait(
+        confirm(
             operator,
             "clear the foam, nothing between the fingers, hand on the stop; the arm then goes "
             "home, homes its fingers and touches the foam at five points",
         )
         until_cleared(arm, operator, arm.home)
         if not arm.home_gripper():
-            _wait(
+            confirm(
                 operator,
                 f"home the hand in Desk, if it was switched on since: {config.robot} cannot do "
                 "that from here",
@@ -154,7 +153,7 @@ def measure_table(
         "table": path,
         "height_m": float(plane.z(middle)),
         "worst_residual_m": float(np.abs(residuals).max()),
-        "next": "calibrate camera or hand (again): the safety floor comes from there",
+        "next": "calibrate camera, points or hand (again): the safety floor comes from there",
     }
 
 
@@ -178,9 +177,9 @@ def measure_camera(
     """
     operator = operator or Terminal()
     table = read_table(config.setup / "table.json")
-    lens = _lens(config)
-    with robot or _arm(config, table) as arm:
-        _wait(
+    lens = lens_of(config)
+    with robot or open_arm(config, table) as arm:
+        confirm(
             operator,
             "lay the board flat into the workspace, nothing between the fingers; the arm then goes "
             "home and closes them",
@@ -195,11 +194,11 @@ def measure_camera(
             raise InputError(f"corners {hidden} are not seen; choose others with --corners")
         touched = []
         for corner in corner_ids:
-            _wait(operator, f"guide the closed fingertips onto corner {corner} of the board")
+            confirm(operator, f"guide the closed fingertips onto corner {corner} of the board")
             touched.append(arm.state().base_T_tcp[:2, 3])
     on_table = board_on_table(corners, board, np.array(corner_ids), np.array(touched))
     fit = fit_homography(corners.pixels, on_table, frame.intrinsics)
-    calibration = _calibration(
+    calibration = make_calibration(
         config,
         frame.intrinsics,
         fit.base_H_pixel,
@@ -210,7 +209,7 @@ def measure_camera(
     )
     path = config.setup / "calibration.json"
     calibration.save(path)
-    write_picture(config.setup / "board_seen.png", _marked(frame.rgb, corners.pixels))
+    write_picture(config.setup / "board_seen.png", marked(frame.rgb, corners.pixels))
     return {"calibration": path, "report": fit.report(), "error_m": fit.error_m}
 
 
@@ -226,58 +225,70 @@ def measure_hand_eye(
     """Find a camera on the hand from pictures of a board that stands still; save.
 
     A person guides the hand from one view to the next; from the last the arm goes home. The table
-    in the camera's picture from there follows from its height.
+    in the camera's picture from there follows from its height. Views are kept in `views.json` until
+    the calibration is written: the next call goes on from them, and a refused one is taken again.
 
     Raises:
-        InputError: too few views, stopped, or the board does not stand still to 3 mm rms
+        InputError: too few views, stopped, or kept ones that are not of this setup
         RobotError, CameraError: robot or camera fail
     """
     _check_views(views, MIN_POSES)
     operator = operator or Terminal()
     table = read_table(config.setup / "table.json")
-    lens = _lens(config)
-    hands: list[np.ndarray] = []
-    seen: list[np.ndarray] = []
+    lens = lens_of(config)
     with (
-        robot or _arm(config, table) as arm,
+        robot or open_arm(config, table) as arm,
         camera or open_camera(config, lens) as device,
     ):
-        while len(seen) < views:
-            text = (
-                f"view {len(seen) + 1} of {views}: guide the hand so that it sees the board from "
-                "elsewhere, tilted by some 25 degrees, and hold still"
-            )
-            if not operator.wait(text):
-                raise InputError("stopped before all views were taken; nothing was written")
-            frame = device.read()
-            try:
-                found = board_pose(find_corners(frame.rgb, board), board, frame.intrinsics)
-            except InputError as error:
-                operator.wait(str(error))
-                continue
-            hands.append(arm.state().base_T_tcp)
-            seen.append(found)
-        hand_eye = calibrate_hand_eye(np.array(hands), np.array(seen))
-        _wait(operator, "release the user stop; the arm then goes home")
-        # What a person has guided and looked through must not be lost to a stop still pressed.
-        until_cleared(arm, operator, arm.home)
-        base_T_camera = arm.state().base_T_tcp @ hand_eye.tcp_T_camera
         intrinsics = device.read().intrinsics
-    calibration = _calibration(
-        config,
-        intrinsics,
-        plane_homography(intrinsics, base_T_camera, table),
-        table,
-        method="hand-eye",
-        error_m=hand_eye.error_m,
-        details={
-            "board": board.to_record(),
-            "report": hand_eye.report(),
-            "tcp_T_camera": hand_eye.tcp_T_camera.tolist(),
-        },
-    )
-    path = config.setup / "calibration.json"
-    calibration.save(path)
+        kept = kept_views(config, board, intrinsics)
+
+        def take(index: int) -> HandView:
+            text = (
+                f"view {index + 1} of {max(views, len(kept.items), index + 1)}: guide the hand so "
+                "that it sees the board from elsewhere, tilted by some 25 degrees, and hold still"
+            )
+            while operator.wait(text):
+                try:
+                    corners = find_corners(device.read().rgb, board)
+                    board_pose(corners, board, intrinsics)
+                except InputError as error:
+                    operator.wait(str(error))
+                    continue
+                return HandView(arm.state().base_T_tcp, corners)
+            raise InputError("stopped before all views were taken")
+
+        def fit(taken: list[HandView]) -> HandEye:
+            seen = []
+            for index, view in enumerate(taken):
+                try:
+                    seen.append(board_pose(view.corners, board, intrinsics))
+                except InputError as error:  # of a kept view, after another lens
+                    raise PoorFit(f"view {index + 1}: {error}", worst=index) from error
+            return calibrate_hand_eye(np.array([v.base_T_tcp for v in taken]), np.array(seen))
+
+        with kept.guarded():
+            hand_eye = gather(kept, wanted=views, take=take, fit=fit, operator=operator)
+            confirm(operator, "release the user stop; the arm then goes home")
+            # What a person has guided and looked through must not be lost to a stop still pressed.
+            until_cleared(arm, operator, arm.home)
+            base_T_camera = arm.state().base_T_tcp @ hand_eye.tcp_T_camera
+            calibration = make_calibration(
+                config,
+                intrinsics,
+                plane_homography(intrinsics, base_T_camera, table),
+                table,
+                method="hand-eye",
+                error_m=hand_eye.error_m,
+                details={
+                    "board": board.to_record(),
+                    "report": hand_eye.report(),
+                    "tcp_T_camera": hand_eye.tcp_T_camera.tolist(),
+                },
+            )
+            path = config.setup / "calibration.json"
+            calibration.save(path)
+        kept.remove()
     return {"calibration": path, "report": hand_eye.report(), "error_m": hand_eye.error_m}
 
 
@@ -299,56 +310,3 @@ def photograph_empty(config: RigConfig) -> dict[str, Any]:
 def _check_views(views: int, least: int) -> None:
     if views < least:
         raise InputError(f"--views is {views}; {least} are needed, 15 are better")
-
-
-def _wait(operator: Terminal, text: str) -> None:
-    """Wait until something is done by hand; InputError where the operator stops instead."""
-    if not operator.wait(text):
-        raise InputError("stopped; nothing was written")
-
-
-def _arm(config: RigConfig, table: TablePlane) -> SafeRobot:
-    """The arm that a calibration moves, kept above a table.
-
-    Raises:
-        InputError: it is none, or may not move
-    """
-    if config.robot not in REAL_ROBOTS or not config.execute:
-        raise InputError("this calibration moves an arm: give --robot panda and --execute")
-    limits = SafetyLimits(table=table, max_joint_speed=config.joint_speed)
-    return SafeRobot(open_robot(config), limits)
-
-
-def _lens(config: RigConfig) -> CameraIntrinsics | None:
-    """Intrinsics of a video device; other cameras tell their own."""
-    return read_intrinsics(config.setup / "lens.json") if config.camera == "uvc" else None
-
-
-def _calibration(
-    config: RigConfig,
-    intrinsics: CameraIntrinsics,
-    base_H_pixel: np.ndarray,
-    table: TablePlane,
-    *,
-    method: str,
-    error_m: float,
-    details: dict[str, Any],
-) -> Calibration:
-    return Calibration(
-        robot_id=config.robot_id,
-        camera_id=config.camera_id,
-        home_q=np.array(HOME_Q),
-        intrinsics=intrinsics,
-        base_H_pixel=base_H_pixel,
-        table=table,
-        method=method,
-        error_m=error_m,
-        details=details,
-    )
-
-
-def _marked(rgb: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    picture = rgb.copy()
-    for column, row in np.rint(pixels).astype(int):
-        cv2.circle(picture, (int(column), int(row)), 5, (255, 0, 0), 1)
-    return picture

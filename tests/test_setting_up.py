@@ -189,7 +189,7 @@ def test_the_table_is_asked_for_then_touched_with_homed_fingers(
     assert table.z(np.array([0.5, 0.1])) == pytest.approx(
         spy.true.z(np.array([0.5, 0.1])), abs=1e-4
     )
-    assert "calibrate camera or hand" in found["next"]
+    assert "calibrate camera, points or hand" in found["next"]
     assert "five points" in asked[0][0] and asked[0][1] == 1  # recovered, nothing else
     if kind is Homing:
         assert spy.log[:4] == ["recover", "move_joints", "home_gripper", "grasp"]
