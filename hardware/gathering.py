@@ -93,8 +93,8 @@ def gather(
 ) -> R:
     """Return what `wanted` or more measurements give, taking those that are not kept yet.
 
-    Where the result is refused, the one that fits worst is taken again; where none is, one more.
-    The old one stays in the file until the new one is there.
+    Where the result is refused, the one that fits worst is taken again; where none is, or it was
+    just that one, one more. The old one stays in the file until the new one is there.
 
     Args:
         take: asks for the measurement of an index and returns it
@@ -105,6 +105,7 @@ def gather(
     """
     if kept.items and not operator.wait(kept.where()):
         raise InputError("stopped")
+    again: int | None = None
     while True:
         while len(kept.items) < wanted:
             kept.put(take(len(kept.items)))
@@ -114,7 +115,8 @@ def gather(
             if not operator.go_on(error):
                 raise
             worst = error.worst if isinstance(error, PoorFit) else None
-        if worst is None:
-            wanted = len(kept.items) + 1
+        if worst is None or worst == again:
+            wanted, again = len(kept.items) + 1, None
         else:
             kept.put(take(worst), at=worst)
+            again = worst

@@ -28,6 +28,11 @@ MIN_POINTS = 5
 """Fewest points that give a result: four always fit, a fifth says whether they fit well."""
 MAX_ERROR = 3e-3
 """Greatest error of a calibration [m], rms, by its own measure: half of a cable's width."""
+# With fewer points some four or five always fit well by chance.
+_MIN_TO_BLAME = 7
+# How many times smaller the noise of the others must be: right points reach 1.7 of 9 by chance, one
+# that is 12 mm off 2.8 at least (both 5 %).
+_BLAME = 2.0
 _MIN_SPREAD = 0.02  # [m], standard deviation across the narrow side of the points
 _MAX_BOARD_ERROR = 2e-3  # [m]
 
@@ -67,24 +72,30 @@ class HomographyFit:
 
     @property
     def worst(self) -> int | None:
-        """Index of the point without which the others fit best; None where any four do.
+        """Index of the point without which the others fit much better; None where there is none.
 
         A wrong point also bends the fit that predicts the right ones at the rim, so the largest of
-        `left_out_m` is often that of a right one.
+        `left_out_m` is often that of a right one. What is compared is the noise that each fit
+        finds, by its degrees of freedom: two for each point less the homography's eight.
         """
-        return None if len(self.others_m) <= MIN_POINTS else int(np.argmin(self.others_m))
+        count, wrong = len(self.others_m), int(np.argmin(self.others_m))
+        if count < _MIN_TO_BLAME:
+            return None
+        noise = math.sqrt(float((self.residuals_m**2).sum()) / (2 * count - 8))
+        without = float(self.others_m[wrong]) * math.sqrt((count - 1) / (2 * count - 10))
+        return wrong if noise > _BLAME * without else None
 
     def check(self) -> None:
         """Raise PoorFit where the error exceeds `MAX_ERROR`."""
         if self.error_m <= MAX_ERROR:
             return
-        if self.worst is None:
-            advice = f"{len(self.left_out_m)} points do not tell which is wrong: measure more"
-        else:
-            advice = f"measure point {self.worst + 1} again first"
+        worst = self.worst
+        advice = "no one point is to blame: measure more, farther apart"
+        if worst is not None:
+            advice = f"measure point {worst + 1} again first"
         raise PoorFit(
             f"{self.report()}; allowed: {1e3 * MAX_ERROR:g} mm rms, so it is refused; {advice}",
-            worst=self.worst,
+            worst=worst,
         )
 
     def report(self) -> str:

@@ -85,13 +85,30 @@ def test_a_result_that_blames_none_gets_one_more(tmp_path: Path) -> None:
     assert [text.split("\n")[0] for text in said] == ["all alike", "all alike"]
 
 
+def test_the_same_one_is_not_taken_again_for_ever(tmp_path: Path) -> None:
+    taken: list[int] = []
+
+    def take(index: int) -> int:
+        taken.append(index)
+        return index
+
+    def fit(items: list[int]) -> int:
+        if len(items) < 6:
+            raise PoorFit("number 2 is off", worst=1)
+        return len(items)
+
+    kept = numbers(tmp_path / "n.json")
+    assert gather(kept, wanted=4, take=take, fit=fit, operator=Terminal(lambda _: "")) == 6
+    assert taken == [0, 1, 2, 3, 1, 4, 1, 5]
+
+
 def test_nothing_is_named_where_nothing_was_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     kept = numbers(tmp_path / "n.json")
     with pytest.raises(InputError, match="no; nothing was written"), kept.guarded():
         raise InputError("no")
-    with pytest.raises(CameraError, match="^gone$"), kept.guarded():
+    with pytest.raises(CameraError, match=r"^gone$"), kept.guarded():
         raise CameraError("gone")
     assert capsys.readouterr().err == ""
 

@@ -87,6 +87,8 @@ def test_a_camera_on_the_hand_is_found_by_someone_who_forgets_the_user_stop(tmp_
         said.append(text)
         if "user stop" not in text:
             robot.guide(rng)
+        else:
+            robot.q = HOME + 0.02  # from where the arm may go home
         pressed = len(said) < 2 or "release the user stop" not in said[-2]
         robot.mode = RobotMode.USER_STOPPED if pressed else RobotMode.IDLE
         return ""
