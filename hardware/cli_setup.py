@@ -58,13 +58,15 @@ class CalibrateOptions(CommandOptions):
     """
 
     what: Annotated[
-        Positional[Literal["board", "lens", "table", "camera", "hand", "empty"]],
+        Positional[Literal["board", "lens", "table", "camera", "points", "hand", "empty"]],
         arg(metavar="WHAT"),
     ]
     """board writes the ChArUco board to print; lens measures a video device's intrinsics with it;
     table touches the foam with the closed fingers; camera finds the board, flat on the table, and
-    asks for some of its corners; hand finds a camera on the hand by looking at the board from many
-    sides, and replaces camera; empty takes a picture of the empty foam."""
+    asks for some of its corners; points does without a board: marks on the foam are clicked and
+    touched; hand finds a camera on the hand by looking at the board from many sides; of camera,
+    points and hand one is enough; empty takes a picture of the empty foam. What points and hand
+    have measured is kept when they are stopped, and gone on from."""
     robot: RobotName = "dry_run"
     """The robot that touches."""
     host: str | None = None
@@ -87,6 +89,13 @@ class CalibrateOptions(CommandOptions):
     """Side of the printed board's squares: measure the print."""
     corners: tuple[int, ...] = (0, 5, 18, 23)
     """For `camera`: the board's corners to touch, by number."""
+    points: Annotated[int, arg(metavar="N")] = 9
+    """For `points`: marks to touch, at least 5."""
+    typed: bool = False
+    """For `points`: type each mark's column and row instead of clicking it."""
+    pairs: Annotated[Path | None, arg(metavar="FILE.csv")] = None
+    """For `points`: take them from this file, a line of column, row [px], x, y [m] for each, and
+    move nothing."""
 
     def rig(self) -> RigConfig:
         """What to open."""
@@ -102,7 +111,7 @@ class CalibrateOptions(CommandOptions):
 
 def calibrate(options: CalibrateOptions) -> Outcome:
     """Measure a part of the setup."""
-    from . import setting_up
+    from . import setting_up, touching_points
     from .charuco import BoardSpec
 
     square = options.square_mm / 1e3
@@ -116,8 +125,14 @@ def calibrate(options: CalibrateOptions) -> Outcome:
         data = setting_up.measure_table(rig, provisional_z=options.table_z)
     elif options.what == "camera":
         data = setting_up.measure_camera(rig, board, corner_ids=options.corners)
+    elif options.what == "points" and options.pairs is not None:
+        data = touching_points.points_from_file(rig, options.pairs)
+    elif options.what == "points":
+        show = touching_points.type_point if options.typed else None
+        data = touching_points.measure_points(rig, points=options.points, show=show)
     elif options.what == "hand":
         data = setting_up.measure_hand_eye(rig, board, views=options.views)
     else:
         data = setting_up.photograph_empty(rig)
-    return Outcome(data=data, text="\n".join(f"{key}  {value}" for key, value in data.items()))
+    said = {key: value for key, value in data.items() if not isinstance(value, list)}
+    return Outcome(data=data, text="\n".join(f"{key}  {value}" for key, value in said.items()))

@@ -3,7 +3,8 @@
     board -> lens.json -> table.json -> calibration.json -> empty_view.png
 
 The camera is found by touching corners of a board that it sees from home (`measure_camera`), or by
-looking at a board that nobody touches from many sides (`measure_hand_eye`).
+looking at a board that nobody touches from many sides (`measure_hand_eye`); without a board see
+`touching_points`.
 
 The lens is measured for video devices alone: RealSense and Azure Kinect tell their intrinsics.
 """
