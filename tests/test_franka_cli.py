@@ -152,6 +152,9 @@ def test_a_goal_is_captured_and_read(tmp_path: Path, capfd: pytest.CaptureFixtur
         (["emulate", "--host", "0.0.0.0"], "not an address of this machine"),
         (["calibrate", "table"], "--table-z"),
         (["calibrate", "table", "--table-z", "0.0"], "--execute"),
+        (["calibrate", "points", "--points", "4"], "--points is 4; 5 are needed"),
+        (["calibrate", "points", "--typed", "--setup", "nowhere"], r"table\.json"),
+        (["calibrate", "points", "--pairs", "p.csv"], "whose are the points"),
         (["calibrate", "empty", "--setup", "nowhere"], "calibration"),
         (["calibrate", "nonsense"], "board"),
         ([], "Expected one of"),
@@ -224,10 +227,12 @@ def test_the_documentation_names_every_error_and_says_what_was_not_tried() -> No
         and issubclass(getattr(robot_module, name), RobotError)
     ]
     assert len(names) > 9 and [name for name in names if f"`{name}`" not in text] == []
-    for name in ("CameraError", "SegmentationError", "InputError", "PhysicsError"):
+    for name in ("CameraError", "SegmentationError", "InputError", "PoorFit", "PhysicsError"):
         assert f"`{name}`" in text
     begins = ("accepts no motion", "after recovery", "the arm stands beyond", "too near its limit")
     assert [words for words in (*begins, BUSY) if words not in text] == []
+    refused = ("no one point is to blame", "run the wrong way round", "the same command goes on")
+    assert [words for words in refused if words not in text] == []
     pictures = re.findall(r"\(images/([\w.]+)\)", text)
     assert len(pictures) == 4
     sizes = [(ROOT / "docs" / "images" / name).stat().st_size for name in pictures[:2]]
