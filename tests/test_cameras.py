@@ -297,7 +297,7 @@ def test_nothing_opens_a_window_and_importing_loads_no_vendor() -> None:
     )
     for path in (ROOT / "hardware").rglob("*.py"):
         assert not re.search(r"cv2.imshow|namedWindow|waitKey", path.read_text())
-    vendors = "{'panda_py', 'franky', 'frankapy', 'pyrealsense2', 'pyk4a'}"
+    vendors = "{'panda_py', 'franky', 'frankapy', 'pyk4a', 'pyrealsense2', 'rospy', 'autolab_core'}"
     simulator = "{'torch', 'warp', 'newton'}"
     script = (
         "import sys, hardware\n"
