@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from learning.report import read_runs, write_report
-from learning.schedules import SCHEDULES
+from learning.schedules import preset_schedule
 from learning.share import share_run
 from learning.snapshots import RunFolder, read_json, write_json
 
@@ -34,7 +34,11 @@ def main() -> None:
     for run in found:
         name = f"{run.task}-{run.agent}-{run.demos}-{run.seed}"
         steps = run.settings["schedule"]["steps"]
-        if steps != SCHEDULES[run.settings["preset"]].steps:
+        usual = preset_schedule(
+            run.settings["preset"], task=run.task, demos=run.demos,
+            sees_state=run.agent.startswith("gt-"),
+        )  # fmt: skip
+        if steps != usual.steps:
             name += f"-{steps}-steps"
         target = RunFolder(options.out / "runs" / name)
         target.path.mkdir(parents=True, exist_ok=True)
