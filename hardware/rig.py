@@ -223,6 +223,7 @@ def read_table(path: Path) -> TablePlane:
     Raises:
         InputError: missing or damaged
     """
+    _expect(path, "table")
     record = read_json(path, what="table", schema=1)
     keys = ("height_m", "slope_x", "slope_y")
     return TablePlane(*(float(require(record, k, float, what=f"table {path}")) for k in keys))
@@ -234,5 +235,12 @@ def read_intrinsics(path: Path) -> CameraIntrinsics:
     Raises:
         InputError: missing or damaged
     """
+    _expect(path, "lens")
     record = read_json(path, what="intrinsics", schema=1)
     return CameraIntrinsics.from_record(record, what=f"intrinsics {path}")
+
+
+def _expect(path: Path, what: str) -> None:
+    """Say how to get a measured file that is not there."""
+    if not path.is_file():
+        raise InputError(f"no {path}: `warp-deform franka calibrate {what}` first")

@@ -14,7 +14,7 @@ import pytest
 from franka_episodes import CALIBRATION
 
 from hardware.goal_file import write_picture
-from hardware.rig import open_rig, read_calibration, read_table
+from hardware.rig import open_rig, read_calibration, read_intrinsics, read_table
 from hardware.rig_config import RigConfig
 from hardware.table_plane import TablePlane
 from warp_deform.errors import InputError
@@ -87,3 +87,9 @@ def test_a_picture_is_written_whole_or_not_at_all(
     with pytest.raises(InputError, match="No space left"):
         write_picture(path, np.full((4, 4, 3), 255, np.uint8))
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(("read", "what"), [(read_table, "table"), (read_intrinsics, "lens")])
+def test_what_is_not_measured_yet_says_how_to_get_it(read: Any, what: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=rf"no .*{what}\.json: .*franka calibrate {what}` first"):
+        read(tmp_path / f"{what}.json")

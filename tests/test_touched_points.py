@@ -337,10 +337,10 @@ def test_whose_pairs_and_which_lens_must_be_known(
     (tmp_path / "none.csv").write_bytes(b"\xff\xfe\x00")
     code, _, said = calibrate(capfd, *PANDA, *pairs[:3], str(tmp_path / "none.csv"))
     assert code == 2 and "are no text" in said[-1]
-    for name in ("lens.json", "table.json"):
-        (tmp_path / name).unlink()
+    for step in ("lens", "table"):
+        (tmp_path / f"{step}.json").unlink()
         code, _, said = calibrate(capfd, *PANDA, *pairs)
-        assert code == 2 and f"{name} cannot be read" in said[-1]
+        assert code == 2 and f"`warp-deform franka calibrate {step}` first" in said[-1]
 
 
 def test_a_camera_that_tells_its_intrinsics_is_opened_for_them(tmp_path: Path) -> None:
