@@ -16,6 +16,7 @@ import numpy as np
 from warp_deform.errors import InputError
 
 from .camera import CameraIntrinsics
+from .poor_fit import PoorFit
 
 __all__ = ["MIN_VIEWS", "BoardSpec", "Corners", "board_pose", "calibrate_intrinsics",
            "find_corners"]  # fmt: skip
@@ -131,7 +132,8 @@ def calibrate_intrinsics(
         size: width and height of the pictures [px]
 
     Raises:
-        InputError: too few views, or they do not fit together
+        InputError: too few views
+        PoorFit: they do not fit together to 1 px rms
 
     Source: Zhang, "A flexible new technique for camera calibration", 2000.
     """
@@ -139,10 +141,13 @@ def calibrate_intrinsics(
         raise InputError(f"intrinsics need {MIN_VIEWS} views of the board, not {len(views)}")
     objects = [board.corners_m[view.ids].astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    rms, K, distortion, _, _ = cv2.calibrateCamera(objects, pixels, size, None, None)
+    rms, K, distortion, *_, errors = cv2.calibrateCameraExtended(objects, pixels, size, None, None)
     if not rms <= _MAX_INTRINSICS_ERROR:
-        raise InputError(
+        worst = int(np.argmax(errors))
+        raise PoorFit(
             f"the views fit together to {rms:.2f} px only ({_MAX_INTRINSICS_ERROR:g} allowed); "
-            "glue the board on something flat and hold the camera still"
+            f"take view {worst + 1} again first; glue the board on something flat, hold the camera "
+            "still",
+            worst=worst,
         )
     return CameraIntrinsics(size, K, distortion.ravel()), float(rms)

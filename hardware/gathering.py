@@ -14,8 +14,8 @@ from typing import Generic, TypeVar
 
 from warp_deform.errors import InputError
 
-from .homography import PoorFit
 from .human import Terminal
+from .poor_fit import PoorFit
 
 __all__ = ["Kept", "gather"]
 

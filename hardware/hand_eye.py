@@ -19,7 +19,8 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from .homography import MAX_ERROR, PoorFit
+from .homography import MAX_ERROR
+from .poor_fit import PoorFit
 
 __all__ = ["MIN_POSES", "HandEye", "calibrate_hand_eye"]
 

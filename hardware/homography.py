@@ -19,9 +19,10 @@ from warp_deform.errors import InputError
 
 from .camera import CameraIntrinsics
 from .charuco import BoardSpec, Corners
+from .poor_fit import PoorFit
 from .table_plane import TablePlane
 
-__all__ = ["MAX_ERROR", "MIN_POINTS", "HomographyFit", "PoorFit", "apply_homography",
+__all__ = ["MAX_ERROR", "MIN_POINTS", "HomographyFit", "apply_homography",
            "board_on_table", "fit_homography", "plane_homography", "solve_homography"]  # fmt: skip
 
 MIN_POINTS = 5
@@ -35,18 +36,6 @@ _MIN_TO_BLAME = 7
 _BLAME = 2.0
 _MIN_SPREAD = 0.02  # [m], standard deviation across the narrow side of the points
 _MAX_BOARD_ERROR = 2e-3  # [m]
-
-
-class PoorFit(InputError):
-    """Measurements do not fit together well enough; the message is one line.
-
-    Attributes:
-        worst: index of the one to measure again first; None where they do not tell which
-    """
-
-    def __init__(self, message: str, *, worst: int | None) -> None:
-        self.worst = worst
-        super().__init__(message)
 
 
 @dataclass(frozen=True, eq=False)

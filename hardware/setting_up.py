@@ -19,6 +19,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
+from .board_views import HandView, kept_hand_views, kept_lens_views
 from .camera import Camera, CameraIntrinsics
 from .charuco import (
     MIN_VIEWS,
@@ -31,12 +32,12 @@ from .charuco import (
 from .gathering import gather
 from .goal_file import write_picture
 from .hand_eye import MIN_POSES, HandEye, calibrate_hand_eye
-from .hand_views import HandView, kept_views
-from .homography import PoorFit, board_on_table, fit_homography, plane_homography
+from .homography import board_on_table, fit_homography, plane_homography
 from .human import Terminal
 from .json_file import write_json
 from .measuring import confirm, lens_of, make_calibration, marked, open_arm
 from .operators import until_cleared
+from .poor_fit import PoorFit
 from .rig import open_camera, read_calibration, read_table
 from .rig_config import RigConfig
 from .safety import SafeRobot
@@ -71,8 +72,11 @@ def measure_lens(
 ) -> dict[str, Any]:
     """Measure a video device's intrinsics from views of the board, one an Enter.
 
+    Views are kept in `lens_views.json` until the intrinsics are written: the next call goes on from
+    them, and where they do not fit together the worst is taken again.
+
     Raises:
-        InputError: too few good views, or stopped
+        InputError: too few views, stopped, or kept ones that are not of this setup
         CameraError: the device cannot be opened
     """
     _check_views(views, MIN_VIEWS)
@@ -82,19 +86,26 @@ def measure_lens(
         np.array([[size[0], 0.0, size[0] / 2], [0.0, size[0], size[1] / 2], [0.0, 0.0, 1.0]]),
         np.zeros(0),
     )
-    seen: list[Corners] = []
-    with camera or open_camera(config, rough) as device:
-        while len(seen) < views:
-            text = f"view {len(seen) + 1} of {views}: hold the board still, tilted, elsewhere"
-            if not operator.wait(text):
-                raise InputError("stopped before all views were taken; nothing was written")
-            try:
-                seen.append(find_corners(device.read().rgb, board))
-            except InputError as error:
-                operator.wait(str(error))
-    intrinsics, rms = calibrate_intrinsics(seen, board, size)
+    kept = kept_lens_views(config, board, size)
     path = config.setup / "lens.json"
-    write_json(path, {"schema": 1, **intrinsics.to_record(), "error_px": rms})
+    with camera or open_camera(config, rough) as device:
+
+        def take(index: int) -> Corners:
+            name = f"view {index + 1} of {max(views, len(kept.items), index + 1)}"
+            while operator.wait(f"{name}: hold the board still, tilted, elsewhere"):
+                try:
+                    return find_corners(device.read().rgb, board)
+                except InputError as error:
+                    operator.wait(str(error))
+            raise InputError("stopped before all views were taken")
+
+        def fit(taken: list[Corners]) -> tuple[CameraIntrinsics, float]:
+            return calibrate_intrinsics(taken, board, size)
+
+        with kept.guarded():
+            intrinsics, rms = gather(kept, wanted=views, take=take, fit=fit, operator=operator)
+            write_json(path, {"schema": 1, **intrinsics.to_record(), "error_px": rms})
+    kept.remove()
     return {"lens": path, "error_px": rms}
 
 
@@ -242,7 +253,7 @@ def measure_hand_eye(
         camera or open_camera(config, lens) as device,
     ):
         intrinsics = device.read().intrinsics
-        kept = kept_views(config, board, intrinsics)
+        kept = kept_hand_views(config, board, intrinsics)
 
         def take(index: int) -> HandView:
             text = (

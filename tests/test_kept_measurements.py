@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from board_photographs import BOARD, INTRINSICS, SIZE, TABLE
+from board_photographs import BOARD, INTRINSICS, SIZE, TABLE, rotation
 from safety_spy import HOME, SpyRobot
 from test_setting_up import BASE_T_BOARD, TCP_T_CAMERA, GuidedRobot, setup
 
@@ -17,12 +17,14 @@ from hardware.calibration import Calibration
 from hardware.camera import CameraError, Frame
 from hardware.charuco import BoardSpec, Corners
 from hardware.gathering import Kept, gather
-from hardware.homography import PoorFit
 from hardware.human import Terminal
 from hardware.json_file import write_json
+from hardware.poor_fit import PoorFit
+from hardware.rig import read_intrinsics
+from hardware.rig_config import RigConfig
 from hardware.safety import SafeRobot
 from hardware.safety_limits import SafetyLimits
-from hardware.setting_up import measure_hand_eye
+from hardware.setting_up import measure_hand_eye, measure_lens
 from warp_deform.errors import InputError
 
 VIEWS = 10
@@ -296,3 +298,86 @@ def test_kept_views_of_another_setup_are_refused(
     assert "\n" not in str(caught.value) and "views.json" in str(caught.value)
     assert bench.asked == [] and path.read_bytes() == before
     assert isinstance(bench.robot, SpyRobot) and not bench.robot.joints
+
+
+# The lens.
+
+
+class Desk:
+    """A video device and a board held before it, which moves while some views are taken."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, moved: tuple[int, ...] = ()) -> None:
+        self.rng = np.random.default_rng(2)
+        self.moved = moved
+        self.seen = 0
+        self.asked: list[str] = []
+        self.stop: tuple[str, ...] = ()
+        monkeypatch.setattr("hardware.setting_up.find_corners", self.corners)
+
+    def corners(self, rgb: np.ndarray, board: BoardSpec) -> Corners:
+        self.seen += 1
+        R = rotation(*self.rng.uniform(-0.5, 0.5, 3))
+        at = [*self.rng.uniform([-0.12, -0.06], [0.12, 0.06]), self.rng.uniform(0.35, 0.6)]
+        pixels, _ = cv2.projectPoints(
+            BOARD.corners_m, cv2.Rodrigues(R)[0], at - R @ BOARD.corners_m.mean(axis=0),
+            INTRINSICS.matrix, INTRINSICS.distortion,
+        )  # fmt: skip
+        noise = self.rng.normal(0.0, 20.0 if self.seen in self.moved else 0.1, (len(pixels), 2))
+        return Corners(np.arange(len(pixels)), pixels.reshape(-1, 2) + noise)
+
+    def answer(self, text: str) -> str:
+        self.asked.append(text)
+        return "q" if any(word in text for word in self.stop) else ""
+
+    def measure(self, folder: Path) -> dict[str, object]:
+        self.asked.clear()
+        return measure_lens(
+            RigConfig(setup=folder, camera="uvc"), BOARD, views=VIEWS, camera=BlindCamera(),
+            operator=Terminal(self.answer),
+        )  # fmt: skip
+
+    @property
+    def views(self) -> list[str]:
+        """Which views were asked for."""
+        return [text.split(":")[0] for text in self.asked if text.startswith("view")]
+
+
+def test_a_lens_takes_the_view_again_that_moved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = Desk(monkeypatch, moved=(4,))
+    found = desk.measure(tmp_path)
+    assert desk.views == [f"view {n} of 10" for n in [*range(1, 11), 4]]
+    assert found["error_px"] < 0.3  # type: ignore[operator]
+    np.testing.assert_allclose(
+        read_intrinsics(tmp_path / "lens.json").matrix, INTRINSICS.matrix, atol=8.0
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["lens.json"]
+
+
+def test_a_stopped_lens_goes_on_and_a_refused_one_keeps_its_views(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = Desk(monkeypatch, moved=(4,))
+    desk.stop = ("view 1 ",)
+    with pytest.raises(InputError, match="all views were taken; nothing was written"):
+        desk.measure(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    desk.stop = ("view 7 ",)
+    with pytest.raises(InputError, match=r"6 views are kept in .*lens_views\.json"):
+        desk.measure(tmp_path)
+    desk.stop = ("px only",)
+    with pytest.raises(InputError, match=r"take view 4 again .*10 views are kept"):
+        desk.measure(tmp_path)
+    assert desk.views == [f"view {n} of 10" for n in range(7, 11)]
+    assert [path.name for path in tmp_path.iterdir()] == ["lens_views.json"]
+    desk.stop = ()
+    desk.measure(tmp_path)
+    assert desk.views == ["view 4 of 10"]
+    assert [path.name for path in tmp_path.iterdir()] == ["lens.json"]
+
+
+def test_views_of_another_video_device_are_refused(tmp_path: Path) -> None:
+    write_json(tmp_path / "lens_views.json", {"schema": 1, "camera_id": "uvc 3", "views": []})
+    with pytest.raises(InputError, match=r"lens_views\.json are of the camera_id uvc 3, not uvc;"):
+        measure_lens(RigConfig(setup=tmp_path, camera="uvc"), BOARD, operator=Terminal(input))

@@ -16,10 +16,11 @@ from test_kept_measurements import BlindCamera
 from test_setting_up import setup
 
 from hardware.calibration import Calibration
-from hardware.homography import PoorFit, apply_homography, plane_homography
+from hardware.homography import apply_homography, plane_homography
 from hardware.human import Terminal
 from hardware.json_file import write_json
 from hardware.points_file import TouchedPoint, read_points, write_points
+from hardware.poor_fit import PoorFit
 from hardware.rig import read_calibration
 from hardware.rig_config import RigConfig
 from hardware.safety import SafeRobot
