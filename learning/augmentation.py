@@ -9,6 +9,7 @@ Source: Seita et al., ICRA 2021, appendix on training; Zeng et al., CoRL 2020, d
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,9 +18,9 @@ import numpy as np
 from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE, TABLE_GRID, PixelGrid
 from warp_deform.tasks.ground_truth import YAW_SCALE
-from warp_deform.tasks.metrics import wrap_angle
 
-__all__ = ["RigidTransform", "draw_transform", "move_action", "move_picture", "move_state"]
+__all__ = ["RigidTransform", "draw_transform", "move_actions", "move_picture",
+           "move_points", "move_states"]  # fmt: skip
 
 _TURN = 2 * math.pi / 6
 """Standard deviation of the turn [rad]."""
@@ -74,20 +75,15 @@ class RigidTransform:
     def matrix(self) -> np.ndarray:
         """(2, 3) float64, of column and row [pixels]."""
         c, s = math.cos(self.turn), math.sin(self.turn)
-        linear = np.array([[c, -s], [s, c]]) @ np.diag([1.0, self.handed])
-        return np.column_stack([linear, _PIVOT + self.shift - linear @ _PIVOT])
+        linear = np.array([[c, -s * self.handed], [s, c * self.handed]])
+        matrix = np.empty((2, 3))
+        matrix[:, :2], matrix[:, 2] = linear, _PIVOT + self.shift - linear @ _PIVOT
+        return matrix
 
     def of_pixels(self, pixels: np.ndarray) -> np.ndarray:
         """Where pixels (n, 2), row and column, go: float64 (n, 2)."""
         moved = self.matrix() @ np.column_stack([pixels[:, ::-1], np.ones(len(pixels))]).T
         return np.asarray(moved.T[:, ::-1])
-
-    def of_world(self, xy: np.ndarray) -> np.ndarray:
-        """Where world points (n, 2) [m] go."""
-        matrix = self.matrix()
-        origin = self.grid.to_world(np.zeros(2))
-        shift = matrix[:, 2] * self.grid.pixel_size
-        return np.asarray((xy - origin) @ matrix[:, :2].T + shift + origin)
 
 
 def draw_transform(
@@ -137,28 +133,40 @@ def move_picture(
     return moved_color, moved_height
 
 
-def move_action(action: np.ndarray, transform: RigidTransform) -> np.ndarray:
-    """An action (7,) with pick and place moved; yaws stay, as in the original, or are mirrored."""
-    moved = np.array(action, dtype=float)
-    moved[[2, 5]] *= transform.handed
-    moved[[0, 1]], moved[[3, 4]] = transform.of_world(np.stack([action[:2], action[3:5]]))
+def move_actions(actions: np.ndarray, transforms: Sequence[RigidTransform]) -> np.ndarray:
+    """Actions (B, 7), with pick and place moved; yaws stay, as in the original, or are mirrored."""
+    moved = np.array(actions, dtype=float)
+    moved[:, [2, 5]] *= np.array([each.handed for each in transforms])[:, None]
+    for x, y in ((0, 1), (3, 4)):
+        moved[:, [x, y]] = move_points(moved[:, None, [x, y]], transforms)[:, 0]
     return moved
 
 
-def move_state(task: str, state: np.ndarray, transform: RigidTransform) -> np.ndarray:
-    """A task's ground-truth state (D,) float32, moved.
+def move_states(task: str, states: np.ndarray, transforms: Sequence[RigidTransform]) -> np.ndarray:
+    """A task's ground-truth states (B, D) float32, each moved.
 
     Raises:
         InputError: the task's ground truth has another size, or the task is not the benchmark's.
     """
-    kinds = _ROWS.get(task, ())
-    if len(state) != 3 * sum(count for _, count in kinds):
-        raise InputError(f"{task}: a ground truth of {len(state)} numbers cannot be moved")
-    rows = state.reshape(-1, 3).astype(float)
-    kind = np.repeat([name for name, _ in kinds], [count for _, count in kinds])
+    kinds, (count, size) = _ROWS.get(task, ()), states.shape
+    if size != 3 * sum(of_kind for _, of_kind in kinds):
+        raise InputError(f"{task}: a ground truth of {size} numbers cannot be moved")
+    rows = states.reshape(count, -1, 3).astype(float)
+    kind = np.repeat([name for name, _ in kinds], [of_kind for _, of_kind in kinds])
     placed, turned = (kind == _POSE) | (kind == _POINT), kind == _POSE
-    rows[placed, :2] = transform.of_world(rows[placed, :2])
-    rows[kind == _VECTOR, :2] = rows[kind == _VECTOR, :2] @ transform.matrix()[:, :2].T
-    yaw = -YAW_SCALE * rows[turned, 2] * transform.handed + transform.turn
-    rows[turned, 2] = -np.array([wrap_angle(each) for each in yaw]) / YAW_SCALE
-    return rows.ravel().astype(np.float32)
+    linear = np.array([each.matrix()[:, :2] for each in transforms])
+    rows[:, placed, :2] = move_points(rows[:, placed, :2], transforms)
+    rows[:, kind == _VECTOR, :2] = rows[:, kind == _VECTOR, :2] @ linear.transpose(0, 2, 1)
+    handed, turn = np.array([(each.handed, each.turn) for each in transforms]).T[..., None]
+    yaw = -YAW_SCALE * rows[:, turned, 2] * handed + turn
+    rows[:, turned, 2] = -np.arctan2(np.sin(yaw), np.cos(yaw)) / YAW_SCALE
+    return rows.reshape(count, size).astype(np.float32)
+
+
+def move_points(xy: np.ndarray, transforms: Sequence[RigidTransform]) -> np.ndarray:
+    """World points (B, n, 2) [m], those of every entry moved by its transform."""
+    matrix = np.array([each.matrix() for each in transforms])
+    origin = np.array([each.grid.to_world(np.zeros(2)) for each in transforms])[:, None]
+    pixel = np.array([each.grid.pixel_size for each in transforms])[:, None]
+    shift = (matrix[:, :, 2] * pixel)[:, None]
+    return np.asarray((xy - origin) @ matrix[:, :, :2].transpose(0, 2, 1) + shift + origin)

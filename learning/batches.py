@@ -12,7 +12,7 @@ from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE
 from warp_deform.tasks.task import Task
 
-from .augmentation import draw_transform, move_action, move_picture, move_state
+from .augmentation import draw_transform, move_actions, move_picture, move_states
 from .dataset import Demonstrations
 from .models.gt_state import encode_action
 from .models.transporter import Batch, Transporter
@@ -110,18 +110,18 @@ def state_batch(
     Raises:
         InputError: a lift is no stage's.
     """
-    states, actions = [], []
+    grid, copies = data.task.grid, data.task.rotated_copies
+    found, transforms = [], []
     for state, action in (data.state(*each) for each in moments):
-        if augment:
-            grid, copies = data.task.grid, data.task.rotated_copies
-            moved = draw_transform(action, rng=rng, grid=grid, copies=copies)
-            state = move_state(data.task.name, state, moved)
-            action = move_action(action, moved)
-        states.append(state)
-        actions.append(action)
-    target = encode_action(np.stack(actions))
+        found.append((state, action))
+        if augment:  # drawn between the moments, which `rng` may draw too
+            transforms.append(draw_transform(action, rng=rng, grid=grid, copies=copies))
+    states, actions = (np.stack(each) for each in zip(*found, strict=True))
+    if augment:
+        states = move_states(data.task.name, states, transforms)
+        actions = move_actions(actions, transforms)
     indices = torch.tensor([_lift_index(action, lifts) for action in actions])
-    return torch.from_numpy(np.stack(states)), torch.from_numpy(target), indices
+    return torch.from_numpy(states), torch.from_numpy(encode_action(actions)), indices
 
 
 def _lift_index(

@@ -13,13 +13,21 @@ from learning import augmentation
 from learning.augmentation import (
     RigidTransform,
     draw_transform,
-    move_action,
+    move_actions,
     move_picture,
-    move_state,
+    move_points,
+    move_states,
 )
 from warp_deform.errors import InputError
 from warp_deform.objects.cable import CableConfig
-from warp_deform.rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world, world_to_pixel
+from warp_deform.rendering.pixels import (
+    PIXEL_SIZE,
+    SHAPE,
+    TABLE_GRID,
+    PixelGrid,
+    pixel_to_world,
+    world_to_pixel,
+)
 from warp_deform.tasks.block import BlockNotarget
 from warp_deform.tasks.ground_truth import pose_rows
 from warp_deform.tasks.registry import TASKS
@@ -36,7 +44,7 @@ def test_world_and_pixels_move_alike(turn: float, shift: tuple[float, float]) ->
     moved = RigidTransform(turn, shift)
     pixels = np.array([[0.0, 0.0], [319.0, 159.0], [100.0, 20.0]])
     expected = pixel_to_world(moved.of_pixels(pixels))
-    assert np.abs(moved.of_world(pixel_to_world(pixels)) - expected).max() < 1e-12
+    assert np.abs(move_points(pixel_to_world(pixels)[None], [moved])[0] - expected).max() < 1e-12
 
 
 @settings(derandomize=True, deadline=None, max_examples=50)
@@ -81,8 +89,9 @@ def test_a_mirror_image_moves_pictures_actions_and_states_alike(
     assert np.argwhere(seen).mean(axis=0) == pytest.approx([row, column], abs=1.0)
     # A body that turns with the place: its mirror image turns the other way.
     heading = np.array([math.cos(ACTION[5]), math.sin(ACTION[5])])
-    ahead = moved.of_world(np.stack([ACTION[3:5], ACTION[3:5] + 0.1 * heading]))
-    action = move_action(ACTION, moved)
+    here = np.stack([ACTION[3:5], ACTION[3:5] + 0.1 * heading])
+    ahead = move_points(here[None], [moved])[0]
+    action = move_actions(ACTION[None], [moved])[0]
     assert action[3:5] == pytest.approx(ahead[0]) and action[5] == -ACTION[5]
     state = np.zeros(6, np.float32)
     state[:3] = pose_rows(np.array([*ACTION[3:5], 0.02]), ACTION[5])
@@ -126,13 +135,13 @@ def test_what_fits_no_picture_is_refused(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_an_action_keeps_its_yaws_and_lift() -> None:
     moved = RigidTransform(0.5, (3.0, -4.0))
-    action = move_action(ACTION, moved)
+    action = move_actions(ACTION[None], [moved])[0]
     assert action[[2, 5, 6]].tolist() == ACTION[[2, 5, 6]].tolist()
     lengths = [np.hypot(*(a[:2] - a[3:5])) for a in (ACTION, action)]
     assert lengths[0] == pytest.approx(lengths[1])
     centre = np.array([0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.04])
     shifted = np.array([0.5 + 3 * PIXEL_SIZE, -4 * PIXEL_SIZE])
-    assert move_action(centre, moved)[:2] == pytest.approx(shifted)
+    assert move_actions(centre[None], [moved])[0, :2] == pytest.approx(shifted)
 
 
 def test_a_pose_turns_by_the_turn() -> None:
@@ -141,6 +150,11 @@ def test_a_pose_turns_by_the_turn() -> None:
     yaws = np.array([0.2 + math.pi / 2, 3.0 - 1.5 * math.pi])
     expected = pose_rows(np.array([[0.4, 0.0], [0.5, -0.1]]), yaws).ravel()
     assert after == pytest.approx(expected, abs=1e-6)
+
+
+def move_state(task: str, state: np.ndarray, transform: RigidTransform) -> np.ndarray:
+    """One state (D,), moved."""
+    return move_states(task, state[None], [transform])[0]
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -154,6 +168,24 @@ def test_every_tasks_state_moves_rigidly_and_back(name: str) -> None:
     assert np.abs(back - state).max() < 1e-6
     heights = move_state(name, state, RigidTransform(0.0, (8.0, 0.0))).reshape(-1, 3)
     assert (np.abs(heights - state.reshape(-1, 3)).max(axis=0)[1:] < 1e-6).all()
+
+
+def test_what_moves_together_moves_as_alone() -> None:
+    """Also among mirror images, and with a grid of its own."""
+    rng = np.random.default_rng(4)
+    fine = PixelGrid((0.3, -0.2), PIXEL_SIZE / 2)
+    transforms = [RigidTransform(0.7 * i, (3.0 * i, -i), (TABLE_GRID, fine)[i % 2], i > 2)
+                  for i in range(6)]  # fmt: skip
+    states = rng.uniform(-0.2, 0.2, (6, TASKS["bag-color-goal"].ground_truth_size))
+    states = states.astype(np.float32)
+    actions = rng.uniform(-0.3, 0.3, (6, 7))
+    together = move_states("bag-color-goal", states, transforms)
+    for i, each in enumerate(transforms):
+        assert together[i].tolist() == move_state("bag-color-goal", states[i], each).tolist()
+    together = move_actions(actions, transforms)
+    for i, each in enumerate(transforms):
+        assert together[i].tolist() == move_actions(actions[i : i + 1], [each])[0].tolist()
+    assert len(np.unique(together, axis=0)) == 6
 
 
 def test_colours_and_displacements_of_bags_are_not_shifted() -> None:

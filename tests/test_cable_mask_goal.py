@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_deform  # noqa: F401  registers the ids
-from learning.augmentation import RigidTransform, draw_transform, move_action, move_state
+from learning.augmentation import RigidTransform, draw_transform, move_actions, move_states
 from warp_deform.demonstrators import demonstrator
 from warp_deform.episode_loop import SOLVED, play
 from warp_deform.episodes import EpisodeReader, EpisodeWriter
@@ -243,11 +243,11 @@ def test_augmentation_turns_into_24_copies_on_the_tasks_own_grid() -> None:
     assert parts <= set(range(24)) and len(parts) > 18
     for transform in drawn[:20]:
         pixels = TASK.grid.fractional(action[None, :2])
-        moved = move_action(action, transform)
+        moved = move_actions(action[None], [transform])[0]
         assert TASK.grid.fractional(moved[:2]) == pytest.approx(transform.of_pixels(pixels)[0])
         assert (
             (TASK.grid.to_pixel(moved[:2]) >= 0) & (TASK.grid.to_pixel(moved[:2]) < SHAPE)
         ).all()
-    state = np.zeros(540, np.float32)
-    assert move_state(NAME, state, drawn[0]).shape == (540,)
+    states = np.zeros((2, 540), np.float32)
+    assert move_states(NAME, states, drawn[:2]).shape == (2, 540)
     assert RigidTransform(0.0, (0.0, 0.0)).grid == TABLE_GRID == find_task("cable-ring").grid
