@@ -54,6 +54,29 @@ def test_turned_maps_give_turned_maps(reads: Field, gives: Field, size: int, qua
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("pictures", "subpixels"), [(1, 1), (2, 2), (None, 1)])
+def test_gradients_come_back_to_the_weights_they_are_of(
+    pictures: int | None, subpixels: int
+) -> None:
+    """A kernel is linear in its weights: <kernel(w), g> = <w, gradient>, for any w and g."""
+    if pictures is None:
+        convolution = QuarterTurnConvolution(8, 12, 3)
+    else:
+        seen = 6 * pictures * subpixels**2
+        convolution = QuarterTurnConvolution(
+            seen, 12, 3, reads="plain", pictures=pictures, subpixels=subpixels
+        )
+    convolution.draw(generator())
+    kernel = convolution.kernel()
+    g = torch.randn(kernel.shape, generator=generator(3))
+    (gradient,) = torch.autograd.grad(kernel, convolution.weight, g)
+    assert kernel.shape == (12, convolution.channels[0], 3, 3)
+    for seed in range(4):
+        torch.nn.init.normal_(convolution.weight, generator=generator(seed))
+        ahead, back = (convolution.kernel() * g).sum(), (convolution.weight * gradient).sum()
+        torch.testing.assert_close(ahead, back, atol=1e-4, rtol=1e-5)
+
+
 def test_a_turned_kernel_holds_the_learnt_weights() -> None:
     """Only one map in four is learnt, and its kernel is the first of each four."""
     convolution = QuarterTurnConvolution(8, 12, 3)
