@@ -1,12 +1,14 @@
-"""CPU time of a training step and of acting, against the original's TensorFlow code.
+"""CPU time of a training step and of acting, against the original's in TensorFlow.
 
-    python benchmarks/models.py --json
+    python benchmarks/models.py [--tensorflow PYTHON] [--json]
 
 One thread, batch 1, process CPU time, median: a step is attention, transport and lift forward,
-their gradients and Adam. The reference is the original's training step of a Transporter on
-TensorFlow 2.14, with one rotation: 16.1 CPU s, measured once on a machine of the same kind while
-others used it, with all threads; not run here. Ratios of `fast` compare a smaller network with
-it, ratios of Goal-Split one with an additional network. The paper's size takes minutes in sum.
+their gradients and Adam. With --tensorflow, an interpreter that has TensorFlow, the same agent of
+the original (tensorflow_peer.py) takes its steps in the same run, before ours and after them: a
+machine's speed drifts. Without it ratios are to 16.1 CPU s, a step of the original's Transporter
+with TensorFlow 2.14 and all threads, measured once on a machine of the same kind while others used
+it. Rotations are 24 where nothing else is said, 1 in TensorFlow and `fast`. The paper's size takes
+minutes.
 """
 
 from __future__ import annotations
@@ -14,8 +16,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import subprocess
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -32,6 +36,7 @@ from learning.models.transporter import (
 
 TENSORFLOW_STEP = 16.1
 """CPU time of the original's training step [s]."""
+PEER = Path(__file__).with_name("tensorflow_peer.py")
 AGENTS = {agent.name: agent for agent in (Transporter, GoalSplit, GoalStack)}
 
 
@@ -85,8 +90,15 @@ def measure(agent_name: str, config: TransporterConfig, repeats: int) -> dict[st
         "step_s": trained,
         "act_s": median(lambda: agent.act(image), repeats),
         "steps_20000_h": 20_000 * trained / 3600,
-        "tensorflow_ratio": TENSORFLOW_STEP / trained,
     }
+
+
+def tensorflow_steps(python: str, agent: str, steps: int) -> list[float]:
+    """CPU times of steps of the original [s], measured now."""
+    command = [python, str(PEER), "--agent", agent, "--steps", str(steps)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    found: list[float] = json.loads(done.stdout.splitlines()[-1])["step_s"]
+    return found
 
 
 def main() -> None:
@@ -99,20 +111,32 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=3, help="steps of every kind; fast: 5 times")
     parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
+    parser.add_argument("--tensorflow", metavar="PYTHON", help="interpreter with TensorFlow")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rows = {}
     for agent in arguments.agents:
+        python, peer = arguments.tensorflow, []
+        if python:
+            peer += tensorflow_steps(python, agent, arguments.repeats)
+        found = {}
         for name in arguments.configurations:
             config = configurations()[name]
             repeats = arguments.repeats * (5 if config.scale > 1 else 1)
-            row = rows[f"{agent}, {name}"] = measure(agent, config, repeats)
+            row = found[name] = rows[f"{agent}, {name}"] = measure(agent, config, repeats)
             print(
                 f"{agent:12} {name:24} step {row['step_s']:6.3f} s   act {row['act_s']:6.3f} s   "
-                f"20,000 steps {row['steps_20000_h']:5.1f} h   "
-                f"TensorFlow / this {row['tensorflow_ratio']:5.1f}",
+                f"20,000 steps {row['steps_20000_h']:5.1f} h",
                 flush=True,
             )
+        if python:
+            peer += tensorflow_steps(python, agent, arguments.repeats)
+            print(f"{agent:12} {'TensorFlow':24} step {np.median(peer):6.3f} s, "
+                  f"{min(peer):.3f} to {max(peer):.3f}")  # fmt: skip
+        for name, row in found.items():
+            row["tensorflow_step_s"] = float(np.median(peer)) if peer else TENSORFLOW_STEP
+            row["tensorflow_ratio"] = row["tensorflow_step_s"] / row["step_s"]
+            print(f"{agent:12} {name:24} TensorFlow / this {row['tensorflow_ratio']:5.1f}")
     if arguments.json:
         print(json.dumps(rows))
 
