@@ -79,8 +79,8 @@ class QuarterTurnConvolution(nn.Module):
             learnt = torch.arange(count).reshape(self.weight[:1].shape)
             places = torch.stack([self._turned(learnt, turn).flatten() for turn in range(TURNS)])
             origins = places.argsort(dim=1) + count * torch.arange(TURNS)[:, None]
-            self.register_buffer("places", places, persistent=False)
-            self.register_buffer("origins", origins, persistent=False)
+            self.register_buffer("places", places.flatten(), persistent=False)
+            self.register_buffer("origins", origins.flatten(), persistent=False)
 
     def draw(self, generator: torch.Generator) -> None:
         """Initial weights: Glorot-uniform by the channels that meet, biases zero.
@@ -122,20 +122,21 @@ class QuarterTurnConvolution(nn.Module):
 
 
 class _Turned(torch.autograd.Function):
-    """Weights (n, k) -> (n, TURNS, k), each map's in its order; one gather, and one back.
+    """Weights (n, k) -> (n, TURNS k), each map's in its order; one gather, and one back.
 
-    Rolling, turning and stacking them took a quarter of a training step of `fast`.
+    Rolling, turning and stacking them took a quarter of a training step of `fast`; `index_select`
+    is several times faster here than an index in brackets.
     """
 
     @staticmethod
     def forward(ctx: Any, weight: Tensor, places: Tensor, origins: Tensor) -> Tensor:
         ctx.save_for_backward(origins)
-        return weight[:, places]
+        return weight.index_select(1, places)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (origins,) = ctx.saved_tensors
-        back = gradient.flatten(1)[:, origins]
+        back = gradient.index_select(1, origins).unflatten(1, (TURNS, -1))
         total = back[:, TURNS - 1]
         for turn in reversed(range(TURNS - 1)):
             total = total + back[:, turn]
