@@ -35,7 +35,8 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     trained = train(
         TrainConfig(
             task=options.task, agent=options.agent, data=data, out=run, preset="fast",
-            demos=options.demos, seed=options.seed,
+            demos=options.demos, seed=options.seed, validate=options.validate,
+            patience=1 if options.validate else None,
         )
     )  # fmt: skip
     evaluating = time.perf_counter()
@@ -66,6 +67,9 @@ def main() -> None:
     parser.add_argument("--demos", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--validate", type=int, default=0,
+                        help="validation episodes of every snapshot; training ends where they show "
+                        "no gain, or nothing to gain")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark"))
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()

@@ -87,6 +87,7 @@ def known(run: RunFolder, step: int, protocol: Protocol) -> bool:
 def stopped_early(run: RunFolder) -> bool:
     """Whether a run's validation brought nothing better for as long as its `patience` allows.
 
+    Or can bring nothing better: every episode was solved in full, and the earliest best is chosen.
     By what is kept in the folder, for the versions that trained; nothing is played.
 
     Raises:
@@ -102,8 +103,9 @@ def stopped_early(run: RunFolder) -> bool:
         kept = _Kept(run, step, protocol, by=settings.get("versions"))
         if kept.whole:
             found = summarise([kept.played[seed] for seed in protocol.seeds], task=kept.task)
-            values.append(found[measure(kept.task)])
-    return len(values) - 1 - int(np.argmax(values or [0])) >= patience
+            values.append(found[measure(kept.task)] / (1 if partial_credit(kept.task) else 100))
+    waited = len(values) - 1 - int(np.argmax(values or [0]))
+    return max(values, default=0.0) >= 1.0 or waited >= patience
 
 
 def trained_steps(run: RunFolder) -> int:

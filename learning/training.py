@@ -61,7 +61,8 @@ class TrainConfig:
     threads: of torch, a process; another number may change the last bits
     hold_out: further demonstrations, not learnt from, on which every snapshot's loss is measured
     validate: validation episodes that every snapshot plays; 0 plays none
-    patience: stop when so many snapshots in a row brought no better validation; None never stops
+    patience: stop when so many snapshots in a row brought no better validation, or one solved all
+        in full; None never stops
     untrained: also a snapshot of the initial weights, step 0, where a learning curve begins
     progress: show a bar on a terminal
     """

@@ -149,9 +149,12 @@ def test_a_run_that_stopped_early_is_finished(run: RunFolder) -> None:
     settle(run, patience=2)
     assert not stopped_early(run)
     settle(run, patience=1)
-    for seed in validation.seeds:
-        kept[2].add(Played(seed, True, 1.0, 1, ""))
+    first, second = validation.seeds
+    kept[2].add(Played(first, True, 1.0, 1, ""))
     assert not stopped_early(run), "it was getting better"
+    kept[2].add(Played(second, True, 1.0, 1, ""))
+    assert stopped_early(run), "it cannot get better"
+    kept[2].add(Played(second, False, 0.5, 1, ""))
     with pytest.raises(InputError, match="to its end"):
         evaluate_run(run.path, episodes=1, progress=False)
 
