@@ -27,6 +27,7 @@ from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE
 
 from .attention import Attention
+from .choice import choose
 from .images import CHANNELS, image_tensor
 from .lift import LiftHead
 from .resnet import STRIDE, NetworkConfig
@@ -39,7 +40,7 @@ Picture = tuple[np.ndarray, np.ndarray]
 """Colour (320, 160, 3) uint8 and height (320, 160) float32 [m], as in an observation."""
 
 
-_MOST_ROTATIONS, _MOST_LIFT = 360, 1.0  # far beyond what is sensible: a file may say anything
+_MOST_CHOICES, _MOST_LIFT = 360, 1.0  # far beyond what is sensible: a file may say anything
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +80,8 @@ class TransporterConfig:
     """Place rotations told apart in training; 24 are steps of 15 degrees."""
     n_rotations_eval: int = 1
     """Place rotations considered when acting; with 1 the place yaw is always 0."""
+    picks: int = 1
+    """The most probable picks are weighed by how sure their places are; 1 takes the first."""
     lifts: tuple[float, ...] = (0.04,)
     """Lifts of the task's stages [m]; with one there is nothing to predict and no lift head."""
     bfloat16: bool = False
@@ -92,10 +95,10 @@ class TransporterConfig:
             raise InputError(f"scale: must divide the picture into eights, got {self.scale}")
         if self.crop < STRIDE or self.crop % STRIDE:
             raise InputError(f"crop: a multiple of {STRIDE} pixels is needed, got {self.crop}")
-        for name in ("n_rotations_train", "n_rotations_eval"):
-            if not 1 <= getattr(self, name) <= _MOST_ROTATIONS:
+        for name in ("n_rotations_train", "n_rotations_eval", "picks"):
+            if not 1 <= getattr(self, name) <= _MOST_CHOICES:
                 raise InputError(
-                    f"{name}: 1 to {_MOST_ROTATIONS} are possible, got {getattr(self, name)}"
+                    f"{name}: 1 to {_MOST_CHOICES} are possible, got {getattr(self, name)}"
                 )
         if not (0 < self.gain < math.inf and 0 <= self.focus < math.inf):
             raise InputError(f"gain {self.gain} and focus {self.focus}: must not be negative")
@@ -154,6 +157,7 @@ PRESETS = {
         pad_features=True,
         goal_bias=1.0,
         n_rotations_train=1,
+        picks=5,
     ),
 }
 
@@ -301,7 +305,7 @@ class Transporter(nn.Module):
 
     @torch.no_grad()
     def act(self, image: Tensor, *, avoid: Tensor | None = None) -> PixelActions:
-        """Most likely pick, then place and lift given the pick, for images (B, 4 k, H, W).
+        """Pick and place that are likely together, then the lift, for images (B, 4 k, H, W).
 
         avoid: (B, H, W) bool, network pixels that are not to be picked; not all of a picture
 
@@ -309,16 +313,24 @@ class Transporter(nn.Module):
             InputError: an image of another shape.
         """
         self._check(image)
-        n, (rows, columns) = self.config.n_rotations_eval, self.config.shape
+        n = self.config.n_rotations_eval
         heat = self.attention(image)
         if avoid is not None:
             heat = heat.masked_fill(avoid.to(heat.device), -math.inf)
-        best = heat.flatten(1).argmax(dim=1).cpu()
-        pick = torch.stack([best // columns, best % columns], dim=1)
-        best = self.transport(image, pick, n_rotations=n).flatten(1).argmax(dim=1).cpu()
-        rotation, best = best // (rows * columns), best % (rows * columns)
-        place = torch.stack([best // columns, best % columns], dim=1)
-        yaw = -rotation.double().numpy() * (2 * math.pi / n)
+        choices = [
+            choose(
+                heat[k].cpu(),
+                lambda pick, seen=image[k : k + 1]: (  # type: ignore[misc]
+                    self.transport(seen, pick[None], n_rotations=n)[0].cpu()
+                ),
+                picks=self.config.picks,
+            )
+            for k in range(len(image))
+        ]
+        pick, place = (
+            torch.stack([getattr(each, name) for each in choices]) for name in ("pick", "place")
+        )
+        yaw = -np.array([float(each.rotation) for each in choices]) * (2 * math.pi / n)
         choice = np.zeros(len(image), int)
         if self.lift is not None:
             choice = self.lift(image, pick).argmax(dim=1).cpu().numpy()
