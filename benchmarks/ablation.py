@@ -79,9 +79,26 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/ablation.jsonl"))
     options = parser.parse_args()
     quiet_warp()
+    rows = []
     for name in options.variants:
-        row = judge(name, options)
-        print(json.dumps(row), flush=True)
+        rows.append(judge(name, options))
+        print(json.dumps(rows[-1]), flush=True)
+    print(table(rows))
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown of rows, as in docs/learning.md."""
+    lines = [
+        "| variant | pick [nat] | place [nat] | place, median [mm] | within 20 mm | CPU s |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        name = row["variant"] + (f", seed {row['seed']}" if row["seed"] else "")
+        lines.append(
+            f"| {name} | {row['pick_nat']:.2f} | {row['place_nat']:.2f} | {row['place_mm']:.1f} "
+            f"| {100 * row['near']:.0f} % | {row['cpu_s']:.0f} |"
+        )
+    return "\n".join(lines)
 
 
 def judge(name: str, options: argparse.Namespace) -> dict[str, Any]:
