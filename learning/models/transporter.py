@@ -81,7 +81,7 @@ class TransporterConfig:
     n_rotations_eval: int = 1
     """Place rotations considered when acting; with 1 the place yaw is always 0."""
     picks: int = 1
-    """The most probable picks are weighed by how sure their places are; 1 takes the first."""
+    """So many of the most probable picks are weighed by how sure their places are (choice.py)."""
     lifts: tuple[float, ...] = (0.04,)
     """Lifts of the task's stages [m]; with one there is nothing to predict and no lift head."""
     bfloat16: bool = False
