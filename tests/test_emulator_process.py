@@ -87,6 +87,21 @@ def test_lock_step_is_faster_than_the_robot(
     assert simulated > time.perf_counter() - clock
 
 
+def test_lock_step_waits_for_a_client_that_a_busy_machine_holds_up(
+    panda: SimpleNamespace, emulator: EmulatorProcess
+) -> None:
+    def make(t: float, state: object) -> object:
+        if 0.1 < t < 0.1015:
+            time.sleep(1.5)
+        return libfranka.JointPositions(list(state.q_d))
+
+    before = emulator.snapshot()
+    panda.robot.control_joint_position(timed(make, seconds=0.2))
+    after = emulator.snapshot()
+    assert after["missed"] == before["missed"] and after["mode"] == "idle"
+    assert after["sim_seconds"] - before["sim_seconds"] < 0.3
+
+
 @pytest.fixture(scope="module")
 def paced() -> Iterator[EmulatorProcess]:
     with EmulatorProcess(EmulatorConfig(paced=True), free_host=True) as process:

@@ -46,8 +46,10 @@ __all__ = ["AddressTaken", "EmulatorConfig", "FciServer"]
 FIRST_STATE_WAIT = 2e-3
 # For the second it may still be starting; repeating states too early would cost determinism [s].
 START_WAIT = 0.2
-# A client that is silent for so long in the middle of a lock-step motion has gone [s].
-SILENCE = 1.0
+# A client that is silent for so long in the middle of a lock-step motion hangs [s]. Patience is
+# free: no simulated time passes, one that has ended is noticed at once by its closed connection,
+# and a busy machine may well keep a process waiting for a second.
+SILENCE = 20.0
 GRIPPER_STATE_PERIOD = 0.01  # [s]
 # How far behind the wall clock paced time may fall before it stops trying to catch up [s].
 MAX_LAG = 0.01
