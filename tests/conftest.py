@@ -1,7 +1,12 @@
 """What holds for every test, and fixtures that several files use."""
 
+import os
 import shutil
 import signal
+
+# Workers share the cores, so a thread each, as do the processes that tests start: torch's threads
+# spin while they wait for one another. It is read when torch is imported, so before everything.
+os.environ["OMP_NUM_THREADS"] = "1"
 
 import pytest
 import warp
@@ -12,17 +17,6 @@ warp.config.enable_backward = False
 # a shell that runs the suite in the background has it ignore Ctrl-C, and so would what tests start
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-@pytest.fixture(scope="module")
-def one_torch_thread():
-    """Torch on one thread, as on shared cores."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

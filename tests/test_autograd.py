@@ -6,7 +6,6 @@ import gc
 import re
 import runpy
 import weakref
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +23,6 @@ from warp_deform.solver import SolverConfig, SolverFusedXPBD
 DT = 1 / 1200
 TINY = CableConfig(beads=4)
 CUBE = BoxConfig(mass=0.05, friction=0.8)
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def cables(worlds: int = 1, lanes: int = 1, precision: str = "float64") -> SolverFusedXPBD:

@@ -16,8 +16,6 @@ from learning.models.crops import rotated_crops
 from learning.models.resnet import NetworkConfig
 from learning.models.transport import Transport
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 SIDE = 256
 REACH = 80
 """An output depends on fewer pixels to either side; see `resnet.receptive_span`."""

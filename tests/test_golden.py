@@ -13,8 +13,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def _parity() -> ModuleType:
     """The module `benchmarks/parity.py`."""

@@ -22,8 +22,6 @@ from learning.models.gt_state import (
 )
 from warp_deform.errors import InputError
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 AGENTS = (GtState, GtState2Step)
 
 

@@ -20,8 +20,6 @@ from learning.models.resnet import NetworkConfig, ResNet43, receptive_span
 from learning.models.transport import Transport
 from warp_deform.errors import InputError
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)

@@ -15,8 +15,6 @@ from learning.models.resnet import NetworkConfig, ResNet43
 from learning.models.transporter import PRESETS, GoalSplit, GoalStack, Transporter
 from warp_deform.errors import InputError
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)

@@ -20,8 +20,6 @@ from learning.models.transporter import (
 )
 from warp_deform.errors import InputError
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 AGENTS = (Transporter, GoalSplit, GoalStack)
 TINY = TransporterConfig(scale=4, width=0.125, crop=16, n_rotations_train=4, n_rotations_eval=4)
 
