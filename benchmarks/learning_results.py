@@ -33,6 +33,8 @@ def main() -> None:
         print(note)
     for run in found:
         name = f"{run.task}-{run.agent}-{run.demos}-{run.seed}"
+        if run.settings["preset"] != "fast":
+            name += f"-{run.settings['preset']}"
         steps = run.settings["schedule"]["steps"]
         usual = preset_schedule(
             run.settings["preset"], task=run.task, demos=run.demos,
