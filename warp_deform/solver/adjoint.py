@@ -19,7 +19,7 @@ from .distance import distance_adjoint
 from .edge_contact_adjoint import edge_contact_adjoint
 from .grip import grip_adjoint
 from .internal_friction import internal_friction_adjoint
-from .lanes import KERNEL_OPTIONS, add, any_less, div, less, mul, select, sub  # noqa: F401
+from .lanes import add, any_less, div, kernel_options, less, mul, select, sub  # noqa: F401
 from .rigid_adjoint import rigid_adjoint
 from .sphere_contact import sphere_contact_adjoint
 from .structures import structures
@@ -82,7 +82,7 @@ def adjoint_kernel(
         far = wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
         return far + wp.abs(q[0]) + wp.abs(q[1]) + wp.abs(q[2]) + wp.abs(q[3]) > S(0.0)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=dict(KERNEL_OPTIONS))
+    @wp.kernel(module="unique", enable_backward=False, module_options=kernel_options(scalar, lanes))
     def sweep(
         st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
         q: Particles, bodies: Bodies, contacts: Contacts, grips: Grips, sheets: Sheets, tape: Tape,

@@ -18,10 +18,10 @@ from .edge_contact import edge_contact
 from .grip import grip, grip_adjoint
 from .internal_friction import internal_friction, internal_friction_adjoint
 from .lanes import (  # noqa: F401  (operators are found by name)
-    KERNEL_OPTIONS,
     add,
     any_less,
     div,
+    kernel_options,
     length,
     less,
     mul,
@@ -87,7 +87,7 @@ def forward_kernel(
     Bodies, Contacts, Grips, Watch = t.Bodies, t.Contacts, t.Grips, t.Watch
     Sheets, Cells, Tape = t.Sheets, t.Cells, t.Tape
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=dict(KERNEL_OPTIONS))
+    @wp.kernel(module="unique", enable_backward=False, module_options=kernel_options(scalar, lanes))
     def forward(
         st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
         q: Particles, near: Near, bodies: Bodies, contacts: Contacts, grips: Grips, watch: Watch,

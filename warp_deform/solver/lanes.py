@@ -21,7 +21,6 @@ import warp as wp
 from ..errors import InputError
 
 __all__ = [
-    "KERNEL_OPTIONS",
     "LANES",
     "PRECISIONS",
     "add",
@@ -29,6 +28,7 @@ __all__ = [
     "cross",
     "div",
     "dot",
+    "kernel_options",
     "lane_types",
     "length",
     "less",
@@ -42,7 +42,7 @@ __all__ = [
 LANES = (1, 4, 8, 16)
 PRECISIONS = (wp.float32, wp.float64)
 
-KERNEL_OPTIONS: dict[str, Any] = {
+_KERNEL_OPTIONS: dict[str, Any] = {
     # no fused multiply-add: the same bits on every x86-64 processor
     "fuse_fp": False,
     "enable_backward": False,
@@ -52,6 +52,17 @@ KERNEL_OPTIONS: dict[str, Any] = {
     # slower)
     "cpu_compiler_flags": "-march=native -mllvm -inline-threshold=20000",
 }
+
+
+def kernel_options(scalar: Any, lanes: int) -> dict[str, Any]:
+    """Options of the modules of kernels over `scalar`s.
+
+    Checks are what float64 without lanes is for, and they wait for the compiler more than they run:
+    -O1 gives the same bits, compiles much sooner and runs a little slower.
+    """
+    for_checks = scalar == wp.float64 and lanes == 1
+    return _KERNEL_OPTIONS | ({"optimization_level": 1} if for_checks else {})
+
 
 _C_TYPE = {wp.float32: "float", wp.float64: "double"}
 _C_SQRT = {wp.float32: "sqrtf", wp.float64: "sqrt"}
