@@ -1,10 +1,11 @@
 """The paper's tables from run folders: runs pooled over seeds, the paper's numbers beside ours.
 
-A cell is a task, an agent, a number of demonstrations and a variant: preset, steps, who chooses the
-lift, whose goals, which arm, who demonstrated. Runs of a cell differ in their seed alone. Their
-test episodes are counted together for the share of successes and its Wilson interval; standard
-errors are those between runs where there are several, else those between episodes. Training runs
-share their test seeds, so the interval speaks of the runs that were made and not of training again.
+A cell is a task, an agent, a number of demonstrations and a variant: preset, steps where they are
+not the preset's, who chooses the lift, whose goals, which arm, who demonstrated. Runs of a cell
+differ in their seed alone. Their test episodes are counted together for the share of successes and
+its Wilson interval; standard errors are those between runs where there are several, else those
+between episodes. Training runs share their test seeds, so the interval speaks of the runs that were
+made and not of training again.
 
 Source: Wilson, JASA 1927; numbers of Seita et al., ICRA 2021, in `paper_results.json`.
 """
@@ -25,6 +26,7 @@ from warp_deform.tasks.registry import TASKS
 
 from .evaluation import wilson
 from .paper_results import PARTIAL_SCORE, SUCCESS, PaperResults, partial_credit, read_paper
+from .schedules import SCHEDULES, preset_schedule
 from .snapshots import RunFolder
 
 __all__ = ["Cell", "Point", "Report", "RunResult", "pool", "read_runs", "version_notes",
@@ -201,7 +203,7 @@ def _read(run: RunFolder) -> RunResult:
 
 def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     """How a run was trained and played, but for task, agent, demonstrations and seed."""
-    parts = [info["preset"], _steps(info, settings)]
+    parts = [info["preset"], *_steps(info, settings)]
     if info["stage_rule"] != "action":
         parts.append(f"{info['stage_rule']} lift")
     if not info["retry"]:
@@ -216,13 +218,23 @@ def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _steps(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
-    """How long a run was trained; where validation may stop it, as long as that allowed."""
-    planned = int(settings["schedule"]["steps"])
+def _steps(info: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
+    """How long a run was trained, where that is not its preset's length.
+
+    Where validation may stop it, as long as that allowed.
+    """
+    planned, trained = int(settings["schedule"]["steps"]), int(info["trained_steps"])
     if settings.get("patience") is not None:
-        return f"up to {planned} steps, patience {settings['patience']}"
-    trained = int(info["trained_steps"])
-    return f"{trained} steps" if trained == planned else f"{trained} of {planned} steps"
+        return [f"up to {planned} steps, patience {settings['patience']}"]
+    if trained != planned:
+        return [f"{trained} of {planned} steps"]
+    usual = None
+    if info["preset"] in SCHEDULES:
+        usual = preset_schedule(
+            info["preset"], task=info["task"], demos=info["demos"],
+            sees_state=settings["agent"].get("state_size") is not None,
+        )  # fmt: skip
+    return [] if usual is not None and planned == usual.steps else [f"{planned} steps"]
 
 
 def pool(runs: Sequence[RunResult], paper: PaperResults) -> list[Cell]:

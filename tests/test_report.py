@@ -158,15 +158,15 @@ def test_what_differs_stays_apart(tmp_path: Path) -> None:
     write_run(tmp_path / "e", robot="panda", demos=30)
     found = cells(tmp_path)
     assert {(cell.variant, cell.demos) for cell in found} == {
-        ("fast, 4000 steps", 10),
-        ("fast, 4000 steps, privileged lift", 10),
+        ("fast", 10),
+        ("fast, privileged lift", 10),
         ("fast, 100 steps", 10),
-        ("fast, 4000 steps, no retries, goals given, 0123", 10),
-        ("fast, 4000 steps, panda", 30),
+        ("fast, no retries, goals given, 0123", 10),
+        ("fast, panda", 30),
     }
     tables = compared(found, read_paper())
-    assert tables["fast, 4000 steps, panda"][0][3:] == ["1", "10", "30", "100", "1000"]
-    rows = {row[1]: row[3:] for row in tables["fast, 4000 steps"]}
+    assert tables["fast, panda"][0][3:] == ["1", "10", "30", "100", "1000"]
+    rows = {row[1]: row[3:] for row in tables["fast"]}
     assert rows["goal-stack"] == ["- (91.0)", "75.0 (99.7)", "- (100.0)", "- (100.0)"]
     assert rows["gt-mlp"][0] == "- (9.4)"
 
@@ -195,11 +195,31 @@ def test_who_demonstrated_and_how_long_is_a_variant(tmp_path: Path) -> None:
     write_run(tmp_path / "h", seed=2, trained={"rounded": "bfloat16"}, snapshots={
         "4000": result(LINE, [1.0, 1.0, 0.5, 0.5])})  # fmt: skip
     assert {cell.variant: cell.seeds for cell in cells(tmp_path)} == {
-        "fast, 4000 steps": (0, 1, 2),
-        "fast, 4000 steps, refined demonstrations": (0,),
-        "fast, 4000 steps, original and scripted demonstrations": (0,),
+        "fast": (0, 1, 2),
+        "fast, refined demonstrations": (0,),
+        "fast, original and scripted demonstrations": (0,),
         "fast, up to 4000 steps, patience 2": (0, 1),
         "fast, 4000 of 8000 steps": (0,),
+    }
+
+
+def test_steps_are_told_where_they_are_not_the_presets(tmp_path: Path) -> None:
+    seen = {"task": LINE, "agent": "gt-mlp", "config": {}, "state_size": 144}
+    baseline = {"agent": "gt-mlp", "trained": {"agent": seen}}
+    short, paper = ({**SCHEDULE, "steps": steps} for steps in (2000, 20_000))
+    write_run(tmp_path / "a")
+    write_run(tmp_path / "b", schedule=short, trained_steps=2000)
+    write_run(tmp_path / "c", schedule=short, trained_steps=2000, **baseline)
+    write_run(tmp_path / "d", **baseline)
+    write_run(tmp_path / "e", preset="paper", schedule=paper, trained_steps=20_000)
+    write_run(tmp_path / "f", preset="of another version")
+    assert {(cell.variant, cell.agent) for cell in cells(tmp_path)} == {
+        ("fast", "goal-stack"),
+        ("fast", "gt-mlp"),
+        ("fast, 2000 steps", "goal-stack"),
+        ("fast, 4000 steps", "gt-mlp"),
+        ("paper", "goal-stack"),
+        ("of another version, 4000 steps", "goal-stack"),
     }
 
 
