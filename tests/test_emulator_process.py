@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +21,8 @@ from emulator_client import HOME, OFF_HOME, libfranka, timed, vendor_client
 from emulator_worlds import RecordingWorld
 
 from hardware.emulator import EmulatorFailed, EmulatorProcess, TableWorld
-from hardware.emulator.server import AddressTaken, EmulatorConfig
+from hardware.emulator.model_library import model_library
+from hardware.emulator.server import AddressTaken, EmulatorConfig, FciServer
 from warp_deform.errors import InputError
 from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
 
@@ -78,13 +79,15 @@ def test_lock_step_gives_the_same_bits_twice() -> None:
     assert once["ticks"] > 1000
 
 
-def test_lock_step_is_faster_than_the_robot(
+def test_lock_step_time_is_what_was_answered(
     panda: SimpleNamespace, emulator: EmulatorProcess
 ) -> None:
-    before, clock = emulator.snapshot()["sim_seconds"], time.perf_counter()
-    assert panda.panda.move_to_joint_position(OFF_HOME, speed_factor=0.05)
-    simulated = emulator.snapshot()["sim_seconds"] - before
-    assert simulated > time.perf_counter() - clock
+    before = emulator.snapshot()
+    assert panda.panda.move_to_joint_position(OFF_HOME, speed_factor=0.2)
+    after = emulator.snapshot()
+    ticks = after["ticks"] - before["ticks"]
+    assert ticks > 500 and after["missed"] == before["missed"]
+    assert after["sim_seconds"] - before["sim_seconds"] == pytest.approx(ticks * 1e-3, abs=1e-9)
 
 
 def test_lock_step_waits_for_a_client_that_a_busy_machine_holds_up(
@@ -108,46 +111,94 @@ def paced() -> Iterator[EmulatorProcess]:
         yield process
 
 
-def test_paced_time_is_the_wall_clocks(paced: EmulatorProcess) -> None:
-    robot = libfranka.Robot(paced.host)
-    first, clock = robot.read_once().time.to_sec(), time.perf_counter()
-    while time.perf_counter() - clock < 0.5:
-        last = robot.read_once().time.to_sec()
-    assert last - first == pytest.approx(time.perf_counter() - clock, abs=0.1)
+@pytest.fixture
+def arm(paced: EmulatorProcess) -> Iterator[SimpleNamespace]:
+    """A client of the paced robot, ready to move; let go of whatever becomes of the test."""
+    client = SimpleNamespace(robot=libfranka.Robot(paced.host))
+    if client.robot.read_once().robot_mode == libfranka.RobotMode.kReflex:
+        client.robot.automatic_error_recovery()
+    try:
+        yield client
+    finally:
+        vars(client).clear()
 
 
-def test_a_silent_client_loses_the_robot(paced: EmulatorProcess) -> None:
-    robot = libfranka.Robot(paced.host)
+def unhindered(robot: object, make: Callable[[float, object], object], seconds: float) -> None:
+    """Move a paced robot, again where the machine is so busy that it loses its client for 20 ms."""
+    for _ in range(20):
+        try:
+            return robot.control_joint_position(timed(make, seconds=seconds))
+        except RuntimeError as error:
+            if "communication_constraints_violation" not in str(error):
+                raise
+            robot.automatic_error_recovery()
+    pytest.fail("the machine holds every motion up")
 
+
+def still(t: float, state: object) -> object:
+    return libfranka.JointPositions(list(state.q_d))
+
+
+def test_paced_time_never_runs_ahead_of_the_wall_clock(paced: EmulatorProcess) -> None:
+    clock, first, passed = time.perf_counter(), paced.snapshot()["sim_seconds"], 0.0
+    while passed < 0.3:
+        assert time.perf_counter() - clock < 60.0, "its time stands still"
+        passed = paced.snapshot()["sim_seconds"] - first
+    assert passed < time.perf_counter() - clock + 0.02
+
+
+def test_paced_time_catches_up_after_a_short_delay_and_lets_a_long_one_pass() -> None:
+    config = EmulatorConfig(host="127.0.78.3", paced=True)
+    server = FciServer(config, model=model_library(), world=TableWorld())
+    try:
+        now = server._next_tick
+
+        def pass_in(seconds: float) -> float:
+            """The simulated time that a delay brings, however often the loop then comes round."""
+            nonlocal now
+            now, before = now + seconds, server.sim_seconds
+            for _ in range(50):
+                server._advance(now)
+            return server.sim_seconds - before
+
+        server._advance(now)
+        assert sum(pass_in(1e-3) for _ in range(200)) == pytest.approx(0.2, abs=1.5e-3)
+        assert pass_in(5e-3) == pytest.approx(5e-3, abs=1.5e-3)
+        assert pass_in(0.3) == pytest.approx(0.011, abs=1.5e-3)
+        assert sum(pass_in(1e-3) for _ in range(100)) == pytest.approx(0.1, abs=1.5e-3)
+    finally:
+        server.close()
+
+
+def test_a_silent_client_loses_the_robot(arm: SimpleNamespace) -> None:
     def make(t: float, state: object) -> object:
-        if t > 0.05:
+        if t > 0.005:
             time.sleep(0.2)
-        return libfranka.JointPositions(list(state.q_d))
+        return still(t, state)
 
     with pytest.raises(RuntimeError, match="communication_constraints_violation"):
-        robot.control_joint_position(timed(make, seconds=1.0))
-    robot.automatic_error_recovery()
+        arm.robot.control_joint_position(timed(make, seconds=1.0))
+    arm.robot.automatic_error_recovery()
 
 
 def test_a_client_that_goes_away_in_mid_motion_leaves_a_robot_for_the_next(
-    paced: EmulatorProcess,
+    paced: EmulatorProcess, arm: SimpleNamespace
 ) -> None:
     def leave(t: float, state: object) -> object:
-        if t > 0.05:
+        if t > 0.005:
             raise ValueError("gone")
-        return libfranka.JointPositions(list(state.q_d))
+        return still(t, state)
 
     with pytest.raises(ValueError, match="gone"):
-        libfranka.Robot(paced.host).control_joint_position(timed(leave, seconds=1.0))
-    until = time.monotonic() + 5.0
+        unhindered(arm.robot, leave, seconds=1.0)
+    vars(arm).clear()
+    until = time.monotonic() + 20.0
     while paced.snapshot()["mode"] == "move" and time.monotonic() < until:
         time.sleep(0.01)
     robot = libfranka.Robot(paced.host)
     if robot.read_once().robot_mode == libfranka.RobotMode.kReflex:
         robot.automatic_error_recovery()
-    robot.control_joint_position(
-        timed(lambda t, state: libfranka.JointPositions(list(state.q_d)), seconds=0.05)
-    )
+    unhindered(robot, still, seconds=0.05)
 
 
 def test_a_second_client_is_turned_away(panda: SimpleNamespace, emulator: EmulatorProcess) -> None:
@@ -233,7 +284,7 @@ def test_command_line() -> None:
     running = subprocess.Popen(
         [*command, "--host", "127.0.78.1"], stderr=subprocess.PIPE, text=True, cwd=ROOT
     )
-    watchdog = threading.Timer(30.0, running.kill)
+    watchdog = threading.Timer(120.0, running.kill)
     watchdog.start()
     try:
         assert "emulated Panda on 127.0.78.1" in running.stderr.readline()
@@ -246,7 +297,7 @@ def test_command_line() -> None:
                 assert time.monotonic() < until
                 time.sleep(0.05)
         running.send_signal(2)
-        assert running.wait(10.0) == 130
+        assert running.wait(60.0) == 130
     finally:
         watchdog.cancel()
         running.kill()

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -290,7 +291,7 @@ def test_goal_and_calibration_must_fit(tmp_path: Path) -> None:
 
 @pytest.mark.emulator
 @pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler")
-@pytest.mark.timeout(240)
+@pytest.mark.timeout(480)
 def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
     """Policy, safety, panda-python, emulator, twin, camera, mask, overlap; recorded and read."""
     import emulator_client  # noqa: F401  skips where the vendor has no wheels
@@ -312,8 +313,9 @@ def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
             PandaRobot(NetworkedConfig(host=emulator.host)) as panda,
             recorder(tmp_path / "a", goal=goal) as made,
         ):
+            limits = replace(LIMITS, max_joint_speed=0.2)
             result = run_episode(
-                SafeRobot(panda, LIMITS), camera, calibration, chooser, recorder=made, goal=goal,
+                SafeRobot(panda, limits), camera, calibration, chooser, recorder=made, goal=goal,
                 config=EpisodeConfig(max_actions=2),
             )  # fmt: skip
         beads = look().beads[:, :2]

@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parent.parent
 pytestmark = [
     pytest.mark.emulator,
     pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
-    pytest.mark.timeout(60),
+    pytest.mark.timeout(180),
 ]
 
 

@@ -38,7 +38,7 @@ ROOT = Path(__file__).resolve().parent.parent
 pytestmark = [
     pytest.mark.emulator,
     pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
-    pytest.mark.timeout(60),
+    pytest.mark.timeout(180),
 ]
 
 
@@ -78,7 +78,7 @@ def test_something_listens_that_never_answers() -> None:
         with pytest.raises(ConnectionFailed, match=r"no answer in 0\.5 s") as caught:
             PandaRobot(NetworkedConfig(host="127.0.79.2", connect_timeout_s=0.5))
     assert says_what_to_do(caught.value)
-    assert time.monotonic() - clock < 5.0
+    assert time.monotonic() - clock < BOUND
 
 
 def test_another_version() -> None:
@@ -110,7 +110,7 @@ def silent(emulator: EmulatorProcess) -> Iterator[None]:
 
 
 WAKER = "import os, signal, sys, time; time.sleep(20); os.kill(int(sys.argv[1]), signal.SIGCONT)"
-BOUND = 8.0
+BOUND = 16.0
 """What a silent robot may cost [s]: it is heard for 1 s, a motion for 5 s; the machine is busy."""
 
 

@@ -21,7 +21,7 @@ from hardware.touch_off import touch_off
 pytestmark = [
     pytest.mark.emulator,
     pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
-    pytest.mark.timeout(120),
+    pytest.mark.timeout(240),
 ]
 # The emulated table meets the TCP itself, the limits' table the fingertips 9 mm below it.
 SURFACE = TABLE_Z - 0.009

@@ -219,7 +219,7 @@ def test_a_bounded_call_ends_in_time_and_is_stopped() -> None:
     stopped, clock = threading.Event(), time.monotonic()
     with pytest.raises(TimeoutError, match="no answer"):
         run_bounded(lambda: stopped.wait(20.0), timeout_s=0.1, stop=stopped.set)
-    assert stopped.is_set() and time.monotonic() - clock < 3.0
+    assert stopped.is_set() and time.monotonic() - clock < 15.0
 
 
 def test_ctrl_c_stops_a_bounded_call() -> None:
