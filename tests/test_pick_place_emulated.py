@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from hardware.pick_place import PickPlaceAction, PickPlaceOutcome, execute
 from hardware.safety import SafeRobot
 from hardware.safety_limits import SafetyLimits
 from hardware.table_plane import TablePlane, fit_table_plane
-from hardware.touch_off import touch_off
+from hardware.touch_off import TouchOffConfig, touch_off
 
 pytestmark = [
     pytest.mark.emulator,
@@ -86,7 +87,8 @@ def test_an_action_outside_moves_nothing(emulator: EmulatorProcess, backend: Pan
 
 def test_touch_off_measures_the_table(backend: PandaRobot) -> None:
     corners = [(0.40, -0.2), (0.40, 0.2), (0.6, 0.2), (0.6, -0.2)]
-    points = touch_off(SafeRobot(backend, limits(SURFACE - 0.02)), corners)
+    quick = replace(limits(SURFACE - 0.02), max_joint_speed=0.2)
+    points = touch_off(SafeRobot(backend, quick), corners, TouchOffConfig(hover_m=0.045))
     plane, residuals = fit_table_plane(points)
     errors = plane.z(np.array(corners)) - SURFACE
     assert np.abs(errors).max() < 1e-3 and np.abs(residuals).max() < 5e-4
