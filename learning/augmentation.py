@@ -19,6 +19,8 @@ from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE, TABLE_GRID, PixelGrid
 from warp_deform.tasks.ground_truth import YAW_SCALE
 
+from .state_rows import Row, state_rows
+
 __all__ = ["RigidTransform", "draw_transform", "move_actions", "move_picture",
            "move_points", "move_states"]  # fmt: skip
 
@@ -28,28 +30,6 @@ _SHIFT = min(SHAPE) / 6
 """Standard deviation of the shift along either axis [pixels]."""
 _PIVOT = np.array([SHAPE[1] / 2, SHAPE[0] / 2])
 _MOST_DRAWS = 10_000
-
-_POSE, _POINT, _VECTOR, _FIXED = "pose", "point", "vector", "fixed"
-_BAG = ((_POSE, 32), (_VECTOR, 1))
-_BAGS_AND_BLOCK = (*_BAG, *_BAG, (_POSE, 1), (_FIXED, 2))
-_ROWS: dict[str, tuple[tuple[str, int], ...]] = {
-    "cable-ring": ((_POSE, 64),),
-    "cable-ring-notarget": ((_POSE, 32),),
-    "cable-shape": ((_POSE, 49),),
-    "cable-shape-notarget": ((_POSE, 48),),
-    "cable-line-notarget": ((_POSE, 48),),
-    "fabric-cover": ((_POSE, 1), (_POINT, 100)),
-    "fabric-flat": ((_POSE, 1), (_POINT, 100)),
-    "fabric-flat-notarget": ((_POINT, 200),),
-    "bag-alone-open": _BAG,
-    "bag-items-1": ((_POSE, 1), *_BAG, (_POSE, 1)),
-    "bag-items-2": ((_POSE, 1), *_BAG, (_POSE, 2)),
-    "bag-color-goal": (*_BAGS_AND_BLOCK, *_BAGS_AND_BLOCK),
-    "block-notarget": ((_POSE, 2),),
-    "cable-mask-goal": ((_POSE, 180),),
-}
-"""What the rows of three of a task's ground truth are: poses x, y, -yaw / 15; points x, y, z;
-displacements x, y, -yaw / 15; or something that does not move, as colours."""
 
 
 @dataclass(frozen=True)
@@ -148,15 +128,15 @@ def move_states(task: str, states: np.ndarray, transforms: Sequence[RigidTransfo
     Raises:
         InputError: the task's ground truth has another size, or the task is not the benchmark's.
     """
-    kinds, (count, size) = _ROWS.get(task, ()), states.shape
-    if size != 3 * sum(of_kind for _, of_kind in kinds):
+    kind, (count, size) = state_rows(task), states.shape
+    if size != 3 * len(kind):
         raise InputError(f"{task}: a ground truth of {size} numbers cannot be moved")
     rows = states.reshape(count, -1, 3).astype(float)
-    kind = np.repeat([name for name, _ in kinds], [of_kind for _, of_kind in kinds])
-    placed, turned = (kind == _POSE) | (kind == _POINT), kind == _POSE
+    turned, shown = np.isin(kind, (Row.POSE, Row.BEAD)), kind == Row.DISPLACEMENT
+    placed = turned | (kind == Row.POINT)
     linear = np.array([each.matrix()[:, :2] for each in transforms])
     rows[:, placed, :2] = move_points(rows[:, placed, :2], transforms)
-    rows[:, kind == _VECTOR, :2] = rows[:, kind == _VECTOR, :2] @ linear.transpose(0, 2, 1)
+    rows[:, shown, :2] = rows[:, shown, :2] @ linear.transpose(0, 2, 1)
     handed, turn = np.array([(each.handed, each.turn) for each in transforms]).T[..., None]
     yaw = -YAW_SCALE * rows[:, turned, 2] * handed + turn
     rows[:, turned, 2] = -np.arctan2(np.sin(yaw), np.cos(yaw)) / YAW_SCALE

@@ -90,7 +90,8 @@ def make_agent(description: AgentDescription, *, seed: int = 0) -> Agent:
         return cls(TransporterConfig(**values), seed=seed)
     if description.state_size is None:
         raise InputError(f"{description.agent} needs the size of the state")
-    return cls(description.state_size, GtStateConfig(**values), seed=seed)
+    choices = GtStateConfig(**{**values, "yaws": tuple(values.get("yaws", ()))})
+    return cls(description.state_size, choices, seed=seed)
 
 
 class Policy(Protocol):
@@ -243,7 +244,7 @@ def load_policy(path: str | Path, *, device: str = "cpu") -> ImagePolicy | State
             raise ValueError(f"lifts {list(agent.config.lifts)} are not those of the task's stages")
         if not all(bool(each.isfinite().all()) for each in agent.parameters()):
             raise ValueError("its weights are not finite")
-    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{file} is no snapshot of this release's agents: {reason}") from error
     agent.to(device)

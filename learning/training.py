@@ -40,6 +40,7 @@ from .policy import AGENTS, Agent, AgentDescription, make_agent
 from .processes import DEVICES, Process, join_processes
 from .schedules import SCHEDULES, Schedule, preset_schedule
 from .snapshots import RunFolder
+from .state_rows import yaw_columns
 from .training_state import Trained, claim, on_cpu, state_steps
 
 __all__ = ["TrainConfig", "TrainReport", "train"]
@@ -262,10 +263,17 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
             bfloat16=config.bf16 or chosen.bfloat16,
         )
         return AgentDescription(task=config.task, agent=config.agent, config=asdict(sizes))
+    choices = GtStateConfig(
+        lifts=lifts,
+        one_rotation=yaws == 1,
+        # Elsewhere yaws say nothing of the action, and a chain's are as good as noise.
+        yaws=yaw_columns(config.task) if yaws > 1 else (),
+        exact=config.exact,
+    )
     return AgentDescription(
         task=config.task,
         agent=config.agent,
-        config=asdict(GtStateConfig(lifts=lifts, one_rotation=yaws == 1, exact=config.exact)),
+        config=asdict(choices),
         state_size=data.state_size,
     )
 

@@ -18,6 +18,7 @@ from learning.augmentation import (
     move_points,
     move_states,
 )
+from learning.state_rows import state_rows, yaw_columns
 from warp_deform.errors import InputError
 from warp_deform.objects.cable import CableConfig
 from warp_deform.rendering.pixels import (
@@ -193,6 +194,16 @@ def test_colours_and_displacements_of_bags_are_not_shifted() -> None:
     moved = move_state("bag-color-goal", state, RigidTransform(0.0, (16.0, 0.0))).reshape(-1, 3)
     still = np.flatnonzero(np.abs(moved[:, 0] - 0.1) < 1e-6)
     assert still.tolist() == [32, 65, 67, 68, 101, 134, 136, 137]
+
+
+def test_yaws_of_bodies_are_found_by_what_a_turn_changes() -> None:
+    for task, yaws in (("block-notarget", 2), ("bag-items-2", 3), ("cable-line-notarget", 0)):
+        columns = list(yaw_columns(task))
+        state = np.zeros((1, 3 * len(state_rows(task))), np.float32)
+        moved = move_states(task, state, [RigidTransform(turn=0.3, shift=(0.0, 0.0))])
+        assert len(columns) == yaws
+        assert moved[0, columns] == pytest.approx(-0.3 / 15)
+    assert yaw_columns("a-task-of-ones-own") == ()
 
 
 def test_a_state_of_another_size_is_refused() -> None:

@@ -87,12 +87,25 @@ def test_parameter_counts() -> None:
     assert float(one.network.first.bias.detach().std()) == pytest.approx(0.05, rel=0.3)
 
 
+@pytest.mark.parametrize(("exact", "same"), [(False, True), (True, False)])
+def test_a_whole_turn_is_seen_as_none(exact: bool, same: bool) -> None:
+    """But for the raw -yaw / 15, whose weights are taken out; the original's sines tell a turn."""
+    agent = GtState(3, GtStateConfig(yaws=(2,), exact=exact), seed=0)
+    network = agent.network
+    for layer in (network.first, network.second, network.mean, network.mixing):
+        layer.weight.data[:, -9:-6] = 0
+    state = torch.tensor([[0.5, 0.1, -1.0 / 15]])
+    turned = state - torch.tensor([0.0, 0.0, 2 * math.pi / 15])
+    before, after = (network(each)[0].mean for each in (state, turned))
+    assert torch.allclose(before, after, atol=1e-5) is same
+
+
 @pytest.mark.parametrize("agent_class", AGENTS)
 def test_agent_learns_an_action_that_depends_on_the_state(
     agent_class: type[GtState] | type[GtState2Step],
 ) -> None:
     """Pick the block, place it opposite, turned as it is; carry high where it lies far."""
-    config = GtStateConfig(lifts=(0.05, 0.3), one_rotation=False)
+    config = GtStateConfig(lifts=(0.05, 0.3), one_rotation=False, yaws=(2,))
     agent = agent_class(3, config, seed=0)
     rng = np.random.default_rng(0)
 

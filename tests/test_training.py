@@ -294,6 +294,7 @@ def test_place_yaws_are_chosen_where_they_matter(
         train(TrainConfig(agent=agent, out=tmp_path / agent, **settings))
     images = load_policy(tmp_path / "goal-stack").description.config
     assert (images["n_rotations_train"], images["n_rotations_eval"]) == (24, 24)
-    assert not load_policy(tmp_path / "gt-mlp").description.config["one_rotation"]
+    seen = load_policy(tmp_path / "gt-mlp").agent.config
+    assert (seen.one_rotation, seen.yaws) == (False, (2, 5))
     elsewhere = load_policy(straight[0]).description.config
     assert (elsewhere["n_rotations_train"], elsewhere["n_rotations_eval"]) == (1, 1)

@@ -11,7 +11,9 @@ without training mode, and then Keras leaves it out.
 [1e-8, 1e8] and so lose their gradient far from the data. Otherwise the same likelihood is computed
 in logarithms without clipping, and (1 cm)^2 is added to every variance to bound it: without a bound
 training on actions that follow from the state never settles. Acting hardly feels it, as the fourth
-power leaves a standard deviation of 0.01 um.
+power leaves a standard deviation of 0.01 um. And where the place's rotation
+matters, sines and cosines are those of the bodies' yaws, not of yaws / 15, which are different
+numbers before and after a whole turn.
 
 An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
 """
@@ -52,8 +54,10 @@ class GtStateConfig:
     """Act with yaws of 0, as in tasks where rotation does not matter."""
     lifts: tuple[float, ...] = (0.04,)
     """Lifts of the task's stages [m]; with several there is one more output that chooses."""
+    yaws: tuple[int, ...] = ()
+    """Columns of the state that hold a -yaw / 15 [rad] whose own sine and cosine are seen."""
     exact: bool = False
-    """The original's clipped likelihood."""
+    """The original's clipped likelihood, and its sines and cosines of yaws / 15."""
 
     def __post_init__(self) -> None:
         if not self.lifts:
@@ -99,10 +103,15 @@ class MixtureMLP(nn.Module):
         self.lift = _linear(hidden + seen, n_lifts) if n_lifts > 1 else None
         for parameter in self.parameters():
             nn.init.normal_(parameter, std=0.05, generator=generator)
+        turns = torch.ones(d_state)
+        if not config.exact:
+            turns[list(config.yaws)] = -YAW_SCALE
+        self.register_buffer("turns", turns, persistent=False)
 
     def forward(self, state: Tensor) -> tuple[Mixture, Tensor | None]:
         """The mixture, and lift logits where there is a choice."""
-        z = torch.cat([state, state.cos(), state.sin()], dim=1)
+        angles = state * self.turns
+        z = torch.cat([state, angles.cos(), angles.sin()], dim=1)
         h = torch.cat([functional.relu(self.first(z)), z], dim=1)
         h = torch.cat([functional.relu(self.second(h)), z], dim=1)
         log_pi = functional.log_softmax(self.mixing(h) / self.config.temperature, dim=1)
