@@ -19,10 +19,11 @@ help:
 
 venv: $(STAMP)
 
-# Installs again only when what is to be installed has changed.
+# Installs again only when what is to be installed has changed. Python compiles modules when they are
+# first imported: pip would compile all of them, most of which nobody imports, in as long as the rest.
 $(STAMP): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[dev]'
 	touch $@
 
 demo: $(STAMP)
