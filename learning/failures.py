@@ -30,7 +30,8 @@ from warp_deform.tasks.bag_opening import BagTask
 from warp_deform.tasks.bag_physics import CARRY, OPEN
 from warp_deform.worlds import Worlds
 
-__all__ = ["FAILURES", "bag_opening", "closed", "failure", "puts_back", "took_nothing"]
+__all__ = ["FAILURES", "bag_holds_items", "bag_opening", "closed", "failure", "puts_back",
+           "took_nothing"]  # fmt: skip
 
 FAILURES = ("physics", "missed grasp", "destructive bag action", "item not enclosed",
             "opening covered", "back and forth", "other")  # fmt: skip
@@ -43,6 +44,17 @@ def bag_opening(worlds: Worlds, slot: int) -> float | None:
     """How far the (first) bag of a slot is open, of its full opening; None without a bag."""
     task = worlds.task
     return task.opening(worlds.episodes[slot].snapshot) if isinstance(task, BagTask) else None
+
+
+def bag_holds_items(worlds: Worlds, slot: int) -> bool | None:
+    """Whether every item of a slot is in its (first) bag; None without a bag or items.
+
+    The benchmark's scores do not ask for it: of bag-items, items and beads have to be in the zone.
+    """
+    task, snapshot = worlds.task, worlds.episodes[slot].snapshot
+    if not isinstance(task, BagTask) or not len(snapshot.body_q):
+        return None
+    return all(task.inside_bag(snapshot, body) for body in range(len(snapshot.body_q)))
 
 
 def failure(
@@ -65,8 +77,7 @@ def failure(
         if closed(opened, [stage is not CARRY for stage in stages]):
             return "destructive bag action"
         tried = any(stage is not OPEN for stage in stages)
-        bodies = range(len(episode.snapshot.body_q))
-        if tried and any(not task.inside_bag(episode.snapshot, body) for body in bodies):
+        if tried and bag_holds_items(worlds, slot) is False:
             return "item not enclosed"
         if task.hidden(episode.layout, episode.snapshot):
             return "opening covered"

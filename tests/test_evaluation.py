@@ -16,7 +16,14 @@ from training_samples import write_demonstrations
 
 from learning import evaluation
 from learning.evaluation import Evaluation, best, evaluate_snapshot, known, summarise
-from learning.failures import FAILURES, bag_opening, closed, failure, puts_back
+from learning.failures import (
+    FAILURES,
+    bag_holds_items,
+    bag_opening,
+    closed,
+    failure,
+    puts_back,
+)
 from learning.playing import Played, goal_distance
 from learning.policy import load_policy
 from learning.protocol import Protocol
@@ -77,6 +84,15 @@ def test_a_summary_is_what_the_textbook_says() -> None:
 @pytest.mark.parametrize(("task", "value"), [(TASK, 87.5), ("cable-ring", 75.0)])
 def test_the_papers_value_is_partial_credit_for_some_tasks(task: str, value: float) -> None:
     assert summarise(played([1.0] * 15 + [0.5] * 5, 15), task=task)["paper_value"] == value
+
+
+def test_items_that_fell_out_of_the_bag_are_counted_apart() -> None:
+    plain = played([1.0, 1.0, 1.0, 0.1], 3)
+    ends = (True, False, None, True)  # of the third the physics was not trusted
+    episodes = [replace(each, in_bag=held) for each, held in zip(plain, ends, strict=True)]
+    summary = summarise(episodes, task="bag-items-1")
+    assert (summary["n_success"], summary["n_success_in_bag"]) == (3, 1)
+    assert summarise(plain, task="bag-items-1")["n_success_in_bag"] is None
 
 
 def test_without_successes_and_with_one_episode() -> None:
@@ -330,6 +346,7 @@ def test_failures_of_bags(
     run.actions = [action((0.3, 0.1 * n), (0.6, 0.0), lift) for n, lift in enumerate(lifts)]
     run.outcomes, run.ended = outcomes, "not solved"
     assert failure(worlds, 0, run, openings) == expected and expected in FAILURES
+    assert bag_holds_items(worlds, 0) is inside
     run.ended = "solved"
     assert failure(worlds, 0, run, openings) is None
     run.ended, episode.physics_ok = "physics: stretch", False
@@ -339,7 +356,7 @@ def test_failures_of_bags(
 def test_failures_without_a_bag() -> None:
     episode = SimpleNamespace(physics_ok=True, snapshot=None, layout=None)
     worlds: Any = SimpleNamespace(task=CableLineNotarget(), episodes={0: episode})
-    assert bag_opening(worlds, 0) is None
+    assert bag_opening(worlds, 0) is None and bag_holds_items(worlds, 0) is None
     run: Run[Any] = Run(0, np.random.default_rng(0))
     run.actions, run.outcomes = [THERE, BACK, THERE], ["placed"] * 3
     run.ended = "not solved in 3 actions"
