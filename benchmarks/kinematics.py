@@ -15,12 +15,11 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import tyro
 
-from warp_deform.robots import Robot, robot
+from warp_deform.robots import ROBOTS, Robot, RobotName, robot
 
 BATCH = 80
 SINGLES = 20
@@ -36,7 +35,7 @@ MARGIN = 0.002  # [m]
 class Options:
     """What to measure."""
 
-    robot: Literal["all", "ur5", "panda"] = "all"
+    robot: RobotName | None = None  # all when left out
     json: bool = False  # one JSON object on stdout
     reach_table: bool = False  # print the reach tables instead
 
@@ -46,7 +45,7 @@ def main(options: Options) -> None:
     import torch
 
     torch.set_num_threads(1)
-    names = ("ur5", "panda") if options.robot == "all" else (options.robot,)
+    names = ROBOTS if options.robot is None else (options.robot,)
     if options.reach_table:
         for name in names:
             print(name)

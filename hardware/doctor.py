@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from warp_deform.errors import InputError
+from warp_deform.extras import install_extra
 
 from .rig_config import RobotName
 
@@ -20,13 +21,13 @@ __all__ = ["Check", "examine"]
 
 _PACKAGES = (
     ("panda_py", "panda-python", "panda", "Panda, server version 5",
-     "pip install 'warp-deform[panda]'"),
+     install_extra("panda")),
     ("franky", "franky-control", "fr3", "FR3 of system 5.9 or later, server version 10",
-     "pip install 'warp-deform[fr3]'"),
+     install_extra("fr3")),
     ("frankapy", "frankapy", "frankapy", "Panda through ROS and a control PC",
      "install ROS, franka-interface and frankapy from source; panda-python needs none of them"),
     ("pyrealsense2", "pyrealsense2", None, "RealSense cameras",
-     "pip install 'warp-deform[realsense]', and libusb-1.0 of the system"),
+     f"{install_extra('realsense')}, and libusb-1.0 of the system"),
     ("pyk4a", "pyk4a-bundle", None, "depth of an Azure Kinect; its colour works as --camera uvc",
      "needs numpy 1, so an environment of its own: pip install pyk4a-bundle 'numpy<2'"),
 )  # fmt: skip

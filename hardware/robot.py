@@ -13,6 +13,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.extras import install_extra
 
 from .closing import Closing
 from .panda_arm import GRIPPER_MAX_WIDTH, Q_MAX, Q_MIN
@@ -92,7 +93,7 @@ class ConnectionFailed(RobotError):
 class BackendMissing(ConnectionFailed):
     """The vendor's package is not installed."""
 
-    default_advice = "install it: pip install 'warp-deform[panda]'"
+    default_advice = f"install it, in the clone: {install_extra('panda')}"
 
 
 class IncompatibleVersion(ConnectionFailed):

@@ -17,9 +17,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE, TABLE_GRID, PixelGrid
-from warp_deform.tasks.ground_truth import YAW_SCALE
-
-from .state_rows import Row, state_rows
+from warp_deform.tasks.ground_truth import YAW_SCALE, Row, Rows, row_kinds, rows_of
 
 __all__ = ["RigidTransform", "draw_transform", "move_actions", "move_picture",
            "move_points", "move_states"]  # fmt: skip
@@ -122,18 +120,25 @@ def move_actions(actions: np.ndarray, transforms: Sequence[RigidTransform]) -> n
     return moved
 
 
-def move_states(task: str, states: np.ndarray, transforms: Sequence[RigidTransform]) -> np.ndarray:
-    """A task's ground-truth states (B, D) float32, each moved.
+def move_states(
+    layout: Rows, states: np.ndarray, transforms: Sequence[RigidTransform]
+) -> np.ndarray:
+    """Ground-truth states (B, D) float32 of a task, each moved.
+
+    layout: what their numbers are, `Task.ground_truth_rows`
 
     Raises:
-        InputError: the task's ground truth has another size, or the task is not the benchmark's.
+        InputError: the ground truth has another size, or the task does not say what it is.
     """
-    kind, (count, size) = state_rows(task), states.shape
+    kind, (count, size) = row_kinds(layout), states.shape
     if size != 3 * len(kind):
-        raise InputError(f"{task}: a ground truth of {size} numbers cannot be moved")
+        raise InputError(
+            f"a ground truth of {size} numbers, {3 * len(kind)} of them in ground_truth_rows of "
+            "its task, cannot be moved; train with --no-augment"
+        )
     rows = states.reshape(count, -1, 3).astype(float)
-    turned, shown = np.isin(kind, (Row.POSE, Row.BEAD)), kind == Row.DISPLACEMENT
-    placed = turned | (kind == Row.POINT)
+    turned, shown = rows_of(kind, [Row.POSE, Row.BEAD]), rows_of(kind, [Row.DISPLACEMENT])
+    placed = turned | rows_of(kind, [Row.POINT])
     linear = np.array([each.matrix()[:, :2] for each in transforms])
     rows[:, placed, :2] = move_points(rows[:, placed, :2], transforms)
     rows[:, shown, :2] = rows[:, shown, :2] @ linear.transpose(0, 2, 1)

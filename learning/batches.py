@@ -118,7 +118,7 @@ def state_batch(
             transforms.append(draw_transform(action, rng=rng, grid=grid, copies=copies))
     states, actions = (np.stack(each) for each in zip(*found, strict=True))
     if augment:
-        states = move_states(data.task.name, states, transforms)
+        states = move_states(data.task.ground_truth_rows, states, transforms)
         actions = move_actions(actions, transforms)
     indices = torch.tensor([_lift_index(action, lifts) for action in actions])
     return torch.from_numpy(states), torch.from_numpy(encode_action(actions)), indices

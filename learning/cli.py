@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from warp_deform.cli import CommandOptions, Outcome
 from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
+from warp_deform.robots import RobotName
 from warp_deform.tasks.registry import task as find_task
 
 __all__ = ["EvalOptions", "ReportOptions", "SweepOptions", "TrainOptions", "evaluate", "report",
@@ -137,7 +138,7 @@ class EvalOptions(CommandOptions):
     """Videos at most."""
     share: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to be made: a run's with the chosen snapshot alone, in half its bytes, to hand on."""
-    robot: Literal["ur5", "panda"] = "ur5"
+    robot: RobotName = "ur5"
     """The arm."""
     workers: Annotated[int | None, arg(metavar="W")] = None
     """Processes; left out, one per core, fewer for few episodes. The result is the same."""

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.extras import install_extra
 
 from .snapshots import RunFolder
 
@@ -48,7 +49,7 @@ class TrainingLog:
                 from torch.utils.tensorboard import SummaryWriter
             except ImportError as error:
                 raise InputError(
-                    "TensorBoard is not installed; run: pip install 'warp-deform[train]'"
+                    f"TensorBoard is not installed; in the clone run: {install_extra('train')}"
                 ) from error
             self._board = SummaryWriter(str(run.path / "tensorboard"), purge_step=step + 1)
 

@@ -28,6 +28,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from warp_deform.errors import InputError
 from warp_deform.progress import progress_bar
+from warp_deform.tasks.ground_truth import yaw_columns
 from warp_deform.tasks.registry import task as find_task
 
 from .batches import check_lifts, image_batch, state_batch, task_lifts
@@ -40,7 +41,6 @@ from .policy import AGENTS, Agent, AgentDescription, make_agent
 from .processes import DEVICES, Process, join_processes
 from .schedules import SCHEDULES, Schedule, preset_schedule
 from .snapshots import RunFolder
-from .state_rows import yaw_columns
 from .training_state import Trained, claim, on_cpu, state_steps
 
 __all__ = ["TrainConfig", "TrainReport", "train"]
@@ -267,7 +267,7 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
         lifts=lifts,
         one_rotation=yaws == 1,
         # Elsewhere yaws say nothing of the action, and a chain's are as good as noise.
-        yaws=yaw_columns(config.task) if yaws > 1 else (),
+        yaws=yaw_columns(data.task.ground_truth_rows) if yaws > 1 else (),
         exact=config.exact,
     )
     return AgentDescription(

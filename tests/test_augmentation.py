@@ -18,7 +18,6 @@ from learning.augmentation import (
     move_points,
     move_states,
 )
-from learning.state_rows import state_rows, yaw_columns
 from warp_deform.errors import InputError
 from warp_deform.objects.cable import CableConfig
 from warp_deform.rendering.pixels import (
@@ -30,8 +29,9 @@ from warp_deform.rendering.pixels import (
     world_to_pixel,
 )
 from warp_deform.tasks.block import BlockNotarget
-from warp_deform.tasks.ground_truth import pose_rows
+from warp_deform.tasks.ground_truth import pose_rows, row_kinds, yaw_columns
 from warp_deform.tasks.registry import TASKS
+from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.shapes import sample_shape
 
 ACTION = np.array([0.45, -0.1, 0.0, 0.55, 0.2, 0.7, 0.04])
@@ -155,7 +155,7 @@ def test_a_pose_turns_by_the_turn() -> None:
 
 def move_state(task: str, state: np.ndarray, transform: RigidTransform) -> np.ndarray:
     """One state (D,), moved."""
-    return move_states(task, state[None], [transform])[0]
+    return move_states(find_task(task).ground_truth_rows, state[None], [transform])[0]
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -180,7 +180,7 @@ def test_what_moves_together_moves_as_alone() -> None:
     states = rng.uniform(-0.2, 0.2, (6, TASKS["bag-color-goal"].ground_truth_size))
     states = states.astype(np.float32)
     actions = rng.uniform(-0.3, 0.3, (6, 7))
-    together = move_states("bag-color-goal", states, transforms)
+    together = move_states(TASKS["bag-color-goal"].ground_truth_rows, states, transforms)
     for i, each in enumerate(transforms):
         assert together[i].tolist() == move_state("bag-color-goal", states[i], each).tolist()
     together = move_actions(actions, transforms)
@@ -198,12 +198,13 @@ def test_colours_and_displacements_of_bags_are_not_shifted() -> None:
 
 def test_yaws_of_bodies_are_found_by_what_a_turn_changes() -> None:
     for task, yaws in (("block-notarget", 2), ("bag-items-2", 3), ("cable-line-notarget", 0)):
-        columns = list(yaw_columns(task))
-        state = np.zeros((1, 3 * len(state_rows(task))), np.float32)
-        moved = move_states(task, state, [RigidTransform(turn=0.3, shift=(0.0, 0.0))])
+        rows = find_task(task).ground_truth_rows
+        columns = list(yaw_columns(rows))
+        state = np.zeros((1, 3 * len(row_kinds(rows))), np.float32)
+        moved = move_states(rows, state, [RigidTransform(turn=0.3, shift=(0.0, 0.0))])
         assert len(columns) == yaws
         assert moved[0, columns] == pytest.approx(-0.3 / 15)
-    assert yaw_columns("a-task-of-ones-own") == ()
+    assert yaw_columns(()) == ()
 
 
 def test_a_state_of_another_size_is_refused() -> None:

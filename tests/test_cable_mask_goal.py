@@ -249,5 +249,5 @@ def test_augmentation_turns_into_24_copies_on_the_tasks_own_grid() -> None:
             (TASK.grid.to_pixel(moved[:2]) >= 0) & (TASK.grid.to_pixel(moved[:2]) < SHAPE)
         ).all()
     states = np.zeros((2, 540), np.float32)
-    assert move_states(NAME, states, drawn[:2]).shape == (2, 540)
+    assert move_states(CableMaskGoal.ground_truth_rows, states, drawn[:2]).shape == (2, 540)
     assert RigidTransform(0.0, (0.0, 0.0)).grid == TABLE_GRID == find_task("cable-ring").grid

@@ -19,7 +19,7 @@ from warp_deform import __version__, cli, doctor
 from warp_deform.cli import CommandOptions, Outcome, Verb, main
 from warp_deform.episodes import EpisodeWriter
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.tasks.registry import TASKS
+from warp_deform.tasks.registry import FURTHER_TASKS, TASKS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +59,7 @@ def full_disk(options: StubOptions) -> Outcome:
     raise OSError(28, "No space left on device", "episode.parquet")
 
 
+LISTED = {"name", "env_id", "goal_conditioned", "max_actions", "objects"}
 PAPER = {
     "cable-ring": (False, 20),
     "cable-ring-notarget": (False, 20),
@@ -192,12 +193,13 @@ def test_list_keeps_its_contract(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--json"]) == 0
     tasks = json.loads(capfd.readouterr().out)["tasks"]
     names = [task["name"] for task in tasks]
-    assert names == list(TASKS)
+    assert names == [*TASKS, *FURTHER_TASKS]
+    assert [task["name"] for task in tasks if task["benchmark"]] == list(TASKS)
     # the paper's tasks come first, in its order; a task of anybody's own may follow
     paper = [name for name in PAPER if name in TASKS]
     assert names[: len(paper)] == paper
     for task in tasks:
-        assert set(task) == {"name", "env_id", "goal_conditioned", "max_actions", "objects"}
+        assert set(task) == {*LISTED, "benchmark"}
         assert task["env_id"].startswith("WarpDeform/")
         if task["name"] in PAPER:
             assert (task["goal_conditioned"], task["max_actions"]) == PAPER[task["name"]]

@@ -323,7 +323,7 @@ def test_bad_flags(
 
 def test_robomimic_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(InputError, match=r"pip install 'warp-deform\[export\]'"):
+    with pytest.raises(InputError, match=r"pip install -c constraints.txt -e '\.\[export\]'"):
         export_robomimic(tmp_path, tmp_path / "out.hdf5")
 
 

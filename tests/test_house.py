@@ -17,7 +17,9 @@ FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.p
 TEXTS = sorted(
     path
     for path in [*FILES, *ROOT.glob("*.*"), *(ROOT / "docs").rglob("*.md"), ROOT / "Makefile"]
-    if path.suffix in {".py", ".md", ".toml", ".txt", ".cff", ""} and path.is_file()
+    if path.suffix in {".py", ".md", ".toml", ".txt", ".cff", ""}
+    and path.is_file()
+    and path.name != ".git"  # of a worktree: a file that says where the repository is
 )
 BANNED_NAMES = {"utils", "util", "common", "helpers", "helper", "misc", "manager", "managers"}
 MACHINE_PATH = re.compile(r"(?<![\w.])/(?:wo[r]k|ro[o]t|ho[m]e|t[m]p)/[a-z]")

@@ -90,7 +90,9 @@ def test_another_version() -> None:
 
 def test_the_vendors_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "panda_py", None)
-    with pytest.raises(BackendMissing, match=r"pip install 'warp-deform\[panda\]'") as caught:
+    with pytest.raises(
+        BackendMissing, match=r"pip install -c constraints.txt -e '\.\[panda\]'"
+    ) as caught:
         PandaRobot(NetworkedConfig(host="127.0.79.1"))
     assert says_what_to_do(caught.value)
 

@@ -111,7 +111,7 @@ def test_unknown_names_are_refused():
 
 def test_missing_pybullet_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(InputError, match=r"pip install 'warp-deform\[dev\]'"):
+    with pytest.raises(InputError, match=r"pip install -c constraints.txt -e '\.\[dev\]'"):
         time_pybullet("cable")
 
 

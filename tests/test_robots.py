@@ -13,13 +13,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from warp_deform.errors import InputError
-from warp_deform.robots import Robot, robot
+from warp_deform.robots import ROBOTS, Robot, robot
 from warp_deform.robots.description import ArmConfig
-from warp_deform.robots.panda import PANDA
 from warp_deform.robots.unwrap import unwrap
-from warp_deform.robots.ur5 import UR5
 
-NAMES = ("ur5", "panda")
+NAMES = tuple(ROBOTS)
 BITS = ("q", "reached", "position_error", "rotation_error")
 
 
@@ -108,7 +106,7 @@ def test_top_down_matrices(arm: Robot) -> None:
     np.testing.assert_allclose(pose[:, 3], [0.5, -0.1, 0.2, 1.0])
 
 
-@pytest.mark.parametrize("config", [UR5, PANDA], ids=NAMES)
+@pytest.mark.parametrize("config", ROBOTS.values(), ids=NAMES)
 def test_closed_form_postures_are_exact(config: ArmConfig) -> None:
     # So that the iteration has nothing to do, and the lengths in the module are those of the URDF.
     arm = robot(config.name)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import importlib
 
-from .registration import register_environments
+from .registration import register_environments, register_task
 
 __version__ = "0.1.0"
 
@@ -30,7 +30,7 @@ _HOME = {
     "WarpDeformError": "errors",
 }
 
-__all__ = ["__version__", *_HOME]
+__all__ = ["__version__", *_HOME, "register_task"]
 
 
 def __getattr__(name: str) -> object:

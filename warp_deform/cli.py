@@ -23,7 +23,9 @@ import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
+
+from tyro.conf import arg
 
 from . import __version__
 from .errors import InputError, WarpDeformError
@@ -65,6 +67,8 @@ class CommandOptions:
 
     json: bool = False
     """Print one JSON object, and nothing else, on stdout."""
+    task_module: Annotated[str | None, arg(metavar="MODULE")] = None
+    """Module, or .py file, that registers tasks of your own; it is imported, so it runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +143,10 @@ def _dispatch(arguments: list[str]) -> int:
     if options is None:
         return 0
     with _stdout_to_stderr():
+        if options.task_module is not None:
+            from .tasks.elsewhere import import_tasks
+
+            import_tasks(options.task_module)
         outcome = verb(options)
     print(
         json.dumps(outcome.data, allow_nan=False, default=_plain) if options.json else outcome.text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +14,8 @@ from .cli import CommandOptions, Outcome
 from .errors import InputError
 from .quiet import quiet_warp
 from .registration import env_id
-from .tasks.registry import TASKS
+from .robots import RobotName
+from .tasks.registry import TASKS, all_tasks
 from .tasks.registry import task as find_task
 
 __all__ = [
@@ -44,11 +46,16 @@ _File = Annotated[Path | None, arg(metavar="FILE")]
 
 @dataclass(frozen=True, kw_only=True)
 class ListOptions(CommandOptions):
-    """List the tasks: Gymnasium id, whether a goal image is given, actions allowed, objects."""
+    """List the tasks: Gymnasium id, whether a goal image is given, actions allowed, objects.
+
+    The benchmark's first, then further ones, of this package, of installed distributions and of
+    --task-module.
+    """
 
 
 def list_tasks(options: ListOptions) -> Outcome:
-    """The benchmark's tasks, in the paper's order."""
+    """The benchmark's tasks, in the paper's order, then the others."""
+    known, wrong = all_tasks()
     tasks: list[dict[str, Any]] = [
         {
             "name": name,
@@ -56,22 +63,26 @@ def list_tasks(options: ListOptions) -> Outcome:
             "goal_conditioned": task.goal_conditioned,
             "max_actions": task.max_actions,
             "objects": list(task.objects),
+            "benchmark": name in TASKS,
         }
-        for name, task in TASKS.items()
+        for name, task in known.items()
     ]
-    rows = [("task", "Gymnasium id", "goal", "actions", "objects")]
+    rows = [("task", "Gymnasium id", "benchmark", "goal", "actions", "objects")]
     for task in tasks:
         goal = "image" if task["goal_conditioned"] else "-"
         rows.append(
             (
                 task["name"],
                 task["env_id"],
+                "yes" if task["benchmark"] else "-",
                 goal,
                 str(task["max_actions"]),
                 ", ".join(task["objects"]),
             )
         )
-    return Outcome(data={"tasks": tasks}, text=_table(rows))
+    for line in wrong:
+        print(f"warp-deform: warning: {line}", file=sys.stderr)
+    return Outcome(data={"tasks": tasks, "warnings": wrong}, text=_table(rows))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +107,7 @@ class DemoOptions(CommandOptions):
     """Address of a Ray cluster to work on (needs the extra `ray`)."""
     video: _File = None
     """MP4 of the first two kept episodes."""
-    robot: Literal["ur5", "panda"] = "ur5"
+    robot: RobotName = "ur5"
     """The arm."""
 
 
@@ -150,7 +161,7 @@ class GoalsOptions(CommandOptions):
     """Whose demonstrations, see `warp-deform demo`."""
     workers: Annotated[int | None, arg(metavar="W")] = None
     """Processes; one per core when left out."""
-    robot: Literal["ur5", "panda"] = "ur5"
+    robot: RobotName = "ur5"
     """The arm."""
 
 

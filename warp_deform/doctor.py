@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from . import __version__
+from .extras import install_extra
 
 __all__ = ["DEPENDENCIES", "render", "report"]
 
@@ -48,8 +49,6 @@ _OPTIONAL = (
         "pybullet", "pybullet", "dev", "the peer of `warp-deform bench`; Python 3.11 at most"
     ),
     _Optional("ray", "ray", "ray", "collecting on a cluster"),
-    _Optional("viser", "viser", "viewers", "viewer in the browser"),
-    _Optional("rerun", "rerun-sdk", "viewers", "viewer and recordings"),
     _Optional("tensorboard", "tensorboard", "train", "training curves while they grow"),
     _Optional("h5py", "h5py", "export", "export to robomimic"),
     _Optional("panda_py", "panda-python", "panda", "Franka Emika Panda"),
@@ -92,7 +91,7 @@ def report() -> dict[str, Any]:
             part.module: {
                 "version": _version(part.distribution),
                 "purpose": part.purpose,
-                "install": f"pip install 'warp-deform[{part.extra}]'",
+                "install": install_extra(part.extra),
             }
             for part in _OPTIONAL
         },

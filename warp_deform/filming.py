@@ -11,6 +11,7 @@ import numpy as np
 from .episode_loop import worlds_for
 from .episodes import Episode, EpisodeReader
 from .errors import InputError, WarpDeformError
+from .recording import recorded_task
 from .rendering.caption import annotate
 from .rendering.scene_view import ArmMeshes, SceneView
 from .rendering.video import VideoWriter
@@ -70,6 +71,7 @@ def film(
     for info in infos:
         if not info.actions:
             raise InputError(f"{reader.path(info.seed)} has no action that could be shown")
+        recorded_task(info)
     length = LONGEST - 2 * STILL_SECONDS * len(infos)
     speed = max(1.0, sum(info.sim_seconds for info in infos) / length)
     view = SceneView(size)

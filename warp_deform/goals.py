@@ -27,7 +27,7 @@ from .episodes import (
     rebuild_index,
 )
 from .errors import InputError, WarpDeformError
-from .recording import GOAL_TARGETS, observe, record, task_config
+from .recording import GOAL_TARGETS, observe, origin, record, recorded_task, task_config
 from .tasks.free_space import FreeSpace
 from .tasks.registry import task as find_task
 from .tasks.task import Layout, Snapshot, Task
@@ -162,7 +162,7 @@ def _construct(name: str, out: Path, seeds: range, robot: str) -> None:
         for slot, run in play(worlds, missing, act=_rest, look=observe, until_solved=False):
             if not run.rows:
                 raise WarpDeformError(f"{name}: no goal of seed {run.seed}: {run.ended}")
-            writer.write(_goal_episode(worlds, slot, run, config))
+            writer.write(_goal_episode(worlds, slot, run, task))
             attempt = Attempt(run.seed, True, 0, run.rows[0].score, CONSTRUCTED)
             append_attempt(out, attempt)
             collection.attempts[run.seed] = attempt
@@ -175,13 +175,13 @@ def _rest(worlds: Worlds, runs: Mapping[int, Run[Step]]) -> dict[int, np.ndarray
     return dict.fromkeys(runs)
 
 
-def _goal_episode(worlds: Worlds, slot: int, run: Run[Step], config: dict[str, Any]) -> Episode:
-    """A slot's state as a goal: one row, at which the task is done."""
+def _goal_episode(worlds: Worlds, slot: int, run: Run[Step], task: Task) -> Episode:
+    """A slot's state as a goal of the task: one row, at which it is done."""
     made = record(worlds, slot, run, demonstrator=CONSTRUCTED)
     goal = worlds.as_goal(slot, kind=CONSTRUCTED)
-    extra = {GOAL_TARGETS: goal.targets.tolist()}
+    extra = {**origin(task), GOAL_TARGETS: goal.targets.tolist()}
     return Episode(
-        info=replace(made.info, success=True, config=config, extra=extra),
+        info=replace(made.info, success=True, config=task_config(task), extra=extra),
         steps=(replace(made.steps[0], success=True),),
         goal=goal,
     )
@@ -190,7 +190,7 @@ def _goal_episode(worlds: Worlds, slot: int, run: Run[Step], config: dict[str, A
 def _goal(reader: EpisodeReader, seed: int) -> Goal:
     """What an episode's last row shows, as a goal."""
     info, path = reader.info(seed), reader.path(seed)
-    task = find_task(info.task)
+    task = recorded_task(info)
     if not task.goal_conditioned:
         raise InputError(f"{path} is an episode of {info.task}, which has no goal image")
     if not info.success:

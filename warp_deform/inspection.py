@@ -13,7 +13,7 @@ import numpy as np
 from .episodes import Episode, EpisodeReader, Step, combine_hashes
 from .errors import InputError
 from .rendering.pixels import SHAPE, TABLE_GRID, PixelGrid
-from .tasks.registry import FURTHER_TASKS, TASKS
+from .tasks.registry import is_known
 from .tasks.registry import task as find_task
 
 __all__ = ["contact_sheet", "statistics"]
@@ -176,7 +176,7 @@ def _draw_header(episode: Episode, *, top: float, width: int) -> np.ndarray:
 
 def _grid(task: str) -> PixelGrid:
     """Where the pixels of a task's pictures are; of a task from elsewhere, the benchmark's."""
-    return find_task(task).grid if task in TASKS | FURTHER_TASKS else TABLE_GRID
+    return find_task(task).grid if is_known(task) else TABLE_GRID
 
 
 def _draw_action(color: np.ndarray, action: np.ndarray, grid: PixelGrid) -> None:

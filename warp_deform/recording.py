@@ -16,13 +16,18 @@ from .episodes import (
     cpu_fingerprint,
     versions,
 )
+from .tasks.registry import FURTHER_TASKS, TASKS, task_name
+from .tasks.registry import task as find_task
 from .tasks.task import Task
 from .worlds import Worlds
 
-__all__ = ["GOAL_TARGETS", "observe", "record", "task_config"]
+__all__ = ["GOAL_TARGETS", "observe", "origin", "record", "recorded_task", "task_config"]
 
 GOAL_TARGETS = "goal_targets"
 """Where an episode of a goal-conditioned task keeps what its last state stands for as a goal."""
+
+_TASK_CLASS = "task_class"
+"""Where an episode of a task from elsewhere says which class that was."""
 
 
 def observe(worlds: Worlds, slot: int) -> Step:
@@ -73,7 +78,7 @@ def record(worlds: Worlds, slot: int, run: Run[Step], *, demonstrator: str) -> E
         versions=versions(),
         cpu=cpu_fingerprint(),
         goal=None,
-        extra=_as_goal(worlds, slot),
+        extra={**origin(worlds.task), **_as_goal(worlds, slot)},
     )
     return Episode(info, (*rows, last), episode.goal)
 
@@ -83,6 +88,22 @@ def _as_goal(worlds: Worlds, slot: int) -> dict[str, Any]:
     if not worlds.task.goal_conditioned:
         return {}
     return {GOAL_TARGETS: worlds.as_goal(slot, kind="demonstrated").targets.tolist()}
+
+
+def origin(task: Task) -> dict[str, Any]:
+    """What an episode says of where its task is from: its class, unless that is this package's."""
+    return {} if task.name in TASKS | FURTHER_TASKS else {_TASK_CLASS: task_name(type(task))}
+
+
+def recorded_task(info: EpisodeInfo) -> Task:
+    """The task of an episode.
+
+    Raises:
+        InputError: there is none of that name here. A task from elsewhere is not imported because
+            a file names it: the message says which class to register.
+    """
+    named = info.extra.get(_TASK_CLASS)
+    return find_task(info.task, recorded=named if isinstance(named, str) else None)
 
 
 def task_config(task: Task) -> dict[str, Any]:

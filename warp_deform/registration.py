@@ -1,10 +1,20 @@
-"""The tasks' Gymnasium ids."""
+"""The tasks' Gymnasium ids, and how a task of the user's own gets one."""
 
 from __future__ import annotations
 
-from .tasks.registry import FURTHER_TASKS, TASKS
+from typing import TYPE_CHECKING, TypeVar
 
-__all__ = ["env_id", "register_environments"]
+from .errors import InputError
+from .tasks.checking import check_task
+from .tasks.elsewhere import offered
+from .tasks.registry import FURTHER_TASKS, TASKS, add_task, registered
+
+if TYPE_CHECKING:
+    from .tasks.task import Task
+
+__all__ = ["env_id", "register_environments", "register_task"]
+
+Registered = TypeVar("Registered", bound="type[Task]")
 
 _VERSION = 1  # rises with any change of physics, observation or reward
 
@@ -18,15 +28,46 @@ def env_id(task: str) -> str:
 def register_environments() -> None:
     """Register one Gymnasium id a task; a second call changes nothing.
 
-    The environment's module loads when `gymnasium.make` builds the first one.
+    Tasks of installed distributions get theirs by their names alone. The environment's module, and
+    theirs, load when `gymnasium.make` builds the first one.
     """
+    for task in (*TASKS, *FURTHER_TASKS, *offered()):
+        _register(task)
+
+
+def register_task(task: Registered) -> Registered:
+    """Make a task of one's own known by its name: to `gymnasium.make`, and to all that takes names.
+
+        @warp_deform.register_task
+        class CableAway(Task):
+            name = "cable-away"
+            ...
+
+    Returns the class. Worker processes of collections, replays, evaluations and sweeps are told of
+    it. The same class again changes nothing.
+
+    Raises:
+        InputError: the class lacks something or has an attribute of a wrong type, or its name or
+            Gymnasium id is another task's.
+    """
+    check_task(task)
+    for other in (*TASKS, *FURTHER_TASKS, *(cls.name for cls in registered())):
+        if other != task.name and env_id(other) == env_id(task.name):
+            raise InputError(
+                f"the Gymnasium id of {task.name!r} would be {env_id(other)}, as that of {other!r}"
+            )
+    add_task(task)
+    _register(task.name)
+    return task
+
+
+def _register(task: str) -> None:
     from gymnasium.envs.registration import register, registry
 
-    for task in TASKS | FURTHER_TASKS:
-        if env_id(task) not in registry:
-            register(
-                env_id(task),
-                entry_point="warp_deform.env:PickPlaceEnv",
-                vector_entry_point="warp_deform.vector_env:PickPlaceVectorEnv",
-                kwargs={"task": task},
-            )
+    if env_id(task) not in registry:
+        register(
+            env_id(task),
+            entry_point="warp_deform.env:PickPlaceEnv",
+            vector_entry_point="warp_deform.vector_env:PickPlaceVectorEnv",
+            kwargs={"task": task},
+        )

@@ -14,6 +14,7 @@ from .episode_loop import SLOTS, Run, play, worlds_for
 from .episodes import Episode, EpisodeReader, Goal, Step, cpu_fingerprint, versions
 from .errors import InputError
 from .goals import CONSTRUCTED, at_goal
+from .recording import recorded_task
 from .tasks.registry import task as find_task
 from .workers import Workers, worker_count
 from .worlds import Worlds
@@ -36,7 +37,8 @@ def verify(
     [m], and whether the recording's processor and versions are the "same" or "other".
 
     Raises:
-        InputError: the folder has no episodes, one is damaged, or one was not simulated.
+        InputError: the folder has no episodes, one is damaged, was not simulated, or is of a task
+            that is not known here.
     """
     if tolerance is not None and not 0 <= tolerance < math.inf:
         raise InputError(f"tolerance is {tolerance}; it must be a distance in metres, 0 or more")
@@ -46,6 +48,7 @@ def verify(
     same_cpu = same_versions = True
     for seed in reader.seeds:
         info = reader.info(seed)
+        recorded_task(info)
         groups.setdefault((info.task, info.robot, info.demonstrator == CONSTRUCTED), []).append(
             seed
         )

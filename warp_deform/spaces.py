@@ -12,14 +12,12 @@ from .episodes import MAX_HEIGHT
 from .errors import InputError
 from .rendering.images import Images
 from .rendering.pixels import BOUNDS, SHAPE
-from .robots.primitive import Outcome
+from .robots.primitive import LIFT, Outcome
 from .tasks.task import Task
 from .worlds import Worlds
 
 __all__ = ["action_space", "check_action", "information", "observation", "observation_space"]
 
-LIFT = (0.04, 0.40)
-"""Least and greatest height [m] at which the tip carries what it holds."""
 _NAMES = ("pick x", "pick y", "pick yaw", "place x", "place y", "place yaw", "lift")
 _POSE = (*BOUNDS[:2], (-np.pi, np.pi))
 _EXACT = np.array([*_POSE, *_POSE, LIFT])

@@ -12,13 +12,19 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from multiprocessing import resource_tracker
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError, _ExecutorManagerThread
 
 from .errors import InputError, WarpDeformError
+from .extras import install_extra
 from .quiet import quiet_warp
+from .registration import register_task
+from .tasks.registry import registered
+
+if TYPE_CHECKING:
+    from .tasks.task import Task
 
 __all__ = ["Workers", "single_threaded", "worker_count"]
 
@@ -74,7 +80,8 @@ class Workers:
                 ...
 
     count: processes; None takes the cluster's cores, or one process without a cluster
-    `function` is an iterator of results and is importable from its module.
+    `function` is an iterator of results and is importable from its module. Tasks that the user
+    registered travel along: by their module's name, or as they are where they stand in a script.
     ray: address of a Ray cluster ("auto" for the one this machine belongs to). Functions and chunks
     travel by joblib, files do not: a cluster needs a folder that all its machines share.
 
@@ -122,7 +129,8 @@ class Workers:
                 for chunk in chunks:
                     yield from function(chunk)
             return
-        calls = (joblib.delayed(_call)(function, chunk) for chunk in chunks)
+        tasks = registered()
+        calls = (joblib.delayed(_call)(function, chunk, tasks) for chunk in chunks)
         try:
             if self._starting is not None:
                 for _ in self._starting:
@@ -210,8 +218,13 @@ def _import() -> None:
     quiet_warp()
 
 
-def _call(function: Callable[[Chunk], Iterable[Result]], chunk: Chunk) -> list[Result]:
+def _call(
+    function: Callable[[Chunk], Iterable[Result]], chunk: Chunk, tasks: tuple[type[Task], ...]
+) -> list[Result]:
+    """Results of a chunk, in a process that is first told which tasks the user registered."""
     quiet_warp()
+    for task in tasks:
+        register_task(task)
     with single_threaded():
         return list(function(chunk))
 
@@ -223,7 +236,7 @@ def _connect(address: str) -> int:
         from ray.util.joblib import register_ray
     except ImportError as error:
         raise InputError(
-            "Ray is not installed; run: pip install 'warp-deform[ray]', or leave out --ray"
+            f"Ray is not installed; in the clone run: {install_extra('ray')}, or leave out --ray"
         ) from error
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:

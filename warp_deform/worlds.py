@@ -36,7 +36,7 @@ from .running import (
 )
 from .solver.solver import SolverFusedXPBD
 from .tasks.free_space import FreeSpace
-from .tasks.registry import task as find_task
+from .tasks.registry import task_of
 from .tasks.task import PHYSICS, Layout, Snapshot, Task
 from .world_state import WorldState
 
@@ -77,7 +77,7 @@ class Worlds:
         rest_limit: float = REST_LIMIT,
         bundles: Path | None = None,
     ) -> None:
-        self.task = find_task(task) if isinstance(task, str) else task
+        self.task = task_of(task)
         self.precision, self.rest_limit = precision, rest_limit
         self.robot = find_robot(robot)
         if count < 1:

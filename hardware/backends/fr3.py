@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from warp_deform.errors import InputError
+from warp_deform.extras import install_extra
 
 from ..closing import Closing
 from ..panda_arm import DQ_MAX, GRIPPER_MAX_WIDTH
@@ -79,7 +80,7 @@ class FR3Robot(Closing):
         except ImportError as error:
             raise BackendMissing(
                 f"franky cannot be loaded: {error}",
-                advice="install it: pip install 'warp-deform[fr3]'",
+                advice=f"install it, in the clone: {install_extra('fr3')}",
             ) from error
         self._franky = franky
         self._closed = False

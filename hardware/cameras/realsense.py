@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from warp_deform.extras import install_extra
+
 from ..camera import CameraError, CameraIntrinsics
 from .streaming import StreamConfig, StreamingCamera
 
@@ -23,8 +25,8 @@ class _RealSense:
             import pyrealsense2 as rs
         except ImportError as error:
             raise CameraError(
-                f"pyrealsense2 cannot be loaded ({error}); pip install 'warp-deform[realsense]' "
-                "and install libusb-1.0"
+                f"pyrealsense2 cannot be loaded ({error}); in the clone run: "
+                f"{install_extra('realsense')}, and install libusb-1.0"
             ) from error
         self._rs = rs
         config = rs.config()

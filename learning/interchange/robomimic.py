@@ -22,9 +22,10 @@ import numpy as np
 from warp_deform import __version__
 from warp_deform.episodes import Episode, EpisodeReader, Step
 from warp_deform.errors import InputError
+from warp_deform.extras import install_extra
 from warp_deform.progress import progress_bar
 from warp_deform.registration import env_id
-from warp_deform.tasks.registry import TASKS
+from warp_deform.tasks.registry import is_known
 
 from .conversion import ConversionReport, new_file, size_of
 
@@ -49,7 +50,9 @@ def export_robomimic(source: Path, target: Path) -> ConversionReport:
     try:
         import h5py
     except ImportError as error:
-        raise InputError("h5py is not installed; run: pip install 'warp-deform[export]'") from error
+        raise InputError(
+            f"h5py is not installed; in the clone run: {install_extra('export')}"
+        ) from error
     target = Path(target)
     if target.suffix not in (".hdf5", ".h5"):
         raise InputError(f"{target} must end with .hdf5: robomimic keeps a dataset in one file")
@@ -148,7 +151,7 @@ def _observations(episode: Episode, steps: Sequence[Step]) -> dict[str, np.ndarr
 
 def _env_args(task: str) -> dict[str, Any]:
     # real recordings name tasks of their own, which have no environment
-    name = env_id(task) if task in TASKS else task
+    name = env_id(task) if is_known(task) else task
     return {"env_name": name, "type": _GYM, "env_version": __version__, "env_kwargs": {}}
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..extras import install_extra
 from ..objects.box import l_block
 from .scene import PeerScene
 from .timing import FRAME_RATE, PeerTiming, measure
@@ -57,7 +58,7 @@ def import_pybullet() -> Any:
         import pybullet
     except ImportError as error:
         raise InputError(
-            "PyBullet is not installed; run: pip install 'warp-deform[dev]' "
+            f"PyBullet is not installed; in the clone run: {install_extra('dev')} "
             "(its wheels stop at Python 3.11)"
         ) from error
     return pybullet

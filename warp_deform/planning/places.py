@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rendering.pixels import BOUNDS
-from ..spaces import LIFT
+from ..robots.primitive import LIFT
 from ..tasks.task import Action, Task
 from .slopes import PLACE, Slope
 

@@ -16,9 +16,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..rendering.pixels import BOUNDS
-from ..robots.primitive import Motion, solve_joints
+from ..robots.primitive import LIFT, Motion, solve_joints
 from ..rollout import GripPath, rollout
-from ..spaces import LIFT
 from ..tasks.task import Action, Task
 from ..world_state import WorldState
 from ..worlds import CALM, RETREAT_LEAST, Worlds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import TYPE_CHECKING, Literal
 
 from warp_deform.errors import InputError
 from warp_deform.robots.arm import Robot
@@ -10,23 +11,29 @@ from warp_deform.robots.kinematics import IKResult
 from warp_deform.robots.panda import PANDA
 from warp_deform.robots.ur5 import UR5
 
-__all__ = ["IKResult", "Robot", "robot"]
+__all__ = ["ROBOTS", "IKResult", "Robot", "RobotName", "robot"]
 
-_CONFIGS = {config.name: config for config in (UR5, PANDA)}
+ROBOTS = {config.name: config for config in (UR5, PANDA)}
+"""The arms by name. A new one is a line here: options, tests and benchmarks run over this."""
+
+if TYPE_CHECKING:
+    RobotName = str
+else:  # the choices that a command's help shows
+    RobotName = Literal[tuple(ROBOTS)]
 
 
 def robot(name: str) -> Robot:
-    """Return the robot called `name`, "ur5" or "panda"; the same instance on every call.
+    """Return the robot called `name`, one of `ROBOTS`; the same instance on every call.
 
     Raises:
         InputError: there is no robot of that name
     """
-    if name not in _CONFIGS:
-        raise InputError(f"robot: one of {', '.join(_CONFIGS)}, not {name!r}")
+    if name not in ROBOTS:
+        raise InputError(f"robot: one of {', '.join(ROBOTS)}, not {name!r}")
     return _build(name)
 
 
 @cache
 def _build(name: str) -> Robot:
     """Build a robot once per process."""
-    return Robot(_CONFIGS[name])
+    return Robot(ROBOTS[name])

@@ -74,6 +74,10 @@ class PrimitiveConfig:
     """Largest turn between them [rad]."""
 
 
+LIFT = (0.04, 0.40)
+"""Least and greatest height [m] at which the tip carries what it holds."""
+
+
 @dataclass(frozen=True)
 class Stage:
     """How high the tip carries what it holds [m], and how fast [m/s].

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..objects.bag import Bag, add_bag
-from .bag_opening import BagTask
+from .bag_opening import BAG_ROWS, BagTask
 from .bag_physics import OPEN
 from .free_space import FreeSpace
 from .task import Action, Layout, Snapshot
@@ -34,7 +34,7 @@ class BagAloneOpen(BagTask):
     name = "bag-alone-open"
     stages = (OPEN,)
     success_score = 0.70
-    ground_truth_size = 99
+    ground_truth_rows = BAG_ROWS
     objects = ("bag",)
     pushes = 12
 

@@ -14,10 +14,10 @@ from ..objects.bag import add_bag
 from ..objects.box import Box, BoxConfig, BoxPart, add_box
 from ..objects.colors import BLUE, CYAN, GREEN, PURPLE, RED, YELLOW, Color
 from ..objects.scene_object import SceneObject
-from .bag_opening import BagTask
+from .bag_opening import BAG_ROWS, BagTask
 from .bag_physics import INSERT, OPEN
 from .free_space import FreeSpace, NoFreeSpace
-from .ground_truth import pose_rows, quaternion_yaw
+from .ground_truth import Row, pose_rows, quaternion_yaw
 from .task import Action, Layout, Snapshot, Stage
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class BagColorGoal(BagTask):
     goal_conditioned = True
     stages = (OPEN, INSERT)
     success_score = 0.95
-    ground_truth_size = 414
+    ground_truth_rows = 2 * (*BAG_ROWS, *BAG_ROWS, (Row.POSE, 1), (Row.FIXED, 2))
     objects = ("bag", "block", "bag")
 
     block: ClassVar[BoxConfig] = BoxConfig(

@@ -14,11 +14,11 @@ from ..objects.box import Box, BoxConfig, BoxPart, add_box
 from ..objects.colors import BROWN, RED, Color
 from ..objects.scene_object import SceneObject
 from ..objects.zone import square_zone
-from .bag_opening import BagTask
+from .bag_opening import BAG_ROWS, BagTask
 from .bag_physics import CARRY, INSERT, OPEN
 from .demonstrators import pick_place
 from .free_space import FreeSpace, NoFreeSpace
-from .ground_truth import pose_rows, quaternion_yaw
+from .ground_truth import Row, pose_rows, quaternion_yaw
 from .shapes import to_world
 from .task import Action, Layout, Snapshot, Stage
 
@@ -50,7 +50,7 @@ class BagItems1(BagTask):
     name = "bag-items-1"
     stages = (OPEN, INSERT, CARRY)
     success_score = 0.5
-    ground_truth_size = 105
+    ground_truth_rows = ((Row.POSE, 1), *BAG_ROWS, (Row.POSE, 1))
     objects: ClassVar[tuple[str, ...]] = ("bag", "cube")
 
     cubes: ClassVar[tuple[BoxConfig, ...]] = (
@@ -276,7 +276,7 @@ class BagItems2(BagItems1):
     name = "bag-items-2"
     place_yaws = 24
     max_actions = 9
-    ground_truth_size = 108
+    ground_truth_rows = ((Row.POSE, 1), *BAG_ROWS, (Row.POSE, 2))
     objects: ClassVar[tuple[str, ...]] = ("bag", "box", "box")
     cubes: ClassVar[tuple[BoxConfig, ...]] = (
         BoxConfig(parts=(BoxPart((0.035, 0.035, 0.03)),), mass=0.1, friction=1.5, color=BROWN),

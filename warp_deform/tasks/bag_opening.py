@@ -21,7 +21,7 @@ from ..rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world
 from ..robots.primitive import PrimitiveConfig, find_grasp
 from .bag_physics import BAG_PRIMITIVE, BAG_SOLVER, INSERT, OPEN
 from .demonstrators import farthest_bead, pick_place, ring_maps, visible_point
-from .ground_truth import pose_rows
+from .ground_truth import Row, Rows, pose_rows
 from .losses import mean_distance, ring_area
 from .metrics import hull_area
 from .shapes import chain_yaw
@@ -30,7 +30,10 @@ from .task import Action, Layout, Snapshot, Task
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["BagTask", "bag_mask", "enclosed"]
+__all__ = ["BAG_ROWS", "BagTask", "bag_mask", "enclosed"]
+
+BAG_ROWS: Rows = ((Row.BEAD, 32), (Row.DISPLACEMENT, 1))
+"""A bag's part of a ground truth: the beads of its opening, and how far it has moved."""
 
 DROP = 0.15
 """Height of the sphere's centre from which a bag falls [m]."""

@@ -15,7 +15,7 @@ from ..objects.box import Box, BoxConfig, add_box, l_block
 from ..solver.config import SolverConfig
 from .demonstrators import pick_place_pose, visible_point
 from .free_space import FreeSpace
-from .ground_truth import pose_rows, quaternion_yaw
+from .ground_truth import Row, pose_rows, quaternion_yaw
 from .metrics import pose_error, wrap_angle
 from .shapes import to_world
 from .task import Action, Layout, Snapshot, Stage, Task
@@ -45,7 +45,7 @@ class BlockNotarget(Task):
     stages = (Stage(lift=0.30, speed=0.5),)
     place_yaws = 24
     success_score = 1.0
-    ground_truth_size = 6
+    ground_truth_rows = ((Row.POSE, 2),)
     objects = ("block",)
     # friction multiplies: 0.3 of the block times 1.0 of the table, as in the original
     solver = SolverConfig(table_friction=1.0, contact_friction=1.0)

@@ -31,7 +31,7 @@ from ..robots.jaw_primitive import JawActionConfig, hand_pose
 from .chain_physics import BEAD_CHAIN, CHAIN_SOLVER
 from .chain_shapes import curved_chain, straight_chain, tossed_chain
 from .free_space import FreeSpace
-from .ground_truth import pose_rows
+from .ground_truth import Row, pose_rows
 from .metrics import mask_iou
 from .shapes import chain_yaw
 from .strand_grasp import find_grasp, map_direction, wrap_half_turn
@@ -63,7 +63,7 @@ class CableMaskGoal(Task):
     jaw = JawActionConfig()
     rotated_copies = 24
     success_score = 0.25
-    ground_truth_size = 2 * 3 * BEAD_CHAIN.beads
+    ground_truth_rows = ((Row.BEAD, 2 * BEAD_CHAIN.beads),)
     objects = ("bead chain",)
 
     cable: ClassVar[CableConfig] = BEAD_CHAIN

@@ -17,7 +17,7 @@ from ..rendering.pixels import BOUNDS
 from .cable_physics import CABLE_SLOPE_DAMPING, CABLE_SOLVER, CABLE_STAGE
 from .demonstrators import best_map, met_particle, pick_place, ring_maps
 from .free_space import FreeSpace
-from .ground_truth import pose_rows
+from .ground_truth import Row, pose_rows
 from .metrics import hull_area
 from .shapes import chain_yaw
 from .task import Action, Layout, Snapshot, Task
@@ -59,7 +59,7 @@ class CableRing(Task):
     solver = CABLE_SOLVER
     slope_damping = CABLE_SLOPE_DAMPING
     success_score = 0.75
-    ground_truth_size = 192
+    ground_truth_rows = ((Row.BEAD, 64),)
     objects = ("cable",)
 
     cable: ClassVar[RingConfig] = RingConfig()
@@ -181,7 +181,7 @@ class CableRingNotarget(CableRing):
     """cable-ring without marks: any opened ring will do, wherever it lies."""
 
     name = "cable-ring-notarget"
-    ground_truth_size = 96
+    ground_truth_rows = ((Row.BEAD, 32),)
     visible = False
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:

@@ -17,7 +17,7 @@ from ..objects.zone import segment_zone
 from .cable_physics import CABLE_SLOPE_DAMPING, CABLE_SOLVER, CABLE_STAGE
 from .demonstrators import met_particle, pick_place, visible_point
 from .free_space import FreeSpace
-from .ground_truth import pose_rows
+from .ground_truth import Row, Rows, pose_rows
 from .metrics import share_in_zone, wrap_angle
 from .shapes import chain_yaw, sample_shape, to_world
 from .task import Action, Layout, Snapshot, Task
@@ -50,7 +50,7 @@ class CableShape(Task):
     solver = CABLE_SOLVER
     slope_damping = CABLE_SLOPE_DAMPING
     success_score = 1.0
-    ground_truth_size = 147
+    ground_truth_rows: ClassVar[Rows] = ((Row.POSE, 1), (Row.BEAD, 48))
     objects = ("cable",)
     # From the white end on, every target turns to the same side: that says which end goes where.
     mirrors = False
@@ -175,7 +175,7 @@ class CableShapeNotarget(CableShape):
 
     name = "cable-shape-notarget"
     goal_conditioned = True
-    ground_truth_size = 144
+    ground_truth_rows = ((Row.BEAD, 48),)
     visible = False
     mirrors = True  # the goal's picture shows both ends
 

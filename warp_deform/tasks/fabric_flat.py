@@ -17,7 +17,7 @@ from .demonstrators import pick_place
 from .fabric_pull import beyond, corners, first_taken, on_table
 from .fabric_shape import fold_corner, square_corners, square_mask
 from .free_space import FreeSpace, NoFreeSpace
-from .ground_truth import pose_rows
+from .ground_truth import Row, Rows, pose_rows
 from .metrics import coverage, mask_iou, wrap_angle
 from .task import Action, Layout, Snapshot, Stage, Task
 
@@ -58,7 +58,7 @@ class FabricFlat(Task):
     solver = FABRIC_SOLVER
     primitive = FABRIC_PRIMITIVE
     success_score = 0.85
-    ground_truth_size = 303
+    ground_truth_rows: ClassVar[Rows] = ((Row.POSE, 1), (Row.POINT, 100))
     objects = ("fabric",)
 
     fabric: ClassVar[ClothConfig] = FABRIC
@@ -215,7 +215,7 @@ class FabricFlatNotarget(FabricFlat):
 
     name = "fabric-flat-notarget"
     goal_conditioned = True
-    ground_truth_size = 600
+    ground_truth_rows = ((Row.POINT, 200),)
     visible = False
 
     def sample(self, rng: np.random.Generator, space: FreeSpace) -> Layout:

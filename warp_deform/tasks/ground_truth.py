@@ -1,4 +1,4 @@
-"""State vectors of the paper's ground-truth baselines.
+"""State vectors of the paper's ground-truth baselines, and what their numbers are.
 
 Source: Seita et al., ICRA 2021, section on baselines: a rigid body is (x, y, -yaw / 15), because
 the policies count rotations in steps of 15 degrees.
@@ -6,11 +6,59 @@ the policies count rotations in steps of 15 degrees.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from enum import Enum
+
 import numpy as np
 
-__all__ = ["YAW_SCALE", "pose_rows", "quaternion_yaw"]
+__all__ = ["YAW_SCALE", "Row", "Rows", "pose_rows", "quaternion_yaw", "row_kinds",
+           "rows_of", "yaw_columns"]  # fmt: skip
 
 YAW_SCALE = 15.0
+
+
+class Row(Enum):
+    """What three numbers of a ground truth are: how they change when the table is turned."""
+
+    POSE = "pose"
+    """x, y [m] and -yaw / 15 [rad] of a rigid body or zone."""
+    BEAD = "bead"
+    """The same of a link of a chain, or of its target."""
+    POINT = "point"
+    """x, y, z [m]."""
+    DISPLACEMENT = "displacement"
+    """x, y [m] and -yaw / 15 [rad] of a pose relative to another one."""
+    FIXED = "fixed"
+    """What does not move with the table, as colours."""
+
+
+Rows = tuple[tuple[Row, int], ...]
+"""A ground truth as runs of rows: kind and number, three numbers each row."""
+
+
+def row_kinds(rows: Rows) -> np.ndarray:
+    """Kind of every row (n,), as objects.
+
+    >>> row_kinds(((Row.POSE, 1), (Row.POINT, 2))).tolist()
+    [<Row.POSE: 'pose'>, <Row.POINT: 'point'>, <Row.POINT: 'point'>]
+    """
+    kinds = np.empty(sum(count for _, count in rows), dtype=object)
+    kinds[:] = [kind for kind, count in rows for _ in range(count)]
+    return kinds
+
+
+def rows_of(kinds: np.ndarray, wanted: Sequence[Row]) -> np.ndarray:
+    """Which of the rows `kinds` (n,) are of one of the wanted kinds (n,) bool."""
+    return np.array([kind in wanted for kind in kinds], dtype=bool)
+
+
+def yaw_columns(rows: Rows) -> tuple[int, ...]:
+    """Where in a ground truth -yaw / 15 of rigid bodies and zones stand.
+
+    >>> yaw_columns(((Row.POINT, 1), (Row.POSE, 2)))
+    (5, 8)
+    """
+    return tuple(int(3 * row + 2) for row in np.flatnonzero(rows_of(row_kinds(rows), [Row.POSE])))
 
 
 def pose_rows(xy: np.ndarray, yaw: np.ndarray | float) -> np.ndarray:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     from ..rendering.topdown import TopDown
     from ..robots.jaw_primitive import JawActionConfig
     from .free_space import FreeSpace
+    from .ground_truth import Rows
 
 __all__ = ["PHYSICS", "Action", "Layout", "Snapshot", "Stage", "Task"]
 
@@ -112,7 +113,11 @@ class Task(abc.ABC):
     stages: ClassVar[tuple[Stage, ...]]
     success_score: ClassVar[float]
     """Score at and above which the task is solved."""
+    ground_truth_rows: ClassVar[Rows] = ()
+    """What the numbers of the ground truth are, three a row, where it may be turned and mirrored
+    with the table; without it no ground-truth baseline is trained with augmentation."""
     ground_truth_size: ClassVar[int]
+    """Length of the ground truth; a class with `ground_truth_rows` of its own need not say it."""
     objects: ClassVar[tuple[str, ...]] = ()
     """Names of what is simulated, for listings."""
     solver: ClassVar[SolverConfig] = SolverConfig()
@@ -131,6 +136,11 @@ class Task(abc.ABC):
     """Whether mirror images of scenes and actions are the task's, too."""
     place_yaws: ClassVar[int] = 1
     """Place yaws to choose among, evenly spread; 1 where the yaw does not matter."""
+
+    def __init_subclass__(cls, **options: object) -> None:
+        super().__init_subclass__(**options)
+        if "ground_truth_rows" in vars(cls) and "ground_truth_size" not in vars(cls):
+            cls.ground_truth_size = 3 * sum(count for _, count in cls.ground_truth_rows)
 
     def stage_of(self, lift: float) -> Stage:
         """The stage whose lift is nearest to `lift` [m]; of equally near ones the first."""
