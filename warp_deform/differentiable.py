@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .checked import POSITIVE, check_number
 from .errors import InputError
 from .rollout import GripPath, prepare
 from .solver.recorder import Recorder
@@ -83,6 +84,7 @@ class DifferentiableRollout:
         self.recorder = Recorder(solver, storage=storage, memory=memory, sleep=sleep)
         self.watch: list[WatchValues] = []
         self._worlds: list[int] = []
+        self.times = np.zeros(0)
         self.velocities = np.zeros((0, 0, 0, 3))
         self.body_poses = np.zeros((0, 0, 0, 7))
         self.body_velocities = np.zeros((0, 0, 0, 6))
@@ -103,7 +105,8 @@ class DifferentiableRollout:
         calm: float | Mapping[int, float] = 0.0,
         calm_after: float = 0.0,
     ) -> np.ndarray:
-        """Positions (W, T, P, 3) [m] at `times` [s] from the start, ascending.
+        """Positions (W, T, P, 3) [m] at `times` [s] from the start, ascending: at the nearest
+        whole numbers of substeps, whose times are then in `times` (T,) [s].
 
         At these times `velocities` (W, T, P, 3) [m/s] are then those of the particles, `body_poses`
         (W, T, B, 7) the poses of the bodies' frames, position and quat_xyzw, and `body_velocities`
@@ -125,8 +128,9 @@ class DifferentiableRollout:
             raise InputError(
                 "derivatives are taken of worlds of one topology at a time, at least one"
             )
-        marks = [round(float(t) / dt) for t in times]
+        marks = [round(check_number(t, "times", POSITIVE) / dt) for t in times]
         self._marks = marks
+        self.times = np.array(marks) * dt
         for name, value in (parameters or {}).items():
             self._set(name, np.asarray(value, dtype=float))
         for name, start in (("particles.x", positions), ("particles.v", velocities)):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .checked import NOT_NEGATIVE, Interval, check_number, real_array
 from .errors import InputError
 from .objects.push import MOST_PUSHES
 
@@ -102,6 +103,9 @@ def rollout(
     release
     record: interval of recorded frames [s]; 0 records nothing
 
+    Durations are rounded to whole substeps; `Rollout.seconds` and `Frames.times` are what was
+    simulated.
+
     A world's result does not depend on which other worlds run with it.
     """
     dt = solver.config.dt
@@ -109,13 +113,13 @@ def rollout(
         solver, worlds, paths=paths, pushes=pushes, least=least, most=most, calm=calm,
         calm_after=calm_after,
     )  # fmt: skip
-    every = max(1, round(record / dt)) if record else 0
+    every = max(1, _substeps(record, -1, "record", dt)) if record else 0
     watch = solver.run(longest, record_every=every)
     return {
         w: Rollout(
             seconds=watch[w].steps * dt,
             watch=watch[w],
-            at_rest=watch[w].steps < round(_of(most, w) / dt),
+            at_rest=watch[w].steps < _substeps(most, w, "most", dt),
             frames=_frames(solver, w, watch[w].steps, every),
         )
         for w in worlds
@@ -142,28 +146,48 @@ def prepare(
     data.clear_grips()
     _write_paths(solver, paths)
     for w, kicks in (pushes or {}).items():
-        if len(kicks) > MOST_PUSHES:
-            raise InputError(
-                f"{len(kicks)} pushes in world {w}; there may be {MOST_PUSHES} at once"
-            )
-        for at, push in enumerate(kicks, start=data.slot[w] * MOST_PUSHES):
-            data.views["grips.push"][at] = push.particle
-            data.views["grips.push_acceleration"][at] = push.acceleration
-            data.views["grips.push_steps"][at] = round(push.seconds / dt)
+        _write_pushes(solver, w, kicks)
     solver.activate(np.asarray(worlds, dtype=int))
     longest = 1
     for w in worlds:
-        limit = round(_of(most, w) / dt)
+        limit = _substeps(most, w, "most", dt)
         longest = max(longest, limit)
-        data.per_world("group.least_steps", w)[:] = round(_of(least, w) / dt)
+        data.per_world("group.least_steps", w)[:] = _substeps(least, w, "least", dt)
         data.per_world("group.most_steps", w)[:] = limit
-        data.per_world("group.calm_steps", w)[:] = round(_of(calm, w) / dt)
-        data.per_world("group.calm_after", w)[:] = round(calm_after / dt)
+        data.per_world("group.calm_steps", w)[:] = _substeps(calm, w, "calm", dt)
+        data.per_world("group.calm_after", w)[:] = _substeps(calm_after, w, "calm_after", dt)
     return longest
 
 
-def _of(value: float | Mapping[int, float], world: int) -> float:
-    return float(value[world]) if isinstance(value, Mapping) else float(value)
+def _substeps(value: float | Mapping[int, float], world: int, name: str, dt: float) -> int:
+    """A duration [s] in substeps, the nearest whole number of them."""
+    seconds = value[world] if isinstance(value, Mapping) else value
+    return round(check_number(seconds, name, NOT_NEGATIVE) / dt)
+
+
+def _write_pushes(solver: SolverFusedXPBD, world: int, pushes: Sequence[Push]) -> None:
+    data, dt = solver.data, solver.config.dt
+    if len(pushes) > MOST_PUSHES:
+        raise InputError(
+            f"{len(pushes)} pushes in world {world}; there may be {MOST_PUSHES} at once"
+        )
+    count = data.topologies[data.world_topology[world]].particle_count
+    for at, push in enumerate(pushes, start=data.slot[world] * MOST_PUSHES):
+        check_number(
+            push.particle,
+            f"Push.particle in world {world}",
+            Interval(low=0, high=count - 1, whole=True),
+        )
+        steps = _substeps(push.seconds, world, "Push.seconds", dt)
+        if steps == 0 and push.seconds > 0:
+            raise InputError(
+                f"Push.seconds is {push.seconds:.3g}, but a push takes one substep, {dt:.3g} s"
+            )
+        data.views["grips.push"][at] = push.particle
+        data.views["grips.push_acceleration"][at] = real_array(
+            push.acceleration, (3,), name="Push.acceleration", finite=True
+        )
+        data.views["grips.push_steps"][at] = steps
 
 
 def _write_paths(solver: SolverFusedXPBD, paths: Mapping[int, GripPath]) -> None:

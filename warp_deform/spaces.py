@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
+from .checked import real_array
 from .episodes import MAX_HEIGHT
 from .errors import InputError
 from .rendering.images import Images
@@ -24,6 +25,8 @@ _EXACT = np.array([*_POSE, *_POSE, LIFT])
 # A policy computes in float32: a limit rounded to float32 still lies within the space.
 _LOW = np.minimum(_EXACT[:, 0], _EXACT[:, 0].astype(np.float32))
 _HIGH = np.maximum(_EXACT[:, 1], _EXACT[:, 1].astype(np.float32))
+# One rounding step of float32 at the limits, with a hair for rounding in float64.
+_STEP = np.spacing(np.abs(_EXACT).max(axis=1).astype(np.float32)).astype(float) * (1 + 1e-6)
 
 
 def action_space() -> spaces.Box:
@@ -42,24 +45,23 @@ def observation_space(task: Task) -> spaces.Dict:
 
 
 def check_action(action: ArrayLike, *, name: str = "action") -> np.ndarray:
-    """The action as (7,) float64, unchanged.
+    """The action as (7,) float64: what the action space holds unchanged, what is one rounding step
+    beyond it on its limit.
+
+    A policy, or a wrapper that rescales its output, computes in float32 and may round a limit
+    outwards; nothing else is clamped.
 
     Raises:
-        InputError: another shape, or a value that is not a number within the action space.
+        InputError: another shape, no real numbers, or a value beyond the action space.
     """
-    try:
-        values = np.array(action, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: 7 numbers are needed, got {action!r}") from error
-    if values.shape != _LOW.shape:
-        raise InputError(f"{name}: 7 numbers are needed, got shape {values.shape}")
-    for what, value, low, high in zip(_NAMES, values, _LOW, _HIGH, strict=True):
-        if not low <= value <= high:  # also when it is not a number
+    values = real_array(action, _LOW.shape, name=name)
+    for what, value, low, high, step in zip(_NAMES, values, _LOW, _HIGH, _STEP, strict=True):
+        if not low - step <= value <= high + step:  # also when it is not a number
             unit = "rad" if what.endswith("yaw") else "m"
             raise InputError(
                 f"{name}: {what} is {value:.6g} {unit}, allowed are {low:.6g} to {high:.6g}"
             )
-    return values
+    return np.clip(values, _LOW, _HIGH)
 
 
 def observation(worlds: Worlds, slot: int) -> dict[str, np.ndarray]:

@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
+from .checked import real_array
 from .demonstrators import demonstrator as find_demonstrator
 from .env import WorldsView, check_render_mode, ending
 from .episode_loop import Run
@@ -129,14 +130,11 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         if self.autoreset_mode is AutoresetMode.DISABLED and self.ended.any():
             over = ", ".join(map(str, np.flatnonzero(self.ended)))
             raise ResetNeeded(f"the episodes of environments {over} are over: reset them")
-        if np.shape(actions) != self.action_space.shape:
-            raise InputError(
-                f"actions need shape {self.action_space.shape}, got {np.shape(actions)}"
-            )
+        rows = real_array(actions, (self.num_envs, 7), name="actions")
         waiting = [int(i) for i in np.flatnonzero(self.ended)]
         acting = {
             i: check_action(action, name=f"action of environment {i}")
-            for i, action in enumerate(np.asarray(actions))
+            for i, action in enumerate(rows)
             if i not in waiting
         }
         reports = self.worlds.step(acting) if acting else {}

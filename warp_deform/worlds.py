@@ -12,6 +12,7 @@ from pathlib import Path
 import newton
 import numpy as np
 
+from .checked import real_array
 from .episodes import Goal, state_hash
 from .errors import InputError, WarpDeformError
 from .jaw_step import jaw_step
@@ -278,9 +279,7 @@ class Worlds:
         return reports
 
     def _checked(self, slot: int, action: np.ndarray) -> Plan:
-        action = np.asarray(action, dtype=float)
-        if action.shape != (7,) or not np.isfinite(action).all():
-            raise InputError(f"an action needs 7 finite numbers, got {action}")
+        action = real_array(action, (7,), name=f"action of slot {slot}", finite=True)
         if slot not in self.episodes:
             raise InputError(f"slot {slot} has no episode: reset it first")
         return Plan(action)

@@ -19,6 +19,7 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
+from .checked import real_array
 from .env import PickPlaceEnv
 from .errors import InputError
 from .rendering.pixels import SHAPE
@@ -57,7 +58,7 @@ class PrivilegedStage(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
     def step(self, action: ArrayLike) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Pick and place with the stage's lift; action (6,)."""
         worlds = cast(PickPlaceEnv, self.unwrapped).worlds
-        pose = _check(action, (6,))
+        pose = real_array(action, (6,), name="action under the privileged rule")
         if worlds.episodes:
             self._stage = stage_at(worlds, 0, pose, self._stage)
         lift = self._stage.lift if self._stage else 0.0
@@ -88,7 +89,7 @@ class VectorPrivilegedStage(VectorWrapper[Any, Any, Any, Any, Any]):
     def step(self, actions: ArrayLike) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Pick and place with every environment's lift; actions (num_envs, 6)."""
         env = cast(PickPlaceVectorEnv, self.unwrapped)
-        poses = _check(actions, (self.num_envs, 6))
+        poses = real_array(actions, (self.num_envs, 6), name="actions under the privileged rule")
         lifts = np.full(self.num_envs, float(env.single_action_space.low[6]))  # type: ignore[attr-defined]
         for i in range(self.num_envs):
             if i in env.worlds.episodes and not env.ended[i]:
@@ -117,14 +118,6 @@ def stage_at(worlds: Worlds, slot: int, pose: np.ndarray, previous: Stage | None
 def _without_lift() -> spaces.Box:
     full = action_space()
     return spaces.Box(full.low[:6], full.high[:6], dtype=np.float64)
-
-
-def _check(action: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    if np.shape(action) != shape:
-        raise InputError(
-            f"under the privileged rule actions have shape {shape}, got {np.shape(action)}"
-        )
-    return np.asarray(action, dtype=float)
 
 
 def _mark(infos: dict[str, Any]) -> dict[str, Any]:

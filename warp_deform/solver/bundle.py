@@ -22,8 +22,8 @@ __all__: list[str] = []  # `warp_deform.solver` is the import path of what is he
 
 _HEADER = {"digest", "lanes", "precision", "bodies", "sheets", "edges", "groups", "settings"}
 _SETTINGS = ("dt", "max_steps", "recovery", "max_speed", "calm_speed", "margin",
-             "rest_speed", "rest_steps", "check_every", "record_every", "particle_stride",
-             "body_stride")  # fmt: skip
+             "rest_speed", "rest_steps", "viscous", "dry", "sleep", "sleep_ramp", "check_every",
+             "record_every", "particle_stride", "body_stride")  # fmt: skip
 
 
 def write_bundle(

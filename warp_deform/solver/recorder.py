@@ -53,6 +53,7 @@ class Recorder:
     memory: most bytes of checkpoints and tapes; a rollout that does not fit is refused.
     sleep: False leaves dry friction and sleep of fabrics out: they hold what a derivative should
     move.
+    dt: length of a substep [s]; None: the solver's.
 
     Branches (contact or not, side, clamp, stick, release, rest) are those of the forward pass, as
     functions of the state there: the derivative is that of the smooth piece the rollout ran on.
@@ -68,10 +69,12 @@ class Recorder:
         storage: str = "replay",
         memory: int = 2**30,
         sleep: bool = True,
+        dt: float | None = None,
     ) -> None:
         if storage not in ("replay", "full"):
             raise InputError(f"storage must be replay or full, not {storage!r}")
         self.solver, self.storage, self.memory, self.sleep = solver, storage, memory, sleep
+        self.dt = dt or solver.config.dt
         data = solver.data
         variant = (
             data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets, data.has_edges
@@ -258,7 +261,7 @@ class Recorder:
 
     def _new_settings(self) -> Any:
         # one of its own: it is changed here and between launches
-        settings = self.solver._new_settings(self.solver.config, 0, 0)
+        settings = self.solver._new_settings(self.solver.config, 0, 0, self.dt)
         if not self.sleep:
             settings.dry = settings.sleep = 0.0
         return settings
@@ -319,7 +322,7 @@ class Recorder:
         for mirrored in self._adjoint.values():
             mirrored.to_host()
         out = {name: mirrored.view.copy() for name, mirrored in self._adjoint.items()}
-        data, dt = self.solver.data, self.solver.config.dt
+        data, dt = self.solver.data, self.dt
         damping, stiffness = (self._inputs[f"group.{n}"] for n in ("damping", "stiffness"))
         # what is pinned has no mass to derive by
         out["body.w"] *= self._inputs["bodies.w0"] > 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from .config import SolverConfig
 from .data import WATCHED, SolverData
 from .forward import forward_kernel
 from .guards import PhysicsError, Problem, WatchValues
+from .stepping import grip_from_control, substeps
 
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
@@ -89,6 +91,9 @@ class SolverFusedXPBD(SolverBase):
         self._launch: Any = None
         self._launch_settings: Any = None
         self._cached_settings: tuple[Any, Any] | None = None
+        self._clamped: list[
+            float
+        ] = []  # by world: substeps that the clamp acted in, steps in a row
         self._gravity()
         # padded lanes divide by their stiffness as well
         self.data.views["group.stiffness"][:] = 1.0
@@ -192,8 +197,13 @@ class SolverFusedXPBD(SolverBase):
 
     # -- running
 
-    def run(self, max_steps: int, *, record_every: int = 0) -> list[WatchValues]:
+    def run(
+        self, max_steps: int, *, record_every: int = 0, dt: float | None = None
+    ) -> list[WatchValues]:
         """Launch up to `max_steps` substeps; returns the guards' values by world.
+
+        dt: length of a substep [s], None: as configured. What is given per second, or in seconds,
+        is turned into shares and numbers of these substeps.
 
         Worlds stop early as `set_duration` says. Nothing is raised, see `check`; but when a guard
         fires and the solver has a folder for bundles, `bundle` is the file that reproduces it.
@@ -203,7 +213,7 @@ class SolverFusedXPBD(SolverBase):
         if frames > data.frame_room:
             data.reserve_frames(frames)
             self._launch = None
-        settings = self._settings(max_steps, record_every)
+        settings = self._settings(max_steps, record_every, dt or self.config.dt)
         data.clear_watch()
         inputs = {}
         if self.bundles is not None:
@@ -223,28 +233,30 @@ class SolverFusedXPBD(SolverBase):
         limits = self.config.limits
         return tuple(p for w, v in enumerate(values) if v.steps for p in v.problems(w, limits))
 
-    def _settings(self, max_steps: int, record_every: int) -> Any:
+    def _settings(self, max_steps: int, record_every: int, dt: float) -> Any:
         """The kernel's settings, not to be changed: launches alike, which is most, share them."""
-        key = self.config, max_steps, record_every
+        key = self.config, max_steps, record_every, dt
         if self._cached_settings is None or self._cached_settings[0] != key:
             self._cached_settings = key, self._new_settings(*key)
         return self._cached_settings[1]
 
-    def _new_settings(self, config: SolverConfig, max_steps: int, record_every: int) -> Any:
+    def _new_settings(
+        self, config: SolverConfig, max_steps: int, record_every: int, dt: float
+    ) -> Any:
         data = self.data
         settings = data.types.Settings()
-        settings.dt = config.dt
+        settings.dt = dt
         settings.max_steps = max_steps
         settings.recovery = config.recovery
         settings.max_speed = config.max_speed
         settings.calm_speed = config.calm_speed
         settings.margin = config.margin
         settings.rest_speed = config.rest_speed
-        settings.viscous = -math.expm1(-config.viscosity * config.dt)
-        settings.dry = config.dry_friction * config.dt
+        settings.viscous = -math.expm1(-config.viscosity * dt)
+        settings.dry = config.dry_friction * dt
         settings.sleep = config.sleep_speed
         settings.sleep_ramp = config.sleep_ramp
-        settings.rest_steps = max(1, round(config.rest_seconds / config.dt))
+        settings.rest_steps = max(1, round(config.rest_seconds / dt))
         settings.check_every = 20
         settings.record_every = record_every
         settings.particle_stride = int(data.group_particle[-1])
@@ -298,44 +310,38 @@ class SolverFusedXPBD(SolverBase):
         *,
         observables: Any = None,
     ) -> None:
-        """Advance every world by `dt` in round(dt / config.dt) substeps, at least one.
+        """Advance every world by `dt` [s], in equal substeps no longer than `config.dt`.
+
+        Of `config.dt` itself where `dt` is a multiple of it; otherwise the substep and all that is
+        given per second are adapted to `dt`. The guard of the speed clamp counts through steps in a
+        row: a fall that the clamp holds up is an error, not a slow fall.
 
         Raises:
+            InputError: `dt` is no positive number, or no sensible multiple of `config.dt`.
             PhysicsError: a guard fired.
         """
+        steps, substep = substeps(dt, self.config.dt)
         self.read_state(state_in)
         self.data.clear_grips()
-        steps = max(1, round(dt / self.config.dt))
         ours = getattr(control, NAMESPACE, None) if control is not None else None
         if ours is not None and hasattr(ours, "grip_particle"):
-            self._grip_from_control(ours, steps)
+            grip_from_control(self.data, ours, steps * substep)
         self.set_duration(_FOREVER, _FOREVER)
         self.activate()
-        values = self.run(steps)
+        values = self.run(steps, dt=substep)
         self.write_state(state_out)
-        self.check(values)
+        self.check(self._clamped_in_a_row(values, substep / self.config.dt))
 
-    def _grip_from_control(self, ours: Any, steps: int) -> None:
-        views, targets = self.data.views, ours.grip_target.numpy()
-        duration = steps * self.config.dt
-        for w, particle in enumerate(ours.grip_particle.numpy()):
-            slot = self.data.slot[w]
-            if particle < 0:
-                continue
-            start = self.data.lane("particles.x", w)[particle]
-            first = 2 * slot
-            for name, value in (
-                ("particle", particle), ("tick", 0), ("knot", first),
-                ("knot_end", first + 2), ("offset", 0.0), ("turn", (0, 0, 0, 1)), ("shift", 0.0),
-                ("lower_start", 0.0), ("lower_end", 0.0),
-            ):  # fmt: skip
-                views[f"grips.{name}"][slot] = value
-            # the knots end after the step, so that the grip lasts through it
-            beyond = 2.0
-            views["grips.time"][first : first + 2] = 0.0, beyond * duration
-            views["grips.position"][first] = start
-            views["grips.position"][first + 1] = start + beyond * (targets[w] - start)
-            views["grips.rotation"][first : first + 2] = (0, 0, 0, 1)
+    def _clamped_in_a_row(self, values: list[WatchValues], share: float) -> list[WatchValues]:
+        """The values with the clamped substeps of the steps before, if all of them had some.
+
+        share: length of a substep as a share of the configured one, in which the guard counts
+        """
+        before = self._clamped or [0.0] * len(values)
+        self._clamped = [
+            c + v.clamped * share if v.clamped else 0.0 for c, v in zip(before, values, strict=True)
+        ]
+        return [replace(v, clamped=round(c)) for c, v in zip(self._clamped, values, strict=True)]
 
     def read_state(self, state: newton.State) -> None:
         """Take positions and velocities of all worlds from a Newton state."""

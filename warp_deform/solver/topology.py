@@ -6,6 +6,7 @@ apart from where they start and how heavy they are; such worlds can share SIMD l
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import newton
@@ -80,6 +81,7 @@ class WorldTopology:
         return b"|".join(np.ascontiguousarray(v).tobytes() for v in vars(self).values())
 
 
+@functools.lru_cache(maxsize=256)
 def tethers(topology: WorldTopology, held: int) -> np.ndarray:
     """Longest distance (P,) [m] of every particle from the particle `held` of a fabric.
 
@@ -95,6 +97,7 @@ def tethers(topology: WorldTopology, held: int) -> np.ndarray:
         reach = dijkstra(ways, directed=False, indices=held)
         joined = np.isfinite(reach)
         longest[joined] = reach[joined]
+    longest.flags.writeable = False  # callers share it
     return longest
 
 
