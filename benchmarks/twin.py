@@ -137,7 +137,7 @@ def _result(
                                 calibration=rig.calibration.digest())  # fmt: skip
         with EpisodeRecorder(Path(folder, "episode"), config, goal_mask=seen.mask) as recorder:
             return run_episode(rig.robot, rig.camera, rig.calibration, chooser,
-                               recorder=recorder, goal=seen.mask)  # fmt: skip
+                               recorder=recorder, goal=seen.mask, toss=rig.toss)  # fmt: skip
 
 
 def _read(path: Path | None) -> list[Played]:

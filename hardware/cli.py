@@ -11,7 +11,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +19,7 @@ from tyro.conf import arg, subcommand
 
 from warp_deform.cli import CommandOptions, Outcome
 from warp_deform.errors import InputError
+from warp_deform.flag_range import SEED, FlagRange
 from warp_deform.quiet import quiet_warp
 
 from .cli_records import ReplayOptions, ScoreOptions, replay, score
@@ -53,13 +54,13 @@ class _RigOptions(CommandOptions):
     """Number of a video device, or serial number of a RealSense."""
     frames: Annotated[Path | None, arg(metavar="DIR")] = None
     """Recorded pictures for --camera file: the folder `frames` of an episode."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Of the simulated toss and goal, and of what an agent draws."""
     execute: bool = False
     """Let a real arm move; without it, its commands are printed."""
     auto: bool = False
     """Do not ask before every action of a real arm."""
-    joint_speed: float = 0.05
+    joint_speed: Annotated[float, FlagRange(1e-3, 0.2)] = 0.05
     """Share of the joints' greatest speeds between poses, at most 0.2; begin with 0.05."""
 
     def rig(self) -> RigConfig:
@@ -83,9 +84,9 @@ class RunOptions(_RigOptions):
     """Training run or snapshot of cable-mask-goal, for --agent policy."""
     goal: Annotated[Path | None, arg(metavar="FILE.png")] = None
     """Mask to reach, see `capture-goal`; left out with --camera sim, a curve drawn by --seed."""
-    max_actions: Annotated[int | None, arg(metavar="N")] = None
+    max_actions: Annotated[int | None, arg(metavar="N"), FlagRange(1, 1000)] = None
     """Actions at most; 10, and 1 where nothing moves."""
-    budget: Annotated[int | None, arg(metavar="N")] = None
+    budget: Annotated[int | None, arg(metavar="N"), FlagRange(1, 10_000)] = None
     """Simulated actions that the planner spends on each real one; 32."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder for the recording; left out, the next number in franka-episodes."""
@@ -102,7 +103,7 @@ class CollectOptions(RunOptions):
 
     agent: AgentName = "human"
     """Who demonstrates, see `run`."""
-    episodes: Annotated[int, arg(aliases=["-n"], metavar="N")] = 1
+    episodes: Annotated[int, arg(aliases=["-n"], metavar="N"), FlagRange(1, 100_000)] = 1
     """Episodes to record."""
 
 
@@ -123,9 +124,9 @@ class EmulateOptions(CommandOptions):
 
     host: str = "127.0.0.1"
     """Address of this machine to listen on, 127.x.y.z."""
-    chain: Annotated[int | None, arg(metavar="SEED")] = None
+    chain: Annotated[int | None, arg(metavar="SEED"), SEED] = None
     """Toss a bead chain onto foam under the hand, and show it to --camera sim."""
-    table_z: Annotated[float | None, arg(metavar="M")] = None
+    table_z: Annotated[float | None, arg(metavar="M"), FlagRange(-1.0, 1.0)] = None
     """Height of a bare table instead [m]."""
     paced: bool = False
     """1 kHz by the wall clock, as a robot; else in lock-step, as fast as it goes."""
@@ -177,23 +178,29 @@ def _run(options: RunOptions) -> Outcome:
 def _collect(options: CollectOptions) -> Outcome:
     from warp_deform.episodes import EpisodeWriter
 
+    from .cameras.sim import SimCamera
     from .human import Terminal
     from .packing import pack
     from .rig import open_rig
 
     if options.out is None:
         raise InputError("collect needs --out, the folder of the dataset")
-    if options.episodes < 1:
-        raise InputError(f"--episodes is {options.episodes}; it must be 1 or more")
+    config = options.rig()
     live, writer = options.out / "live", EpisodeWriter(options.out)
     done: list[EpisodeResult] = []
     kept = 0
-    with open_rig(options.rig()) as rig:
+    with contextlib.ExitStack() as stack:
+        rig: Rig | None = None
         for number in range(options.episodes):
             seed = options.seed + number
-            if rig.toss is not None:
-                rig.toss(seed)
-            elif not options.auto and not Terminal().wait(f"episode {number + 1}: toss the cable"):
+            if rig is None or rig.toss is not None:
+                # What is simulated is made anew, so that every episode is that of `run --seed`.
+                stack.close()
+                rig = stack.enter_context(open_rig(replace(config, seed=seed)))
+            if isinstance(rig.camera, SimCamera):
+                rig.camera.reseed(seed)
+            simulated = rig.toss is not None or options.auto
+            if not simulated and not Terminal().wait(f"episode {number + 1}: toss the cable"):
                 break
             done.append(_episode(options, rig, _next_folder(live), seed=seed))
             if done[-1].error is not None:
@@ -204,6 +211,8 @@ def _collect(options: CollectOptions) -> Outcome:
             if episode.info.success:
                 writer.write(episode)
                 kept += 1
+            else:
+                _say(f"{done[-1].folder} is not kept as a demonstration: {_why_not(done[-1])}")
     data = {
         "out": options.out,
         "episodes": len(done),
@@ -213,6 +222,10 @@ def _collect(options: CollectOptions) -> Outcome:
     }
     text = f"{len(done)} episodes, {kept} of them kept as demonstrations, in {options.out}"
     return Outcome(data=data, text=text, failure=_failure(done[-1]) if done else None)
+
+
+def _why_not(result: EpisodeResult) -> str:
+    return "it begins where it ends" if result.score is None else "it did not reach its goal"
 
 
 def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> EpisodeResult:
@@ -265,6 +278,7 @@ def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> Episo
             config=settings,
             operator=Terminal() if config.real and not options.auto else Unattended(),
             empty=rig.empty,
+            toss=rig.toss,
             say=_say,
         )
 

@@ -47,29 +47,39 @@ def score(options: ScoreOptions) -> Outcome:
                 "actions": len(found.iou) - 1,
                 "actions_to_success": found.actions_to_success,
                 "iou": list(found.iou),
+                "at_start": found.at_start,
                 "best": found.best[-1],
                 "warnings": list(found.warnings),
+                "differences": list(found.differences),
             }
         )
         verdict = f"success after {found.actions_to_success}" if found.success else "no success"
         lines.append(f"{folder}  {verdict}, best overlap {found.best[-1]:.3f}")
-        lines += [f"  {warning}" for warning in found.warnings]
-    won = [row["actions_to_success"] for row in rows if row["success"]]
+        lines += [f"  {line}" for line in (*found.warnings, *found.differences)]
+    counted = [row for row in rows if not row["at_start"]]
+    won = [row["actions_to_success"] for row in counted if row["success"]]
     mean = sum(won) / len(won) if won else None
     data = {
         "episodes": rows,
-        "n_episodes": len(rows),
+        "n_episodes": len(counted),
         "n_success": len(won),
+        "n_at_start": len(rows) - len(counted),
         "failed": failed,
         "mean_actions_solved": mean,
     }
     after = "" if mean is None else f", after {mean:.1f} actions on average"
-    lines.append(f"{len(won)} of {len(rows)} episodes succeeded{after}")
-    failure = None
+    lines.append(f"{len(won)} of {len(counted)} episodes succeeded{after}")
+    if len(counted) < len(rows):
+        lines.append(f"{len(rows) - len(counted)} more began at their goal, and are not counted")
+    failure, code = None, 1
+    differ = [row for row in rows if row["differences"]]
     if failed:
         count = f"{len(failed)} of {len(options.episodes)} folders cannot be scored"
-        failure = f"{count}; {failed[0]['error']}"
-    return Outcome(data=data, text="\n".join(lines), failure=failure, failure_code=2)
+        failure, code = f"{count}; {failed[0]['error']}", 2
+    elif differ:
+        count = f"{len(differ)} of {len(options.episodes)} recordings differ from their pictures"
+        failure = f"{count}; {differ[0]['folder']}: {differ[0]['differences'][0]}"
+    return Outcome(data=data, text="\n".join(lines), failure=failure, failure_code=code)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +103,7 @@ def replay(options: ReplayOptions) -> Outcome:
     for row in found.rows:
         overlap = "" if row["iou"] is None else f"overlap {row['iou']:.3f}"
         lines.append(f"{row['index']:>3}  {overlap}  {row['outcome'] or ''}".rstrip())
-    lines += [f"  {warning}" for warning in found.warnings]
+    lines += [f"  {line}" for line in (*found.warnings, *found.differences)]
     lines.append(f"outcome: {found.outcome}; {found.mismatches} of {len(found.rows)} masks differ")
     data = {
         "folder": options.episode,
@@ -103,9 +113,12 @@ def replay(options: ReplayOptions) -> Outcome:
         "mismatches": found.mismatches,
         "rows": found.rows,
         "warnings": list(found.warnings),
+        "differences": list(found.differences),
         "video": options.video,
     }
     failure = None
-    if found.mismatches:
-        failure = f"{found.mismatches} masks differ from those that these pictures give now"
+    if found.differences:
+        more = len(found.differences) - 1
+        others = f", and {more} more" if more else ""
+        failure = f"what is recorded and what is computed differ: {found.differences[0]}{others}"
     return Outcome(data=data, text="\n".join(lines), failure=failure)

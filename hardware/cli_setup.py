@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from warp_deform.cli import CommandOptions, Outcome
+from warp_deform.flag_range import FlagRange
 
 from .rig_config import CameraName, RigConfig, RobotName
 
@@ -79,17 +80,17 @@ class CalibrateOptions(CommandOptions):
     """Folder of the setup."""
     execute: bool = False
     """Let a real arm move."""
-    table_z: Annotated[float | None, arg(metavar="M")] = None
+    table_z: Annotated[float | None, arg(metavar="M"), FlagRange(-1.0, 1.0)] = None
     """For `table`: a height in the base frame that is certainly 1 to 3 cm below the foam's top."""
-    views: Annotated[int, arg(metavar="N")] = 15
+    views: Annotated[int, arg(metavar="N"), FlagRange(8, 500)] = 15
     """For `lens` and `hand`: views of the board."""
-    size: tuple[int, int] = (1280, 720)
+    size: Annotated[tuple[int, int], FlagRange(16, 8192)] = (1280, 720)
     """For `lens`: width and height of the video device's pictures."""
-    square_mm: float = 36.0
+    square_mm: Annotated[float, FlagRange(5.0, 500.0)] = 36.0
     """Side of the printed board's squares: measure the print."""
-    corners: tuple[int, ...] = (0, 5, 18, 23)
+    corners: Annotated[tuple[int, ...], FlagRange(0, 23)] = (0, 5, 18, 23)
     """For `camera`: the board's corners to touch, by number."""
-    points: Annotated[int, arg(metavar="N")] = 9
+    points: Annotated[int, arg(metavar="N"), FlagRange(5, 500)] = 9
     """For `points`: marks to touch, at least 5."""
     typed: bool = False
     """For `points`: type each mark's column and row instead of clicking it."""

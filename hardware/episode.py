@@ -9,6 +9,8 @@ What happens when something goes wrong:
   as aborted; nobody there means that only reflexes are recovered from, as often as the limits
   allow;
 - a picture that shows no cable on foam: the operator is asked whether to take another;
+- a cable that lies at its goal before the first action: it is tossed again where it is simulated;
+  elsewhere the operator is asked to, and nobody there ends the episode, which is no success;
 - anything else (a limit broken on the way, a lost connection, a blocked gripper, a twin whose
   simulation cannot be trusted any more): the arm is stopped and the episode ends with the error as
   its outcome.
@@ -45,7 +47,7 @@ from .pick_place import (
 from .recorder import EpisodeRecorder
 from .robot import ConnectionLost, MotionError, RobotError, SafetyViolation, UnreachablePose
 from .safety import SafeRobot
-from .scoring import MAX_ACTIONS, SUCCESS_IOU, EpisodeScore, score_masks
+from .scoring import MAX_ACTIONS, SUCCESS_IOU, EpisodeScore, StartAtGoal, score_masks
 from .segmentation import SegmentationConfig, SegmentationError, segment_cable
 from .top_down_view import TopDownView
 
@@ -55,6 +57,7 @@ __all__ = ["Chooser", "EpisodeConfig", "EpisodeResult", "Observation", "refusal"
 # arrival may miss by 2 degrees, which a camera on the hand sees as a shift of up to 2 cm.
 _AT_HOME = 0.01
 _MOST_PROPOSALS = 20
+_MOST_TOSSES = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,6 +175,7 @@ def run_episode(
     config: EpisodeConfig | None = None,
     operator: Operator | None = None,
     empty: np.ndarray | None = None,
+    toss: Callable[[int], None] | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> EpisodeResult:
     """Run an episode; the recorder is finished afterwards.
@@ -180,6 +184,7 @@ def run_episode(
         goal: the mask to reach, (H, W) bool; without one there is no score
         operator: who confirms every plan; default: nobody, see `Unattended`
         empty: the view of the foam without a cable, (H, W, 3) uint8, see `segment_cable`
+        toss: tosses a simulated cable again, given how often it was; see the module
         say: told what goes on, a line each time
 
     Raises:
@@ -191,7 +196,7 @@ def run_episode(
         raise InputError(f"the goal has {goal.shape} pixels, the view {config.view.shape}")
     episode = _Episode(
         robot, camera, calibration, chooser, recorder, goal, config, operator or Unattended(),
-        empty, say,
+        empty, toss, say,
     )  # fmt: skip
     robot.begin_episode()
     chooser.reset()
@@ -203,7 +208,7 @@ def run_episode(
         robot.stop()
         recorder.finish("stopped")
         raise
-    except (RobotError, CameraError, SegmentationError, PhysicsError) as problem:
+    except (RobotError, CameraError, SegmentationError, PhysicsError, StartAtGoal) as problem:
         error = problem
         outcome = f"error: {type(problem).__name__}: {' '.join(str(problem).split())}"
         if not isinstance(problem, ConnectionLost):
@@ -226,6 +231,7 @@ class _Episode:
     config: EpisodeConfig
     operator: Operator
     empty: np.ndarray | None
+    toss: Callable[[int], None] | None
     say: Callable[[str], None]
     masks: list[np.ndarray] = field(default_factory=list)
     outcomes: list[PickPlaceOutcome] = field(default_factory=list)
@@ -237,13 +243,16 @@ class _Episode:
                 return "stopped"
             until_cleared(self.robot, self.operator, self.robot.home)
         while True:
-            frame, view, mask = self._look()
-            self.masks.append(mask)
             done = len(self.outcomes)
+            frame, view, mask = self._look() if done else self._look_at_start()
+            self.masks.append(mask)
             last = self.outcomes[-1] if done else None
             seen = Observation(done, view, mask, self.goal, last)
             self._record(frame, seen)
-            solved = self.goal is not None and _solved(mask, self.goal)
+            overlap = self._overlap(mask)
+            solved = overlap > SUCCESS_IOU
+            if solved and not done:
+                raise StartAtGoal(overlap)
             if done >= self.config.max_actions or (solved and self.config.until_success):
                 return "success" if self._succeeded() else "limit"
             action = self._choose(seen)
@@ -276,6 +285,25 @@ class _Episode:
                     raise
                 continue
             return frame, view, mask
+
+    def _look_at_start(self) -> tuple[Frame, np.ndarray, np.ndarray]:
+        """A picture of a cable that is not at its goal yet, or of one that nobody tosses again."""
+        for again in range(1, _MOST_TOSSES + 1):
+            seen = self._look()
+            overlap = self._overlap(seen[2])
+            if overlap <= SUCCESS_IOU:
+                break
+            problem = StartAtGoal(overlap)
+            if self.toss is not None:
+                self.say(f"{problem}: tossed again")
+                self.toss(again)
+            elif not self.operator.go_on(problem):
+                break
+        return seen
+
+    def _overlap(self, mask: np.ndarray) -> float:
+        """With the goal; 0 without one."""
+        return 0.0 if self.goal is None else score_masks([mask], self.goal).iou[0]
 
     def _record(self, frame: Frame, seen: Observation) -> None:
         iou = self.recorder.observe(frame, seen.view, seen.mask, overlay=self._drawn(seen, None))
@@ -357,7 +385,3 @@ class _Episode:
         grasp = way_points(action, robot.limits.table, config)["grasp"]
         lift, outcome = self._lift(action), PickPlaceOutcome.ABORTED
         return PickPlaceResult(outcome, grasp, None, None, None, lift, force)
-
-
-def _solved(mask: np.ndarray, goal: np.ndarray) -> bool:
-    return score_masks([mask], goal).iou[0] > SUCCESS_IOU

@@ -105,7 +105,7 @@ def pack(
             "hindsight": hindsight,
             "times_s": [float(row["t"]) for row in recording.observations],
             "actions_after_last_picture": len(recording.actions) - (rows - 1),
-            "warnings": sorted({*recording.warnings, *score.warnings}),
+            "warnings": sorted({*recording.warnings, *score.warnings, *score.differences}),
         },
     )
     return Episode(info, tuple(steps), goal)

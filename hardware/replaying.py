@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from .calibration import Calibration
 from .camera import FileCamera, read_image
 from .json_file import require
 from .recording import Recording
+from .scoring import ROUNDING, outcome_difference, score_masks
 from .segmentation import SegmentationConfig, segment_cable
 from .top_down_view import TopDownView
 
@@ -32,6 +34,7 @@ class Replay:
             the same, the action that followed, and its outcome; None where it did not end
         actions: finished actions
         mismatches: observations whose mask is another now
+        differences: what was recorded and is computed otherwise, masks too, a line each
         outcome: recorded; None where the recorder was killed
         warnings: a line each
     """
@@ -39,6 +42,7 @@ class Replay:
     rows: tuple[dict[str, Any], ...]
     actions: int
     mismatches: int
+    differences: tuple[str, ...]
     outcome: str | None
     warnings: tuple[str, ...]
 
@@ -62,10 +66,12 @@ def replay_recording(folder: Path) -> Replay:
     goal = recording.goal_mask()
     camera = FileCamera(folder / "frames", calibration.intrinsics)
     planned = {plan["index"]: plan for plan in recording.plans}
-    rows = []
+    masks: list[np.ndarray] = []
+    rows: list[dict[str, Any]] = []
     for index, seen in enumerate(recording.observations):
         picture = view.rectify(camera.read().rgb, calibration)
         mask = segment_cable(picture, config=segmentation, empty=empty)
+        masks.append(mask)
         done = recording.actions[index] if index < len(recording.actions) else {}
         begun = done or planned.get(index, {})
         rows.append(
@@ -82,9 +88,31 @@ def replay_recording(folder: Path) -> Replay:
         tuple(rows),
         len(recording.actions),
         sum(not row["same_mask"] for row in rows),
+        (*_differences(rows), *_of_the_whole(recording, calibration, masks, goal)),
         recording.meta.get("outcome"),
         recording.warnings,
     )
+
+
+def _differences(rows: list[dict[str, Any]]) -> Iterator[str]:
+    for row in rows:
+        recorded, now = row["iou"], row["iou_now"]
+        if not row["same_mask"]:
+            yield f"picture {row['index']}: its mask is another now"
+        if (recorded is None) != (now is None):
+            yield f"picture {row['index']}: recorded overlap {recorded}, now {now}"
+        elif recorded is not None and not abs(recorded - now) <= ROUNDING:
+            yield f"picture {row['index']}: recorded overlap {recorded:.4f}, now {now:.4f}"
+
+
+def _of_the_whole(
+    recording: Recording, calibration: Calibration, masks: list[np.ndarray], goal: np.ndarray | None
+) -> Iterator[str]:
+    digest = require(recording.meta, "calibration", str, what=f"recording {recording.folder}")
+    if calibration.digest() != digest:
+        yield "calibration.json is another than the one it was recorded with"
+    if goal is not None:
+        yield from outcome_difference(recording.meta.get("outcome"), score_masks(masks, goal))
 
 
 def _made(kind: type, settings: dict[str, Any], name: str) -> Any:

@@ -37,7 +37,7 @@ class Rig:
 
     Attributes:
         look: the true state, where the camera is simulated
-        toss: tosses the chain anew, where it is simulated in this process
+        toss: tosses the chain again, given how often it was, where it is simulated in this process
         lay: puts its beads, where it is simulated in this process
         empty: the view of the foam without a cable, where the setup has one
     """
@@ -80,7 +80,8 @@ def open_rig(config: RigConfig) -> Iterator[Rig]:
                 from .twin import CableTwin
 
                 world = chain = CableTwin(twin)
-                look, toss, lay = chain.look, chain.toss, chain.lay
+                look, lay = chain.look, chain.lay
+                toss = functools.partial(chain.toss, config.seed)
             camera: Camera = SimCamera(look, twin=twin, seed=config.seed)
         else:
             if config.robot == "sim":

@@ -20,6 +20,7 @@ import newton
 import numpy as np
 
 from warp_deform.errors import InputError
+from warp_deform.flag_range import check_seed
 from warp_deform.objects.cable import CableConfig, add_cable
 from warp_deform.quiet import quiet_warp
 from warp_deform.robots.jaw import Jaw, JawConfig
@@ -57,6 +58,9 @@ class TwinConfig:
     """Upper side of the foam in the base frame [m]."""
     seed: int = 0
     """Of grips that slip, and of the first toss."""
+
+    def __post_init__(self) -> None:
+        check_seed(self.seed)
 
     @property
     def table(self) -> TablePlane:
@@ -137,9 +141,15 @@ class CableTwin:
         self._jaw.reset()
         self._settle(0.5, calm=True)
 
-    def toss(self, seed: int) -> None:
-        """Toss the chain lightly onto the foam, as people do before an episode."""
-        rng, view = np.random.default_rng(seed), self.config.view
+    def toss(self, seed: int, again: int = 0) -> None:
+        """Toss the chain lightly onto the foam, as people do before an episode.
+
+        Args:
+            seed: of the toss
+            again: how often it was tossed by that seed before
+        """
+        rng = np.random.default_rng([check_seed(seed), again])
+        view = self.config.view
         beads = tossed_chain(rng, self.config.chain, view.x, view.y)
         self.lay(np.add(beads, (0.0, 0.0, self.config.foam_height_m)))
 

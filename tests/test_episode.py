@@ -50,7 +50,7 @@ from hardware.recording import Recording
 from hardware.replaying import replay_recording
 from hardware.rig_config import RigConfig
 from hardware.safety import SafeRobot
-from hardware.scoring import score_recording
+from hardware.scoring import StartAtGoal, score_recording
 from hardware.twin import CableTwin, TwinConfig
 from warp_deform.cli import main as command
 from warp_deform.errors import InputError, WarpDeformError
@@ -111,6 +111,41 @@ def test_an_episode_ends_at_success(tmp_path: Path) -> None:
     assert (found.mismatches, found.actions, found.outcome) == (0, 2, "success")
     overlays = sorted(path.name for path in (tmp_path / "a" / "frames").glob("*_overlay.png"))
     assert len(overlays) == 3
+
+
+def test_a_start_at_the_goal_is_tossed_again(tmp_path: Path) -> None:
+    places = {"x": 0.50}
+    tosses: list[int] = []
+
+    def toss(again: int) -> None:
+        tosses.append(again)
+        places["x"] = 0.50 if again < 3 else 0.45
+
+    said: list[str] = []
+    with recorder(tmp_path / "a") as made, drawn_camera(lambda: places["x"]) as camera:
+        result = run_episode(
+            SafeRobot(Arm(), LIMITS), camera, CALIBRATION, Listed([ACTION]), recorder=made,
+            goal=GOAL, config=EpisodeConfig(max_actions=1), toss=toss, say=said.append,
+        )  # fmt: skip
+    assert tosses == [1, 2, 3] and "no success" in said[0]
+    assert result.outcome == "limit" and result.score is not None and not result.score.success
+    assert len(Recording.read(tmp_path / "a").observations) == 2
+
+
+def test_a_start_at_the_goal_is_for_the_operator_to_clear(tmp_path: Path) -> None:
+    places = iter([0.50, 0.50, 0.45, 0.50])
+    person = Person()
+    result, _ = episode(
+        tmp_path / "a", Arm(), [ACTION], where=lambda: next(places), operator=person
+    )
+    assert [type(problem) for problem in person.problems] == [StartAtGoal] * 2
+    assert result.outcome == "success" and len(result.outcomes) == 1
+    gives_up = Person(clears=False)
+    result, chooser = episode(
+        tmp_path / "b", Arm(), [ACTION], where=lambda: 0.50, operator=gives_up
+    )
+    assert isinstance(result.error, StartAtGoal) and chooser.seen == []
+    assert result.score is not None and result.score.at_start and not result.score.success
 
 
 def test_an_episode_ends_at_its_limit_and_where_nothing_is_to_do(tmp_path: Path) -> None:

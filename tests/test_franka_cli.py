@@ -6,7 +6,9 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from hardware.camera import CameraError
 from hardware.goal_file import read_goal, sampled_goal, write_goal
 from hardware.look_server import LookServer, remote_look
 from hardware.revision import software_revision
+from hardware.scoring import StartAtGoal
 from hardware.top_down_view import TopDownView
 from hardware.twin import TwinLook
 from warp_deform.cli import main
@@ -100,6 +103,24 @@ def test_a_folder_without_a_picture_does_not_hide_the_other_scores(
     assert "before its first picture" in lines[1]
 
 
+def test_an_episode_of_collect_is_that_of_run_with_its_seed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Toss, noise and draws: the second episode sees the pictures of `run --seed` bit by bit,
+    before and after an action.
+    """
+    options = ("--robot", "sim", "--agent", "random", "--max-actions", "1")
+    assert (
+        run(capfd, "collect", "-n", "2", "--seed", "7", *options, "--out", f"{tmp_path}/c")[0] == 0
+    )
+    assert run(capfd, "run", "--seed", "8", *options, "--out", f"{tmp_path}/r")[0] == 0
+    collected, alone = tmp_path / "c" / "live" / "0001" / "frames", tmp_path / "r" / "frames"
+    for name in ("000_rgb.png", "001_rgb.png"):
+        assert (collected / name).read_bytes() == (alone / name).read_bytes()
+    first = tmp_path / "c" / "live" / "0000" / "frames" / "000_rgb.png"
+    assert first.read_bytes() != (alone / "000_rgb.png").read_bytes()
+
+
 def test_a_replay_finds_a_changed_mask(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "a"
     episode(folder, Arm(), [ACTION], max_actions=1)
@@ -116,6 +137,59 @@ def test_a_replay_finds_a_changed_mask(tmp_path: Path, capfd: pytest.CaptureFixt
     (folder / "frames" / "000_mask.png").write_bytes(cv2.imencode(".png", grey)[1].tobytes())
     code, data, said = run(capfd, "replay", str(folder))
     assert code == 1 and data["mismatches"] == 1 and "differ" in said
+
+
+def tampered(folder: Path, name: str, change: Callable[[dict[str, Any]], None]) -> None:
+    """Change the objects in a recording's file of JSON lines, or its only object."""
+    path = folder / name
+    text = path.read_text()
+    rows = (
+        [json.loads(text)] if name == "episode.json" else list(map(json.loads, text.splitlines()))
+    )
+    for row in rows:
+        change(row)
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message", "verbs"),
+    [
+        ("steps.jsonl", lambda row: row.update(iou=0.2), "overlap|recorded 0.2000", "both"),
+        ("episode.json", lambda row: row.update(outcome="success"), "'success'", "both"),
+        ("episode.json", lambda row: row.update(calibration="0" * 32), "calibration", "replay"),
+    ],
+    ids=["overlap", "outcome", "calibration"],
+)
+def test_what_is_recorded_and_computed_otherwise_is_exit_code_1(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str],
+    name: str, change: Callable[[dict[str, Any]], None], message: str, verbs: str,
+) -> None:  # fmt: skip
+    folder, untouched = tmp_path / "a", tmp_path / "b"
+    for each in (folder, untouched):
+        episode(each, Arm(), [ACTION], max_actions=1)
+    tampered(folder, name, change)
+    for verb in ("score", "replay") if verbs == "both" else ("replay",):
+        code, data, said = run(capfd, verb, str(folder))
+        found = data["episodes"][0] if verb == "score" else data
+        assert code == 1 and re.search(message, said) and "differ" in said
+        assert found["differences"] and found["warnings"] == []
+        assert run(capfd, verb, str(untouched))[0] == 0
+    code, data, said = run(capfd, "score", str(untouched), str(folder), str(tmp_path / "none"))
+    assert code == 2 and len(data["episodes"]) == 2, "a folder that is none is bad input"
+
+
+def test_an_episode_that_began_at_its_goal_is_counted_by_itself(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    begun, _ = episode(tmp_path / "a", Arm(), [ACTION], where=lambda: 0.50)
+    assert isinstance(begun.error, StartAtGoal) and begun.outcomes == ()
+    assert begun.outcome.startswith("error: StartAtGoal: the cable lies at its goal already")
+    places = iter([0.45, 0.50])
+    episode(tmp_path / "b", Arm(), [ACTION], where=lambda: next(places))
+    code, data, _ = run(capfd, "score", str(tmp_path / "a"), str(tmp_path / "b"))
+    assert code == 0 and (data["n_episodes"], data["n_success"], data["n_at_start"]) == (1, 1, 1)
+    assert data["mean_actions_solved"] == 1.0
+    assert run(capfd, "replay", str(tmp_path / "a"))[0] == 0
 
 
 def test_a_goal_is_captured_and_read(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -143,7 +217,7 @@ def test_a_goal_is_captured_and_read(tmp_path: Path, capfd: pytest.CaptureFixtur
         (["run", "--agent", "policy"], "--policy"),
         (["run", "--agent", "policy", "--policy", "nowhere"], "nowhere"),
         (["run", "--robot", "ur5"], "--robot"),
-        (["run", "--joint-speed", "0.9"], "max_joint_speed"),
+        (["run", "--joint-speed", "0.9"], "--joint-speed is 0.9; allowed: 0.001 to 0.2"),
         (["collect"], "--out"),
         (["score"], "EPISODE|episode"),
         (["score", "nowhere"], "nowhere"),
@@ -152,7 +226,7 @@ def test_a_goal_is_captured_and_read(tmp_path: Path, capfd: pytest.CaptureFixtur
         (["emulate", "--host", "0.0.0.0"], "not an address of this machine"),
         (["calibrate", "table"], "--table-z"),
         (["calibrate", "table", "--table-z", "0.0"], "--execute"),
-        (["calibrate", "points", "--points", "4"], "--points is 4; 5 are needed"),
+        (["calibrate", "points", "--points", "4"], "--points is 4; allowed: 5"),
         (["calibrate", "points", "--typed", "--setup", "nowhere"], r"table\.json"),
         (["calibrate", "points", "--pairs", "p.csv"], "whose are the points"),
         (["calibrate", "empty", "--setup", "nowhere"], "calibration"),
@@ -227,7 +301,15 @@ def test_the_documentation_names_every_error_and_says_what_was_not_tried() -> No
         and issubclass(getattr(robot_module, name), RobotError)
     ]
     assert len(names) > 9 and [name for name in names if f"`{name}`" not in text] == []
-    for name in ("CameraError", "SegmentationError", "InputError", "PoorFit", "PhysicsError"):
+    names = (
+        "CameraError",
+        "SegmentationError",
+        "InputError",
+        "PoorFit",
+        "PhysicsError",
+        "StartAtGoal",
+    )
+    for name in names:
         assert f"`{name}`" in text
     begins = ("accepts no motion", "after recovery", "the arm stands beyond", "too near its limit")
     assert [words for words in (*begins, BUSY) if words not in text] == []

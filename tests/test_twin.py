@@ -77,6 +77,10 @@ def test_a_toss_lies_still_on_the_foam_and_depends_on_its_seed(twin: CableTwin) 
         assert (beads[:, :2] < (view.x[1], view.y[1])).all()
     np.testing.assert_array_equal(starts[0], starts[2])
     assert np.abs(starts[0] - starts[1]).max() > 0.02
+    twin.toss(3, 1)
+    assert np.abs(twin.look().beads - starts[0]).max() > 0.02, "tossed again"
+    with pytest.raises(InputError, match="a seed is 0"):
+        TwinConfig(seed=-1)
     other = CableTwin(TwinConfig(seed=3)).look().beads
     np.testing.assert_array_equal(other, starts[0])
 

@@ -48,7 +48,12 @@ def bad_toss(config: object) -> Iterator[None]:
 def blind(config: object) -> Iterator[SimpleNamespace]:
     robot = SafeRobot(Arm(), LIMITS)
     yield SimpleNamespace(
-        robot=robot, camera=Blind(), calibration=CALIBRATION, view=TopDownView(), look=None
+        robot=robot,
+        camera=Blind(),
+        calibration=CALIBRATION,
+        view=TopDownView(),
+        look=None,
+        toss=None,
     )
 
 

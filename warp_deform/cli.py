@@ -29,6 +29,7 @@ from tyro.conf import arg
 
 from . import __version__
 from .errors import InputError, WarpDeformError
+from .flag_range import check_flags
 
 __all__ = ["VERBS", "CommandOptions", "Outcome", "Verb", "main"]
 
@@ -142,6 +143,7 @@ def _dispatch(arguments: list[str]) -> int:
     options = _parse(f"warp-deform {name}", verb, rest)
     if options is None:
         return 0
+    check_flags(options)
     with _stdout_to_stderr():
         if options.task_module is not None:
             from .tasks.elsewhere import import_tasks

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from warp_deform.errors import InputError
+from warp_deform.flag_range import check_seed
 from warp_deform.rendering.strand_mask import draw_line
 
 from ..calibration import Calibration
@@ -135,11 +136,15 @@ class SimCamera(Closing):
         self._twin = twin or TwinConfig()
         self.config = config or SimCameraConfig()
         self._intrinsics = self.config.intrinsics
-        self._rng = np.random.default_rng(seed)
+        self._closed = False
+        self.reseed(seed)
+
+    def reseed(self, seed: int) -> None:
+        """Begin noise and the foam's structure anew, as those of a camera made with that seed."""
+        self._rng = np.random.default_rng(check_seed(seed))
         width, height = self.config.size
         coarse = self._rng.normal(0.0, self.config.grain, (height // 2, width // 2))
         self._grain = cv2.resize(coarse.astype(np.float32), (width, height))
-        self._closed = False
 
     def read(self) -> Frame:
         """Return a picture of the twin as it is now.

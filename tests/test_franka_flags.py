@@ -1,0 +1,113 @@
+"""Every number on the command line of `warp-deform franka`: what cannot be meant is one line.
+
+The rows are the flags themselves: a new one without a range fails here.
+"""
+
+from __future__ import annotations
+
+import math
+import types
+import typing
+from dataclasses import fields, make_dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hardware.cli import franka
+from warp_deform.cli import CommandOptions, main
+from warp_deform.errors import InputError
+from warp_deform.flag_range import FlagRange, check_flags, check_seed, flag_range
+
+VERBS: dict[str, type[CommandOptions]] = {
+    verb.__metadata__[0].name: typing.get_args(verb)[0]
+    for verb in typing.get_args(typing.get_type_hints(franka, include_extras=True)["options"])
+}
+NEEDED = {"calibrate": ["lens"], "capture-goal": ["--out", "g.png"], "collect": ["--out", "demos"]}
+
+
+def kinds(hint: Any) -> set[type]:
+    """The scalar types in an annotation."""
+    if typing.get_origin(hint) is typing.Annotated:
+        return kinds(typing.get_args(hint)[0])
+    if typing.get_origin(hint) in (types.UnionType, typing.Union, tuple):
+        return set().union(*map(kinds, typing.get_args(hint)))
+    return {hint} if isinstance(hint, type) else set()
+
+
+def numeric_flags() -> list[tuple[str, str, Any]]:
+    """Verb, name and annotation of every flag that takes a number."""
+    return [
+        (verb, field.name, hint)
+        for verb, options in VERBS.items()
+        for field in fields(options)
+        for hint in [typing.get_type_hints(options, include_extras=True)[field.name]]
+        if kinds(hint) & {int, float}
+    ]
+
+
+FLAGS = numeric_flags()
+
+
+def test_the_table_has_the_flags() -> None:
+    assert set(VERBS) == {
+        "doctor", "calibrate", "capture-goal", "collect", "run", "replay", "score", "emulate",
+    }  # fmt: skip
+    names = {(verb, name) for verb, name, _ in FLAGS}
+    assert {("run", "seed"), ("emulate", "chain"), ("calibrate", "size")} <= names
+    assert len(FLAGS) >= 18
+
+
+@pytest.mark.parametrize(("verb", "name", "hint"), FLAGS, ids=lambda value: str(value)[:20])
+def test_every_number_has_a_range(verb: str, name: str, hint: Any) -> None:
+    allowed = flag_range(hint)
+    assert allowed is not None, f"franka {verb} --{name} takes any number"
+    assert math.isfinite(allowed.low) and math.isfinite(allowed.high)
+    many = tuple in {typing.get_origin(typing.get_args(hint)[0])}
+
+    given = make_dataclass("Given", [(name, hint)])
+
+    def refused(value: float) -> bool:
+        try:
+            check_flags(given((allowed.low, value) if many else value))
+        except InputError as error:
+            assert f"--{name.replace('_', '-')} is" in str(error)
+            return True
+        return False
+
+    assert not refused(allowed.low) and not refused(allowed.high)
+    beyond = [allowed.low - 1, allowed.high + 1, 1e300, -1e300]
+    assert all(map(refused, [*beyond, math.nan, math.inf, -math.inf]))
+
+
+@pytest.mark.parametrize(("verb", "name", "hint"), FLAGS, ids=lambda value: str(value)[:20])
+def test_what_cannot_be_meant_is_one_line_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+    verb: str, name: str, hint: Any,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    allowed = flag_range(hint)
+    assert allowed is not None
+    bad = [str(int(allowed.low) - 1)] if int in kinds(hint) else ["nan"]
+    count = len(typing.get_args(typing.get_args(hint)[0])) if name == "size" else 1
+    flag = f"--{name.replace('_', '-')}"
+    code = main(["franka", verb, *NEEDED.get(verb, []), flag, *(bad * count)])
+    said = capfd.readouterr()
+    assert code == 2 and said.out == "" and list(tmp_path.iterdir()) == []
+    (line,) = said.err.strip().splitlines()
+    assert line.startswith(f"warp-deform: {flag} is {bad[0]}; allowed: ")
+
+
+def test_what_is_left_out_or_has_no_range_is_not_checked() -> None:
+    given = make_dataclass(
+        "Given", [("a_b", typing.Annotated[int | None, FlagRange(0, 1)]), ("c", int)]
+    )
+    check_flags(given(None, -1))
+    with pytest.raises(InputError, match="--a-b is 2; allowed: 0 to 1"):
+        check_flags(given(2, -1))
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 1.5, "1", None])
+def test_a_seed_is_a_number_that_numpy_takes(seed: Any) -> None:
+    with pytest.raises(InputError, match="a seed is 0 to 4294967295"):
+        check_seed(seed)
