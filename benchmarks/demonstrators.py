@@ -2,6 +2,7 @@
 
     python benchmarks/demonstrators.py [--tasks cable-ring] [--seeds 50] [--out rows.jsonl]
     python benchmarks/demonstrators.py --by scripted mpc enumerate cem gradient refined-cem
+    python benchmarks/demonstrators.py --hardness --out benchmarks/results/demonstrators.jsonl
 
 Besides the demonstrators there are the searches of `warp_deform.planning`, which may simulate
 `--budget` actions a choice and look `--depth` actions ahead (`enumerate` one ahead is `mpc` with
@@ -9,8 +10,9 @@ that budget), and `refined-`: successful episodes of the scripted demonstrator r
 those with fewer actions accepted where both solve the task (`refine --accept solved`).
 Plays whole episodes in this process on the same seeds, eight side by side, with the images that a
 collection would render. One episode before each row, not timed, compiles or loads the kernels. With
---out, rows already in that file are not measured again. Intervals of rates are Wilson's, others
-1.96 standard errors, 95 %.
+--out, rows already in that file are not measured again; --hardness then prints its rows of the
+scripted demonstrators, 200 seeds each, beside the paper's, and --bags all of its rows of bags.
+Intervals of rates are Wilson's, others 1.96 standard errors, 95 %.
 """
 
 from __future__ import annotations
@@ -45,6 +47,26 @@ from warp_deform.workers import single_threaded
 from warp_deform.worlds import Worlds
 
 WARM_UP = 999_000  # seed
+ORDER = ("scripted", "visible", "mpc")
+PAPER: dict[str, tuple[float | None, float]] = {
+    "cable-ring": (99.1, 6.56),
+    "cable-ring-notarget": (99.3, 6.49),
+    "cable-shape": (98.8, 6.86),
+    "cable-shape-notarget": (99.1, 6.94),
+    "cable-line-notarget": (100.0, 5.55),
+    "fabric-cover": (97.0, 2.00),
+    "fabric-flat": (98.3, 3.10),
+    "fabric-flat-notarget": (97.4, 3.12),
+    "bag-alone-open": (60.2, 5.63),
+    "bag-items-1": (41.7, 2.84),
+    "bag-items-2": (32.5, 4.07),
+    "bag-color-goal": (89.1, 2.60),
+    "block-notarget": (None, 1.00),
+}
+"""Success [%] of the original's demonstrator, and mean actions of the demonstrations kept.
+
+Source: Seita et al., ICRA 2021 (arXiv:2012.03385v4), tables of tasks and of demonstrations.
+"""
 REFINED = tuple(f"refined-{method}" for method in METHODS)
 
 
@@ -77,6 +99,8 @@ class Row:
     pierced: dict[str, float]
     """Share of a state's edges that pierce a triangle: mean, p95, worst; share of states above 2 %.
     Empty for tasks without a sheet."""
+    enclosed: int | None = None
+    """Successes whose items the bag enclosed, see `Task.enclosed`; None without bag or item."""
 
 
 @dataclass
@@ -127,7 +151,13 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
     parser.add_argument("--compact", action="store_true", help="a table of mean actions by task")
     parser.add_argument("--out", type=Path, help="file of JSON lines to which rows are added")
+    parser.add_argument("--hardness", action="store_true", help="the table of docs/results.md")
+    parser.add_argument("--bags", action="store_true", help="its table of the bags")
     options = parser.parse_args()
+    if options.hardness or options.bags:
+        rows = list(_rows(options.out).values())
+        print(hardness(rows) if options.hardness else bags(rows))
+        return
     if options.quick:
         options.tasks, options.seeds, options.budget = ["block-notarget"], 2, 4
     quiet_warp()
@@ -169,14 +199,17 @@ def measure(
         if by in REFINED:
             assert search is not None
             solved, actions, scores, cpu = refined(task, search, first, count)
+            kept: list[bool | None] = [None]
         else:
             act = demonstrator(by) if search is None else planner(search)
             worlds, seeds = worlds_for(task, "ur5"), range(first, first + count)
             list(play(worlds, [WARM_UP], act=act, look=observe))
-            runs = []
+            runs, kept = [], []
             began = time.process_time()
-            for _, run in play(worlds, seeds, act=act, look=watch.look):
+            for slot, run in play(worlds, seeds, act=act, look=watch.look):
                 runs.append(run)
+                inside = worlds.enclosed(slot) if run.rows else None
+                kept.append(None if inside is None else inside and run.ended == SOLVED)
                 print(f"\r{task} {by} {len(runs)}/{count}", end="", file=sys.stderr)
             cpu = time.process_time() - began - watch.cpu
             print(file=sys.stderr)
@@ -203,6 +236,7 @@ def measure(
         states=watch.states,
         still_moving=watch.still_moving,
         pierced=watch.shares(),
+        enclosed=None if all(each is None for each in kept) else sum(map(bool, kept)),
     )
 
 
@@ -234,6 +268,38 @@ def _rows(path: Path | None) -> dict[tuple[str, str, int | None, int | None, int
         return {}
     rows = [Row(**json.loads(line)) for line in path.read_text().splitlines()]
     return {(r.task, r.by, r.budget, r.depth, r.first_seed, r.attempts): r for r in rows}
+
+
+def hardness(rows: list[Row]) -> str:
+    """The scripted demonstrators beside the paper's: success, and actions of the successes."""
+    lines = ["| task | success | paper | ours / paper | actions | paper | ours / paper |",
+             "|---|---|---|---|---|---|---|"]  # fmt: skip
+    mine = {row.task: row for row in rows if row.by == "scripted" and row.attempts == 200}
+    for task, (success, actions) in PAPER.items():
+        row = mine[task]
+        rate = 100 * row.successes / row.attempts
+        theirs, ratio = ("-", "-") if success is None else (f"{success} %", f"{rate / success:.2f}")
+        lines.append(
+            f"| {task} | {rate:.1f} % | {theirs} | {ratio} | {row.mean_actions_solved:.2f} "
+            f"| {actions:.2f} | {row.mean_actions_solved / actions:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def bags(rows: list[Row]) -> str:
+    """The bags' demonstrators: successes, how many enclosed, mean actions, CPU seconds."""
+    lines = ["| task | by | solved / attempts | 95 % | enclosed | actions | CPU s an attempt |",
+             "|---|---|---|---|---|---|---|"]  # fmt: skip
+    for row in sorted(rows, key=lambda r: (list(TASKS).index(r.task), ORDER.index(r.by))):
+        if row.task.startswith("bag-"):
+            low, high = row.interval
+            kept = "-" if row.enclosed is None else str(row.enclosed)
+            lines.append(
+                f"| {row.task} | `{row.by}` | {row.successes} / {row.attempts} "
+                f"| {100 * low:.0f} to {100 * high:.0f} % | {kept} | {row.mean_actions:.2f} "
+                f"| {row.cpu_s_per_attempt:.1f} |"
+            )
+    return "\n".join(lines)
 
 
 def _name(row: Row) -> str:

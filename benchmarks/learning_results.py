@@ -63,12 +63,12 @@ def write_episodes(run: RunFolder, info: Mapping[str, Any], target: Path) -> Non
         label = "" if record["protocol"]["retry"] else "_no_retry"
         with (target / f"episodes{label}.csv").open("w", newline="") as file:
             table = csv.writer(file, lineterminator="\n")
-            bag = any(each.get("in_bag") is not None for each in record["episodes"])
-            table.writerow(["seed", "success", "score", "actions", "failure", *["in_bag"] * bag])
+            bag = any(each.get("enclosed") is not None for each in record["episodes"])
+            table.writerow(["seed", "success", "score", "actions", "failure", *["enclosed"] * bag])
             for each in record["episodes"]:
                 score = round(each["score"], 4)
                 row = [each["seed"], int(each["success"]), score, each["actions"], each["failure"]]
-                held = "" if each.get("in_bag") is None else int(each["in_bag"])
+                held = "" if each.get("enclosed") is None else int(each["enclosed"])
                 table.writerow([*row, *[held] * bag])
     if run.log.exists():
         shutil.copyfile(run.log, target / run.log.name)

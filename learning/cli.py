@@ -249,8 +249,8 @@ def _describe(report: dict[str, Any]) -> str:
         "mean actions": f"{test['mean_actions']:.2f}",
         "paper's value": f"{test['paper_value']:.1f} %",
     }
-    if test["n_success_in_bag"] is not None:
-        lines["in the bag"] = f"{test['n_success_in_bag']} of the solved end with all items in it"
+    if test["n_success_enclosed"] is not None:
+        lines["enclosed"] = f"{test['n_success_enclosed']} of the solved kept all items in the bag"
     if test["failures"]:
         lines["failures"] = ", ".join(f"{name} {n}" for name, n in test["failures"].items())
     if report["paper"] is not None:

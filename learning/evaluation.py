@@ -25,6 +25,7 @@ from scipy.stats import binomtest
 from warp_deform.episode_loop import SLOTS, worlds_for
 from warp_deform.episodes import EpisodeReader, combine_hashes, versions
 from warp_deform.errors import InputError
+from warp_deform.tasks.registry import task as find_task
 from warp_deform.workers import Workers
 
 from .paper_results import partial_credit
@@ -145,15 +146,15 @@ def summarise(episodes: Sequence[Played], *, task: str) -> dict[str, Any]:
     paper_value [%]: what the paper's table calls success, see `partial_credit`
     failures: how often each of `failures.FAILURES` happened
     goal_l2: mean of the last states' `goal_distance`, None where there is no goal
-    n_success_in_bag: successes that end with every item in the bag, which scores do not ask for;
-    None where there is no bag or item
+    n_success_enclosed: successes whose every item the bag enclosed, which scores do not ask for,
+    see `Task.enclosed`; None where there is no bag or item
     """
     n, solved = len(episodes), [e for e in episodes if e.success]
     scores = np.array([e.score for e in episodes])
     mean, rate = float(scores.mean()), 100 * len(solved) / n
     failed = Counter(e.failure for e in episodes if e.failure is not None)
     distances = [e.goal_l2[-1] for e in episodes if e.goal_l2]
-    held = [e for e in episodes if e.in_bag is not None]
+    bagged = [e for e in episodes if e.enclosed is not None]
     return {
         "n_episodes": n,
         "n_success": len(solved),
@@ -166,7 +167,7 @@ def summarise(episodes: Sequence[Played], *, task: str) -> dict[str, Any]:
         "paper_value": 100 * mean if partial_credit(task) else rate,
         "failures": dict(sorted(failed.items())),
         "goal_l2": float(np.mean(distances)) if distances else None,
-        "n_success_in_bag": sum(e.success for e in held if e.in_bag) if held else None,
+        "n_success_enclosed": sum(e.success for e in bagged if e.enclosed) if bagged else None,
     }
 
 
@@ -263,6 +264,8 @@ def _described(protocol: Protocol, task: str) -> dict[str, Any]:
     if not protocol.makes_goals(task):
         described["n_goals"] = None
     del described["episodes"], described["goal_folder"]
+    if (version := find_task(task).version) > 1:  # episodes by an older rule are others
+        described["task_version"] = version
     if protocol.given is not None:
         # goals count by what they are, not by where they lie
         shown = (info.state_hash for info in EpisodeReader(protocol.given).infos())
@@ -272,7 +275,7 @@ def _described(protocol: Protocol, task: str) -> dict[str, Any]:
 
 _PLAYED: Fields = {
     "seed": int, "success": bool, "score": float, "actions": int, "reason": str,
-    "failure": (str, type(None)), "goal_l2": (list, type(None)), "in_bag": (bool, type(None)),
+    "failure": (str, type(None)), "goal_l2": (list, type(None)), "enclosed": (bool, type(None)),
 }  # fmt: skip
 
 
@@ -286,7 +289,7 @@ def _read_played(path: Path) -> dict[int, Played]:
     found = {}
     for entry in record["episodes"]:
         check_fields({"episode": entry}, {"episode": dict}, what=what)
-        entry.setdefault("in_bag", None)  # as nobody asked once
+        entry.setdefault("enclosed", None)  # as nobody asked once
         check_fields(entry, _PLAYED, what=what)
         distances = entry["goal_l2"]
         for distance in distances or ():

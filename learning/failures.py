@@ -49,7 +49,7 @@ def bag_opening(worlds: Worlds, slot: int) -> float | None:
 def bag_holds_items(worlds: Worlds, slot: int) -> bool | None:
     """Whether every item of a slot is in its (first) bag; None without a bag or items.
 
-    The benchmark's scores do not ask for it: of bag-items, items and beads have to be in the zone.
+    How they came there does not count, other than for `Task.enclosed`.
     """
     task, snapshot = worlds.task, worlds.episodes[slot].snapshot
     if not isinstance(task, BagTask) or not len(snapshot.body_q):

@@ -14,7 +14,7 @@ from warp_deform.tasks.task import Stage
 from warp_deform.worlds import Worlds
 from warp_deform.wrappers import stage_at
 
-from .failures import bag_holds_items, bag_opening, failure
+from .failures import bag_opening, failure
 from .policy import ImagePolicy, Policy, RetryingPolicy, StatePolicy
 from .protocol import Protocol
 
@@ -27,7 +27,8 @@ class Played:
 
     failure: which of `failures.FAILURES` it is; None if solved
     goal_l2: for goal-conditioned tasks, `goal_distance` at the start and after every action
-    in_bag: `failures.bag_holds_items` at the end; None also if the physics cannot be trusted
+    enclosed: `Worlds.enclosed` at the end, whether the bag keeps its items; None also if the
+    physics cannot be trusted
     """
 
     seed: int
@@ -37,7 +38,7 @@ class Played:
     reason: str
     failure: str | None = None
     goal_l2: tuple[float, ...] | None = None
-    in_bag: bool | None = None
+    enclosed: bool | None = None
 
 
 class Measured(NamedTuple):
@@ -102,7 +103,7 @@ def play_policy(
             reason=ended,
             failure=failure(worlds, slot, run, [row.opening for row in run.rows]),
             goal_l2=distances or None,
-            in_bag=bag_holds_items(worlds, slot) if trusted else None,
+            enclosed=worlds.enclosed(slot) if trusted else None,
         )
         yield slot, played, run
 

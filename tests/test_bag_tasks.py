@@ -12,6 +12,7 @@ from warp_deform.objects.bag import bag_shell
 from warp_deform.rendering.drawables import Drawables
 from warp_deform.rendering.pixels import BOUNDS
 from warp_deform.rendering.topdown import TopDown
+from warp_deform.robots.primitive import Outcome
 from warp_deform.rollout import GripPath, rollout
 from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.tasks.bag_alone_open import BagAloneOpen
@@ -20,6 +21,7 @@ from warp_deform.tasks.bag_items import BagItems1, BagItems2
 from warp_deform.tasks.bag_opening import enclosed
 from warp_deform.tasks.bag_physics import CARRY, INSERT, OPEN
 from warp_deform.tasks.free_space import FreeSpace, NoFreeSpace
+from warp_deform.tasks.past import PastAction
 from warp_deform.tasks.task import Layout, Snapshot, Task
 from warp_deform.worlds import Worlds
 
@@ -47,13 +49,11 @@ def snapshot(
     task: Task, layout: Layout, points: np.ndarray | None = None, body_q: np.ndarray | None = None,
     lifts: tuple[float, ...] = (),
 ) -> Snapshot:  # fmt: skip
-    """State at rest, rendered, after actions with these lifts [m]."""
+    """State at rest, rendered, after actions that carried the bag with these lifts [m]."""
     points = np.asarray(layout.particle_q if points is None else points, np.float32)
     body_q = np.asarray(layout.body_q if body_q is None else body_q, np.float32)
     items = objects(type(task))
     drawables = Drawables.of(task.drawn(layout, items))
-    actions = np.zeros((len(lifts), 7))
-    actions[:, 6] = lifts
     return Snapshot(
         particle_q=points,
         particle_qd=np.zeros_like(points),
@@ -62,8 +62,13 @@ def snapshot(
         segments=drawables.segments,
         render=lambda: TopDown().render(drawables, points, body_q),
         objects=items,
-        actions=actions,
+        history=tuple(carried(lift) for lift in lifts),
     )
+
+
+def carried(lift: float) -> PastAction:
+    """An action with this lift [m] that placed the bag."""
+    return PastAction(np.array([0.0] * 6 + [lift]), Outcome.PLACED, held=0)
 
 
 def delivered(task: BagItems1, layout: Layout, lifts: tuple[float, ...]) -> Snapshot:

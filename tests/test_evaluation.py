@@ -86,13 +86,13 @@ def test_the_papers_value_is_partial_credit_for_some_tasks(task: str, value: flo
     assert summarise(played([1.0] * 15 + [0.5] * 5, 15), task=task)["paper_value"] == value
 
 
-def test_items_that_fell_out_of_the_bag_are_counted_apart() -> None:
+def test_successes_whose_items_the_bag_enclosed_are_counted_apart() -> None:
     plain = played([1.0, 1.0, 1.0, 0.1], 3)
     ends = (True, False, None, True)  # of the third the physics was not trusted
-    episodes = [replace(each, in_bag=held) for each, held in zip(plain, ends, strict=True)]
+    episodes = [replace(each, enclosed=held) for each, held in zip(plain, ends, strict=True)]
     summary = summarise(episodes, task="bag-items-1")
-    assert (summary["n_success"], summary["n_success_in_bag"]) == (3, 1)
-    assert summarise(plain, task="bag-items-1")["n_success_in_bag"] is None
+    assert (summary["n_success"], summary["n_success_enclosed"]) == (3, 1)
+    assert summarise(plain, task="bag-items-1")["n_success_enclosed"] is None
 
 
 def test_without_successes_and_with_one_episode() -> None:

@@ -21,6 +21,7 @@ from warp_deform.tasks.fabric_flat import FabricFlat, FabricFlatNotarget
 from warp_deform.tasks.fabric_pull import beyond, corners, on_table, takes
 from warp_deform.tasks.fabric_shape import fold_corner, square_corners, square_mask
 from warp_deform.tasks.free_space import FreeSpace, NoFreeSpace
+from warp_deform.tasks.past import PastAction
 from warp_deform.tasks.task import Layout, Snapshot, Task
 from warp_deform.worlds import Worlds
 
@@ -45,6 +46,9 @@ def objects(cls: type[Task]) -> tuple:
     return cls().add_objects(newton.ModelBuilder())
 
 
+ONE = PastAction(np.zeros(7), Outcome.PLACED, held=0)
+
+
 def snapshot(
     task: Task, layout: Layout, points: np.ndarray | None = None, body_q: np.ndarray | None = None,
     actions: int = 0,
@@ -62,7 +66,7 @@ def snapshot(
         segments=drawables.segments,
         render=lambda: TopDown().render(drawables, points, body_q),
         objects=items,
-        actions=np.zeros((actions, 7)),
+        history=(ONE,) * actions,
     )
 
 
@@ -286,7 +290,7 @@ def test_cover_puts_the_cube_then_folds_any_corner() -> None:
     assert action[:2] == pytest.approx(layout.body_q[0, :2], abs=1e-6)
     assert action[3:5] == pytest.approx(points[:, :2].mean(axis=0), abs=1e-6)
     assert action[6] == 0.10
-    later, picked = replace(state, actions=np.zeros((1, 7))), set()
+    later, picked = replace(state, history=(ONE,)), set()
     for _ in range(40):
         fold = task.demonstrate(layout, later, rng)
         i = int(np.linalg.norm(points[:, :2] - fold[:2], axis=1).argmin())

@@ -130,7 +130,7 @@ def test_every_task_has_a_gymnasium_id() -> None:
     [
         ("cable-ring", "WarpDeform/CableRing-v1"),
         ("cable-ring-notarget", "WarpDeform/CableRingNotarget-v1"),
-        ("bag-items-1", "WarpDeform/BagItems1-v1"),
+        ("bag-items-1", "WarpDeform/BagItems1-v2"),
     ],
 )
 def test_gymnasium_id(name: str, expected: str) -> None:

@@ -325,7 +325,7 @@ def test_a_bent_path_is_no_worse_and_runs_again_to_the_same_state(started):
 def test_way_points_chain_through_positions_and_times(started):
     worlds, _ = started
     state, action = worlds.state(0), _moves(worlds, 0, 1)[0]
-    base = WayPoints(worlds.task, robot="ur5")._lead({0: (state, action)})[0]
+    base = WayPoints(worlds.task, robot="ur5")._lead({0: (state, action)})[0](action)[1]
     bend = _Bend.of(base, float(action[6]), 3)
     assert bend is not None and len(bend.start) == 11
     rng = np.random.default_rng(0)

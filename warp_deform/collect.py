@@ -14,6 +14,7 @@ from pathlib import Path
 
 from .collection import Attempt, Collection, append_attempt, check_seeds
 from .demonstrators import demonstrator
+from .enclosed import enclosed_count
 from .episode_loop import SLOTS, SOLVED, play, worlds_for
 from .episodes import EpisodeReader, EpisodeWriter, Goal, combine_hashes, rebuild_index
 from .errors import InputError
@@ -73,6 +74,8 @@ class CollectReport:
     attempts: seeds up to the one of the last kept success; mean_actions, mean_score, sim_seconds
     [s] and physics_ok are of the kept episodes; seconds: what this run took [s]
     state_hash: of the kept episodes' hashes in the order of their seeds
+    enclosed: kept episodes whose bag enclosed its items, see `Task.enclosed`; None where there are
+    none
     """
 
     task: str
@@ -87,6 +90,7 @@ class CollectReport:
     physics_ok: bool
     state_hash: str
     discarded_starts: int
+    enclosed: int | None = None
 
 
 def most_attempts(episodes: int) -> int:
@@ -242,4 +246,5 @@ def _report(
         physics_ok=all(info.physics_ok for info in infos),
         state_hash=combine_hashes(info.state_hash for info in infos),
         discarded_starts=sum(info.discarded_starts for info in infos),
+        enclosed=enclosed_count(infos),
     )

@@ -134,6 +134,8 @@ def demo(options: DemoOptions) -> Outcome:
             )
         )
     )
+    if report["enclosed"] is None:  # there are no items to enclose
+        del report["enclosed"]
     failure = None
     if report["successes"] < options.episodes:
         failure = (

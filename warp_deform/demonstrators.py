@@ -8,12 +8,12 @@ the simulator's state.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from .episode_loop import SLOTS, Act, Run
 from .errors import InputError
-from .planning import Lookahead, SearchConfig, lookahead_for, search
+from .planning import Lookahead, Outlook, SearchConfig, lookahead_for, search
 from .spaces import action_space
 from .tasks.task import Action
 from .worlds import Worlds
@@ -22,6 +22,8 @@ __all__ = ["DEMONSTRATORS", "demonstrator", "planner"]
 
 CANDIDATES = 8
 """Candidates an episode and action: one group of SIMD lanes."""
+MORE_CANDIDATES = 24
+"""The same where the first ones would lose an item."""
 
 
 def demonstrator(name: str) -> Act[Any]:
@@ -59,29 +61,39 @@ def _each(
 
 
 def _mpc(worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, Action | None]:
-    """The candidate with the best outlook in every slot; of equals the one proposed first."""
-    chosen: dict[int, Action | None] = dict.fromkeys(runs)
+    """The candidate with the best outlook in every slot; of equals the one proposed first.
+
+    Where even the best would end the episode with an item outside of the bag, more are tried.
+    """
+    best: dict[int, Outlook] = {}
+    for slot, outlook in _outlooks(worlds, runs, CANDIDATES):
+        if slot not in best or outlook.rank > best[slot].rank:
+            best[slot] = outlook
+    poor = {slot: run for slot, run in runs.items() if slot in best and best[slot].ends_badly}
+    for slot, outlook in _outlooks(worlds, poor, MORE_CANDIDATES):
+        if outlook.rank > best[slot].rank:
+            best[slot] = outlook
+    return {slot: best[slot].action if slot in best else None for slot in runs}
+
+
+def _outlooks(
+    worlds: Worlds, runs: Mapping[int, Run[Any]], count: int
+) -> Iterator[tuple[int, Outlook]]:
+    """Slots and what up to `count` candidates lead to there."""
     slots, jobs = [], []
     for slot, run in runs.items():
-        actions = _candidates(worlds, slot, run)
-        if len(actions) == 1:
-            chosen[slot] = actions[0]  # nothing to choose from
-        else:
-            slots += [slot] * len(actions)
-            jobs += [(worlds.state(slot), action) for action in actions]
-    best: dict[int, tuple[int, float]] = {}
-    for slot, outlook in zip(slots, _lookahead(worlds).try_each(jobs), strict=True):
-        if slot not in best or outlook.rank > best[slot]:
-            best[slot], chosen[slot] = outlook.rank, outlook.action
-    return chosen
+        for action in _candidates(worlds, slot, run, count):
+            slots.append(slot)
+            jobs.append((worlds.state(slot), action))
+    return zip(slots, _lookahead(worlds).try_each(jobs), strict=True)
 
 
-def _candidates(worlds: Worlds, slot: int, run: Run[Any]) -> list[Action]:
-    """Different candidates of the task that the environments allow, at most `CANDIDATES`."""
+def _candidates(worlds: Worlds, slot: int, run: Run[Any], count: int) -> list[Action]:
+    """Different candidates of the task that the environments allow, at most `count`."""
     episode = worlds.episodes[slot]
-    proposed = worlds.task.candidates(episode.layout, episode.snapshot, run.rng, CANDIDATES)
+    proposed = worlds.task.candidates(episode.layout, episode.snapshot, run.rng, count)
     different = {action.tobytes(): action for action in proposed}
-    return [action for action in different.values() if action_space().contains(action)][:CANDIDATES]
+    return [action for action in different.values() if action_space().contains(action)][:count]
 
 
 def planner(config: SearchConfig) -> Act[Any]:

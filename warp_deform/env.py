@@ -35,9 +35,10 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     task: a name, see `warp-deform list`, or a `Task` of your own; robot: "ur5" or "panda"
     render_mode: None, or "rgb_array" for `render` to draw table, objects and arm (360, 640, 3)
 
-    Reward is the change of the score. An episode terminates when the task is solved and is
-    truncated after `max_actions`, or as soon as a guard of the solver says that the state cannot be
-    trusted. `spaces.observation` and `spaces.information` say what observations and infos hold.
+    Reward is the change of the score. An episode terminates when the task is solved or over without
+    success by its rules (`Task.ended`), and is truncated after `max_actions`, or as soon as a guard
+    of the solver says that the state cannot be trusted. `spaces.observation` and
+    `spaces.information` say what observations and infos hold.
 
     A seed names an episode: the same bits in any environment, alone or in a vector. A reset without
     one draws the episode's seed from `np_random` (1,000,000 and up) and tells it in `info`.
@@ -98,7 +99,7 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         info = information(self.worlds, 0, outcome=report.outcome)
         reward = info["score"] - self._score
         self._score = info["score"]
-        terminated, truncated = ending(self.task, info)
+        terminated, truncated = ending(self.worlds, 0, info)
         self._running = not (terminated or truncated)
         return observation(self.worlds, 0), reward, terminated, truncated, info
 
@@ -145,10 +146,10 @@ class WorldsView:
         return self._scene.render(episode.drawables, *state, self._links)
 
 
-def ending(task: Task, info: Mapping[str, Any]) -> tuple[bool, bool]:
-    """Whether an episode has terminated (solved) and whether it is truncated."""
-    terminated = bool(info["success"])
-    over = info["actions"] >= task.max_actions or not info["physics_ok"]
+def ending(worlds: Worlds, slot: int, info: Mapping[str, Any]) -> tuple[bool, bool]:
+    """Whether an episode has terminated (by its task's rules) and whether it is truncated."""
+    terminated = bool(worlds.episodes[slot].ended)
+    over = info["actions"] >= worlds.task.max_actions or not info["physics_ok"]
     return terminated, bool(over and not terminated)
 
 

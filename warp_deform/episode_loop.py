@@ -73,8 +73,8 @@ def play(
 
     look: called with a slot at the start and after every action of an episode whose physics holds
     goals: the goal of a seed, None to construct it
-    until_solved: end episodes that are solved or have used up their actions; else `act` alone ends
-        them
+    until_solved: end episodes that are solved, over by their task's rules (`Task.ended`), or have
+        used up their actions; else `act` alone ends them
     """
     waiting = iter(seeds)
     free = list(range(worlds.count))
@@ -148,5 +148,7 @@ def _see(
     run.rows.append(look(worlds, slot))
     if until_solved and worlds.solved(slot):
         run.ended = SOLVED
-    elif until_solved and len(episode.actions) >= worlds.task.max_actions:
-        run.ended = f"not solved in {len(episode.actions)} actions"
+    elif until_solved and episode.ended:
+        run.ended = f"over without success after {len(episode.history)} actions"
+    elif until_solved and len(episode.history) >= worlds.task.max_actions:
+        run.ended = f"not solved in {len(episode.history)} actions"

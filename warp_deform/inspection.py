@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from .enclosed import ENCLOSED, enclosed_count
 from .episodes import Episode, EpisodeReader, Step, combine_hashes
 from .errors import InputError
 from .rendering.pixels import SHAPE, TABLE_GRID, PixelGrid
@@ -72,17 +73,19 @@ def statistics(folder: Path) -> dict[str, Any]:
     Keys: `episodes`, `steps` (actions taken), `successes`, `success_rate`, `mean_actions`,
     `median_actions`, `mean_score`, `physics_ok` (episodes whose guards held), `discarded_starts`,
     `sim_seconds`, `bytes`, `tasks`, `demonstrators` and `robots` (episodes of each), `state_hash`
-    (of the episodes in seed order).
+    (of the episodes in seed order); where bags have items also `enclosed`, the episodes whose bag
+    enclosed them.
 
     Raises:
         InputError: the folder has no episodes, or one cannot be read.
     """
     reader = EpisodeReader(folder)
-    actions, scores, seconds, hashes = [], [], [], []
+    actions, scores, seconds, hashes, infos = [], [], [], [], []
     successes = sound = discarded = size = 0
     tasks, demonstrators, robots = Counter[str](), Counter[str](), Counter[str]()
     for seed in reader.seeds:
         info = reader.info(seed)
+        infos.append(info)
         actions.append(info.actions)
         scores.append(info.score)
         seconds.append(info.sim_seconds)
@@ -94,7 +97,7 @@ def statistics(folder: Path) -> dict[str, Any]:
         tasks[info.task] += 1
         demonstrators[info.demonstrator] += 1
         robots[info.robot] += 1
-    count = len(reader)
+    count, enclosed = len(reader), enclosed_count(infos)
     return {
         "episodes": count,
         "steps": sum(actions),
@@ -111,6 +114,7 @@ def statistics(folder: Path) -> dict[str, Any]:
         "demonstrators": dict(sorted(demonstrators.items())),
         "robots": dict(sorted(robots.items())),
         "state_hash": combine_hashes(hashes),
+        **({} if enclosed is None else {ENCLOSED: enclosed}),
     }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from .objects.cable import Cable
 from .robots.jaw import Jaw
 from .robots.jaw_primitive import jaw_motion, jaw_script, run_scripts
+from .robots.primitive import Outcome
 from .rollout import rollout
 from .running import Plan, episode_rng
 
@@ -42,6 +43,7 @@ def jaw_step(worlds: Worlds, plans: Mapping[int, Plan], record: float) -> None:
     for slot, (outcome, run) in run_scripts(solver, jaws, scripts, config, record=record).items():
         jaws[slot].reset()
         plans[slot].outcome = outcome
+        plans[slot].held = 0 if outcome is Outcome.PLACED else None  # the chain
         plans[slot].runs.append(run)
     if not moving:
         return

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .enclosed import ENCLOSED
 from .episode_loop import SOLVED, Run
 from .episodes import (
     Episode,
@@ -78,7 +79,7 @@ def record(worlds: Worlds, slot: int, run: Run[Step], *, demonstrator: str) -> E
         versions=versions(),
         cpu=cpu_fingerprint(),
         goal=None,
-        extra={**origin(worlds.task), **_as_goal(worlds, slot)},
+        extra={**origin(worlds.task), **_as_goal(worlds, slot), **_enclosed(worlds, slot)},
     )
     return Episode(info, (*rows, last), episode.goal)
 
@@ -104,6 +105,12 @@ def recorded_task(info: EpisodeInfo) -> Task:
     """
     named = info.extra.get(_TASK_CLASS)
     return find_task(info.task, recorded=named if isinstance(named, str) else None)
+
+
+def _enclosed(worlds: Worlds, slot: int) -> dict[str, Any]:
+    """Whether the bag enclosed its items, where there are any."""
+    enclosed = worlds.enclosed(slot)
+    return {} if enclosed is None else {ENCLOSED: enclosed}
 
 
 def task_config(task: Task) -> dict[str, Any]:

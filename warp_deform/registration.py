@@ -16,13 +16,15 @@ __all__ = ["env_id", "register_environments", "register_task"]
 
 Registered = TypeVar("Registered", bound="type[Task]")
 
-_VERSION = 1  # rises with any change of physics, observation or reward
-
 
 def env_id(task: str) -> str:
-    """Gymnasium id of the task called `task`: `cable-ring` is `WarpDeform/CableRing-v1`."""
+    """Gymnasium id of the task called `task`: `cable-ring` is `WarpDeform/CableRing-v1`.
+
+    The version of a task from elsewhere, which may not have been loaded, is 1.
+    """
     words = "".join(word.capitalize() for word in task.split("-"))
-    return f"WarpDeform/{words}-v{_VERSION}"
+    known = TASKS | FURTHER_TASKS
+    return f"WarpDeform/{words}-v{known[task].version if task in known else 1}"
 
 
 def register_environments() -> None:

@@ -86,11 +86,13 @@ def information(
     success and is_success (both spellings are in use), score in [0, 1], physics_ok, problems (why
     the physics cannot be trusted, "" when it can), state_hash, sim_seconds [s], at_rest (whether
     things came to rest after the last motion), seed, discarded_starts, actions so far, outcome of
-    the last one ("" after a reset), stage_rule (who chose the lift), ground_truth (D,) float32,
+    the last one ("" after a reset), enclosed (only where a bag is to keep items: whether it does,
+    see `Task.enclosed`), stage_rule (who chose the lift), ground_truth (D,) float32,
     segmentation (320, 160) uint8.
     """
     episode = worlds.episodes[slot]
     success = bool(worlds.solved(slot))
+    enclosed = worlds.enclosed(slot)
     return {
         "success": success,
         "is_success": success,
@@ -102,8 +104,9 @@ def information(
         "at_rest": bool(episode.at_rest),
         "seed": int(episode.seed),
         "discarded_starts": int(episode.discarded_starts),
-        "actions": len(episode.actions),
+        "actions": len(episode.history),
         "outcome": outcome.value if outcome is not None else "",
+        **({} if enclosed is None else {"enclosed": enclosed}),
         "stage_rule": stage_rule,
         "ground_truth": worlds.task.ground_truth(episode.layout, episode.snapshot),
         "segmentation": _images(worlds, slot).segmentation.copy(),

@@ -145,7 +145,7 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
             info = information(self.worlds, i, outcome=report.outcome)
             rewards[i] = info["score"] - self._scores[i]
             self._scores[i] = info["score"]
-            terminations[i], truncations[i] = ending(self.task, info)
+            terminations[i], truncations[i] = ending(self.worlds, i, info)
             if (
                 terminations[i] or truncations[i]
             ) and self.autoreset_mode is AutoresetMode.SAME_STEP:

@@ -26,13 +26,13 @@ from .robots import robot as find_robot
 from .robots.primitive import Motion, Outcome, approach, solve_joints
 from .rollout import rollout
 from .running import (
+    ALOFT_EVERY,
     LAYOUT_STREAM,
     Carry,
     Plan,
     RunningEpisode,
     StepReport,
     episode_rng,
-    join_frames,
     objects_in,
 )
 from .solver.solver import SolverFusedXPBD
@@ -266,22 +266,18 @@ class Worlds:
             for run in plan.runs:
                 episode.sim_seconds += run.seconds
                 episode.problems += run.watch.problems(slot, limits)
-            episode.actions = np.vstack([episode.actions, plan.action])
+            outcome = plan.outcome if episode.physics_ok else Outcome.INVALID
+            episode.history += (plan.past(outcome),)
             self._look(slot)
-            seconds = [run.seconds for run in plan.runs]
-            reports[slot] = StepReport(
-                outcome=plan.outcome if episode.physics_ok else Outcome.INVALID,
-                seconds=sum(seconds),
-                motions=tuple(plan.motions),
-                joints=tuple(plan.joints),
-                frames=join_frames([run.frames for run in plan.runs], seconds),
-            )
+            episode.judge(self.task)
+            reports[slot] = plan.report(outcome, recorded=record > 0)
         return reports
 
     def _checked(self, slot: int, action: np.ndarray) -> Plan:
         action = real_array(action, (7,), name=f"action of slot {slot}", finite=True)
         if slot not in self.episodes:
             raise InputError(f"slot {slot} has no episode: reset it first")
+        self.episodes[slot].over |= self.episodes[slot].ended
         return Plan(action)
 
     def _approach(self, plans: Mapping[int, Plan], record: float) -> None:
@@ -321,11 +317,10 @@ class Worlds:
             least=RETREAT_LEAST,
             most={slot: float(paths[slot].times[-1]) + self.rest_limit for slot in moving},
             calm_after=CALM,
-            record=record,
+            record=record or (ALOFT_EVERY if self.task.looks_aloft else 0.0),
         )
         for slot in moving:
-            plans[slot].runs.append(runs[slot])
-            plans[slot].outcome = Outcome.PLACED
+            plans[slot].placed(runs[slot], carries[slot], paths[slot])
             self.episodes[slot].at_rest = runs[slot].at_rest
             self.episodes[slot].tip = motions[slot].way_points[-1]
 
@@ -380,7 +375,7 @@ class Worlds:
 
         episode.snapshot = Snapshot(
             particle_q, particle_qd, body_q, body_qd, drawables.segments, render,
-            episode.objects, episode.actions,
+            episode.objects, episode.history, episode.over,
         )  # fmt: skip
 
     def state(self, slot: int) -> WorldState:
@@ -412,6 +407,12 @@ class Worlds:
         """Whether a slot's task is done; never on an untrusted state."""
         episode = self.episodes[slot]
         return episode.physics_ok and self.task.solved(episode.layout, episode.snapshot)
+
+    def enclosed(self, slot: int) -> bool | None:
+        """Whether a slot's items are in a bag, never on an untrusted state; None without either."""
+        episode = self.episodes[slot]
+        kept = self.task.enclosed(episode.layout, episode.snapshot)
+        return None if kept is None else kept and episode.physics_ok
 
     def hash(self, slot: int) -> str:
         """Hash of a slot's positions and velocities."""

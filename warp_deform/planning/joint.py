@@ -67,7 +67,7 @@ def move_both(
             moving[i] = there, replace(follow, like=like), pair
             tries.append(moving[i][:2])
     firsts = lookahead.try_each([(state, action) for action, _ in tries], keep=True)
-    led = [(f, o) for (_, f), o in zip(tries, firsts, strict=True) if o.after and o.grade >= 2]
+    led = [(f, o) for (_, f), o in zip(tries, firsts, strict=True) if o.after and o.goes_on]
     jobs = [(o.after, f.action(o.after.episode.snapshot)) for f, o in led if o.after]
     seconds = lookahead.try_each(jobs)
     return [

@@ -25,7 +25,8 @@ LOOKAHEAD_REST = 1.0
 class Outlook:
     """What an action leads to.
 
-    grade: 3 solved, 2 placed, 1 nothing moved, 0 not to be trusted
+    grade: 4 solved, 3 solved but an item is not enclosed (`Task.enclosed`), 2 placed, 1 nothing
+    moved, 0 not to be trusted or the episode over without success
     promise: of the task for the state that the action leaves; greater is better
     """
 
@@ -44,9 +45,24 @@ class Outlook:
         return self.grade, self.promise
 
     @property
+    def done(self) -> bool:
+        """Whether nothing is left to wish for: solved, with every item enclosed where there are."""
+        return self.grade == 4
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether something moved, and the episode is not over then."""
+        return self.grade == 2
+
+    @property
+    def ends_badly(self) -> bool:
+        """Whether it ends the episode without success, or with an item that is not enclosed."""
+        return self.grade in (0, 3)
+
+    @property
     def solved(self) -> bool:
         """Whether the task is done then."""
-        return self.grade == 3
+        return self.grade >= 3
 
 
 class Lookahead:
@@ -101,7 +117,12 @@ class Lookahead:
         promise = float(worlds.task.promise(episode.layout, episode.snapshot))
         if not math.isfinite(promise):
             raise WarpDeformError(f"{worlds.task.name}: the promise of a state is {promise}")
-        grade = 1 if outcome is not Outcome.PLACED else 3 if worlds.solved(slot) else 2
+        if outcome is not Outcome.PLACED:
+            grade = 1
+        elif worlds.solved(slot):
+            grade = 3 if worlds.enclosed(slot) is False else 4
+        else:
+            grade = 0 if episode.ended else 2
         after = worlds.state(slot) if keep else None
         return Outlook(action, grade, promise, worlds.score(slot), after)
 

@@ -95,12 +95,12 @@ def search(
     tried.sort(key=lambda o: o.rank, reverse=True)
     if not deep or not tried:
         return tried
-    if tried[0].solved:
+    if tried[0].done:
         if config.polish:
             tried += around.improved(tried, config.budget - (lookahead.rollouts - spent))
             tried.sort(key=lambda o: o.rank, reverse=True)
         return tried
-    beam = [o for o in tried if o.after is not None and o.grade >= 2][: config.beam]
+    beam = [o for o in tried if o.after is not None and o.goes_on][: config.beam]
     if not beam:
         return tried
     rest = config.budget - first
@@ -111,6 +111,7 @@ def search(
         from_there = _Around(lookahead, task, outlook.after, rng, config, keep=False)
         seconds = from_there.tried((rest - jointly) // len(beam))
         led.append((outlook, max([outlook, *seconds], key=lambda o: o.rank)))
+    led += [(o, o) for o in tried if o.solved]  # but with an item that is not enclosed
     led.sort(key=lambda pair: pair[1].rank, reverse=True)
     if jointly >= JOINT_COST:
         steps = min(JOINT_STEPS, jointly // JOINT_COST)
@@ -222,7 +223,7 @@ class _Around:
         return [replace(o, origin=origin) for o, origin in zip(outlooks, origins, strict=True)]
 
     def _done(self, tried: Sequence[Outlook]) -> bool:
-        return not self._config.polish and any(o.solved for o in tried)
+        return not self._config.polish and any(o.done for o in tried)
 
     def _fresh(self, actions: Sequence[Action], most: int) -> list[Action]:
         """Those that have not been tried from here, at most so many."""

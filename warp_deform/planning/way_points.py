@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..rendering.pixels import BOUNDS
 from ..robots.primitive import LIFT, Motion, solve_joints
 from ..rollout import GripPath, rollout
+from ..running import ALOFT_EVERY, Carry, Plan
 from ..tasks.task import Action, Task
 from ..world_state import WorldState
 from ..worlds import CALM, RETREAT_LEAST, Worlds
@@ -104,7 +105,7 @@ class WayPoints:
         be trusted.
         """
         worlds = self._worlds
-        self._lead(jobs)
+        carries = self._lead(jobs)
         moving = self._followed(jobs, paths)
         if not moving:
             return {}
@@ -115,6 +116,7 @@ class WayPoints:
             least=RETREAT_LEAST,
             most={slot: float(paths[slot].times[-1]) + worlds.rest_limit for slot in moving},
             calm_after=CALM,
+            record=ALOFT_EVERY if worlds.task.looks_aloft else 0.0,
         )
         ran: dict[int, Ran] = {}
         for slot in moving:
@@ -122,7 +124,9 @@ class WayPoints:
             episode.problems += runs[slot].watch.problems(slot, worlds.solver.config.limits)
             if not episode.physics_ok:
                 continue
-            episode.actions = np.vstack([episode.actions, jobs[slot][1]])
+            plan = Plan(jobs[slot][1])
+            plan.placed(runs[slot], carries[slot], paths[slot])
+            episode.history += (plan.past(plan.outcome),)
             worlds.restore(slot, worlds.state(slot))  # which looks at where it ended
             end = worlds.episodes[slot].snapshot
             before = jobs[slot][0].episode
@@ -134,7 +138,8 @@ class WayPoints:
         self, jobs: Sequence[tuple[WorldState, Action]], config: WayPointConfig
     ) -> list[Bent]:
         led = dict(enumerate(jobs))
-        straight = self._lead(led)
+        carries = self._lead(led)
+        straight = {slot: carried(led[slot][1])[1] for slot, carried in carries.items()}
         bends = {
             slot: bend
             for slot, path in straight.items()
@@ -177,12 +182,11 @@ class WayPoints:
             for s in range(len(jobs))
         ]
 
-    def _lead(self, jobs: dict[int, tuple[WorldState, Action]]) -> dict[int, GripPath]:
-        """Lead the tips down; the straight paths of those that have taken something."""
+    def _lead(self, jobs: dict[int, tuple[WorldState, Action]]) -> dict[int, Carry]:
+        """Lead the tips down; how those that have taken something would carry it."""
         for slot, (state, _) in jobs.items():
             self._worlds.restore(slot, state)
-        carries = self._worlds.lead({slot: action for slot, (_, action) in jobs.items()})
-        return {slot: carried(jobs[slot][1])[1] for slot, carried in carries.items()}
+        return self._worlds.lead({slot: action for slot, (_, action) in jobs.items()})
 
     def _followed(
         self, jobs: dict[int, tuple[WorldState, Action]], paths: dict[int, GripPath]

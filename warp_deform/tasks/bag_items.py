@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from ..objects.bag import add_bag
+from ..objects.bag import Bag, add_bag
 from ..objects.box import Box, BoxConfig, BoxPart, add_box
 from ..objects.colors import BROWN, RED, Color
 from ..objects.scene_object import SceneObject
 from ..objects.zone import square_zone
+from ..robots.primitive import Outcome
 from .bag_opening import BAG_ROWS, BagTask
 from .bag_physics import CARRY, INSERT, OPEN
 from .demonstrators import pick_place
 from .free_space import FreeSpace, NoFreeSpace
 from .ground_truth import Row, pose_rows, quaternion_yaw
+from .past import PastAction
 from .shapes import to_world
 from .task import Action, Layout, Snapshot, Stage
 
@@ -41,15 +43,20 @@ _TRIES = 50  # draws of a whole layout; a zone in the way leaves no room in some
 class BagItems1(BagTask):
     """The cube has to be in the zone with part of the bag: open it, put the cube in, carry it.
 
+    A carry is an action that was placed, with the lift of that stage, and held the bag. The first
+    one that leaves a bead or an item in the zone ends the episode, solved or not, as in the
+    original. The score of the state after any other action is 0.
+
     Deliberate differences from the original: the bag's as in bag-alone-open; an item is set on the
-    table instead of dropped; the episode goes on after a carry that did not succeed, until the
-    actions are used up; a start whose item cannot be seen is drawn again. A carry is an action with
-    the lift of that stage: the score of the state after any other action is 0.
+    table instead of dropped; a start whose item cannot be seen is drawn again; an action that the
+    arm cannot carry out counts with nothing, but does not end the episode.
     """
 
     name = "bag-items-1"
     stages = (OPEN, INSERT, CARRY)
     success_score = 0.5
+    version = 2
+    looks_aloft = True
     ground_truth_rows = ((Row.POSE, 1), *BAG_ROWS, (Row.POSE, 1))
     objects: ClassVar[tuple[str, ...]] = ("bag", "cube")
 
@@ -121,9 +128,34 @@ class BagItems1(BagTask):
         items, beads = self._shares(layout, snapshot)
         return self._carried(snapshot) and items == 1.0 and beads > 0.0
 
+    def ended(self, layout: Layout, snapshot: Snapshot) -> bool:
+        """Whether the last action was a carry that left a bead or an item in the zone."""
+        return self._carried(snapshot) and max(self._shares(layout, snapshot)) > 0.0
+
+    def enclosed(self, layout: Layout, snapshot: Snapshot) -> bool:
+        """Whether every item is inside the bag, and left the table in it at the last carry."""
+        carries = [past for past in snapshot.history if self._is_carry(snapshot, past)]
+        if not carries or not self.was_aloft(snapshot, carries[-1]):
+            return False
+        return bool(super().enclosed(layout, snapshot))
+
     def _carried(self, snapshot: Snapshot) -> bool:
-        actions = snapshot.actions
-        return len(actions) > 0 and self.stage_of(float(actions[-1, 6])) is CARRY
+        """Whether the last action was a carry, and the episode had not ended before."""
+        history = snapshot.history
+        return bool(history) and not snapshot.over and self._is_carry(snapshot, history[-1])
+
+    def _is_carry(self, snapshot: Snapshot, past: PastAction) -> bool:
+        held = None if past.held is None else snapshot.objects[past.held]
+        placed = past.outcome is Outcome.PLACED and isinstance(held, Bag)
+        return placed and self.stage_of(past.lift) is CARRY
+
+    def _inserted(self, snapshot: Snapshot) -> int:
+        """How often an item was inserted: picked at any lift, or meant to be."""
+        return sum(
+            self.stage_of(past.lift) is INSERT
+            or (past.held is not None and isinstance(snapshot.objects[past.held], Box))
+            for past in snapshot.history
+        )
 
     def _shares(self, layout: Layout, snapshot: Snapshot) -> tuple[float, float]:
         """Shares of the items' centres and of the beads that are in the zone."""
@@ -151,8 +183,7 @@ class BagItems1(BagTask):
         """
         if self.hidden(layout, snapshot):
             return None
-        lifts = [self.stage_of(float(a[6])) for a in snapshot.actions]
-        tried = lifts.count(INSERT)
+        tried = self._inserted(snapshot)
         if tried >= len(self.cubes):
             return self._carry(layout, snapshot, rng, None)
         clear = self._clear(layout, snapshot, tried)
@@ -197,9 +228,9 @@ class BagItems1(BagTask):
         return actions + self.pulls(layout, snapshot, rng, count - len(actions))
 
     def promise(self, layout: Layout, snapshot: Snapshot) -> float:
-        """Solved, else items in the bag, then how far it is open."""
+        """Solved with every item enclosed, else solved; items in the bag; how far it is open."""
         if self.solved(layout, snapshot):
-            return 10.0
+            return 10.0 if self.enclosed(layout, snapshot) else 5.0
         outside = len(self._outside(snapshot))
         inside = len(self.cubes) - outside
         if not outside:

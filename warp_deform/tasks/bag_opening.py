@@ -24,6 +24,7 @@ from .demonstrators import farthest_bead, pick_place, ring_maps, visible_point
 from .ground_truth import Row, Rows, pose_rows
 from .losses import mean_distance, ring_area
 from .metrics import hull_area
+from .past import PastAction
 from .shapes import chain_yaw
 from .task import Action, Layout, Snapshot, Task
 
@@ -47,6 +48,7 @@ _WORTH = 0.5
 FEWEST_VISIBLE = 0.33
 """The demonstrators give up where no more than this share of the beads can be seen."""
 _RAYS = 96
+_OFF_TABLE = 0.01  # [m] that an item's lowest point is above the table when it has left it
 _INSIDE = 0.75  # share of the rays sideways and down that meet the shell around an item inside
 
 
@@ -143,8 +145,21 @@ class BagTask(Task):
     def inside_bag(self, snapshot: Snapshot, body: int) -> bool:
         """Whether a body's centre is inside the first bag."""
         bag = self.bag_of(snapshot)
-        centre = snapshot.body_q[body, :3].astype(float)
-        return enclosed(centre, snapshot.particle_q.astype(float), bag.faces) >= _INSIDE
+        return _inside(bag, snapshot.particle_q, snapshot.body_q[body])
+
+    def enclosed(self, layout: Layout, snapshot: Snapshot) -> bool | None:
+        """Whether every item is inside the first bag; None without items."""
+        bodies = range(len(snapshot.body_q))
+        return all(self.inside_bag(snapshot, b) for b in bodies) if len(bodies) else None
+
+    def was_aloft(self, snapshot: Snapshot, past: PastAction) -> bool:
+        """Whether every item hung inside the first bag while that hung highest in an action."""
+        if past.aloft is None:
+            return False
+        bag, body_q = self.bag_of(snapshot), past.aloft.body_q
+        boxes = [item for item in snapshot.objects if isinstance(item, Box)]
+        off = all(body_q[box.body, 2] + box.config.lowest > _OFF_TABLE for box in boxes)
+        return off and all(_inside(bag, past.aloft.particle_q, pose) for pose in body_q)
 
     def met_beads(self, snapshot: Snapshot, number: int = 0) -> list[int]:
         """Beads of a bag that a tip descending at their centre really takes."""
@@ -301,6 +316,12 @@ class BagTask(Task):
         return np.concatenate([pose_rows(beads, chain_yaw(beads, closed=True)), moved])
 
 
+def _inside(bag: Bag, particle_q: np.ndarray, pose: np.ndarray) -> bool:
+    """Whether a body with this pose (7,) has its centre inside a bag of a world's particles."""
+    share = enclosed(pose[:3].astype(float), particle_q.astype(float), np.asarray(bag.faces))
+    return share >= _INSIDE
+
+
 def bag_mask(segmentation: np.ndarray, first: int, stop: int) -> np.ndarray:
     """Filled convex hull (320, 160) uint8 of pixels with ids first .. stop - 1; may be empty."""
     mask = np.zeros(SHAPE, np.uint8)
@@ -316,6 +337,8 @@ def enclosed(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> floa
 
     vertices (P, 3) and faces (T, 3); near 1 inside a bag, near 0 beside it.
     """
+    if not (np.isfinite(point).all() and np.isfinite(vertices).all()):
+        return 0.0
     a = vertices[faces[:, 0]]
     u, v = vertices[faces[:, 1]] - a, vertices[faces[:, 2]] - a
     rays = _downward_rays()

@@ -73,6 +73,7 @@ _ATTRIBUTES = {
         "None or a whole number, 1 or more", lambda value: value is None or _whole(value)
     ),
     "mirrors": _Attribute("True or False", lambda value: type(value) is bool),
+    "looks_aloft": _Attribute("True or False", lambda value: type(value) is bool),
     "place_yaws": _Attribute("a whole number, 1 or more", _whole),
 }
 _OF_GOALS = ("goal_layout", "goal_targets")

@@ -17,6 +17,7 @@ import numpy as np
 from ..rendering.pixels import TABLE_GRID, PixelGrid
 from ..robots.primitive import PrimitiveConfig, Stage
 from ..solver.config import SolverConfig
+from .past import PastAction
 
 if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     import newton
@@ -95,8 +96,16 @@ class Snapshot:
     render: Callable[[], Images] = field(repr=False)
     objects: tuple[SceneObject, ...] = ()
     """Where the objects of `Task.add_objects` stand in the arrays above, as they are here."""
-    actions: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
-    """Actions of the episode so far (T, 7)."""
+    history: tuple[PastAction, ...] = ()
+    """The episode's actions so far, and what came of each."""
+    over: bool = False
+    """Whether the episode had ended before its last action: what came after the end is no success.
+    """
+
+    @cached_property
+    def actions(self) -> np.ndarray:
+        """Actions of the episode so far (T, 7)."""
+        return np.array([past.action for past in self.history]).reshape(-1, 7)
 
     @cached_property
     def images(self) -> Images:
@@ -136,6 +145,11 @@ class Task(abc.ABC):
     """Whether mirror images of scenes and actions are the task's, too."""
     place_yaws: ClassVar[int] = 1
     """Place yaws to choose among, evenly spread; 1 where the yaw does not matter."""
+    version: ClassVar[int] = 1
+    """Of its Gymnasium id: rises with any change of physics, observation or reward. Those of tasks
+    from elsewhere are 1."""
+    looks_aloft: ClassVar[bool] = False
+    """Whether its rules ask where things were while what was held hung highest, see `Aloft`."""
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -198,6 +212,17 @@ class Task(abc.ABC):
     def solved(self, layout: Layout, snapshot: Snapshot) -> bool:
         """Whether the task is done."""
         return self.score(layout, snapshot) >= self.success_score
+
+    def ended(self, layout: Layout, snapshot: Snapshot) -> bool:
+        """Whether the last action ended the episode, solved or not."""
+        return self.solved(layout, snapshot)
+
+    def enclosed(self, layout: Layout, snapshot: Snapshot) -> bool | None:
+        """Whether every item is where a bag keeps it; None for tasks without a bag or an item.
+
+        Scores do not ask for it: it stands beside success.
+        """
+        return None
 
     def acceptable(self, layout: Layout, snapshot: Snapshot) -> bool:
         """Whether an episode may start like this, once settled; others are drawn again, counted."""
