@@ -15,6 +15,7 @@ import numpy as np
 from warp_deform.errors import InputError
 
 from ..panda_arm import DDQ_MAX, DQ_MAX, Q_MAX, Q_MIN, TAU_MAX, flange_T_tcp
+from .frames import difference, is_frame
 from .model_library import INERTIA, ModelLibrary
 from .protocol import ControllerMode, GeneratorMode
 
@@ -98,7 +99,7 @@ class Arm:
         if controller == ControllerMode.EXTERNAL:
             violation = self._torque(command["tau_J_d"])
         elif generator == GeneratorMode.JOINT_POSITION:
-            if first and np.abs(command["q_c"] - self.q).max() > START_TOLERANCE:
+            if first and not np.abs(command["q_c"] - self.q).max() <= START_TOLERANCE:
                 return "joint_position_motion_generator_start_pose_invalid"
             violation = self._joint_velocity((command["q_c"] - self.q_d) / DT, command["q_c"])
         elif generator == GeneratorMode.JOINT_VELOCITY:
@@ -147,14 +148,13 @@ class Arm:
     def _pose(self, O_T_EE_c: np.ndarray, *, first: bool) -> str | None:
         """Follow a commanded pose by one Gauss-Newton step from where the arm is."""
         target, current = O_T_EE_c.reshape(4, 4).T, self.base_T_tcp
-        turn = target[:3, :3].T @ target[:3, :3] - np.eye(3)
-        if not np.abs(turn).max() < 1e-5:
+        if not is_frame(O_T_EE_c):
             return "cartesian_position_motion_generator_invalid_frame_flag"
         if first and not np.linalg.norm(target[:3, 3] - current[:3, 3]) < START_TOLERANCE:
             return "cartesian_position_motion_generator_start_pose_invalid"
         before = self.O_T_EE_c.reshape(4, 4).T
-        twist = _difference(before, target) / DT
-        return self._twist(twist, _difference(current, target))
+        twist = difference(before, target) / DT
+        return self._twist(twist, difference(current, target))
 
     def _twist(self, twist: np.ndarray, step: np.ndarray) -> str | None:
         """Move the end effector by `step` while `twist` is what was commanded."""
@@ -168,10 +168,3 @@ class Arm:
         # Joint acceleration is not held to its limit here: redundancy is resolved afresh each step.
         self.dq_d = dq
         return self._joint_velocity(dq, self.q + DT * dq, "cartesian_motion_generator_joint")
-
-
-def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return translation [m] and small rotation vector [rad] from pose a to pose b, shape (6,)."""
-    R = b[:3, :3] @ a[:3, :3].T
-    turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return np.concatenate([b[:3, 3] - a[:3, 3], turn])

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import struct
-
 from ..panda_arm import GRIPPER_MAX_WIDTH
 from .protocol import GripperCommand, GripperStatus, Request
+from .requests import GRIPPER_FORMS, read
 
 __all__ = ["Gripper"]
 
@@ -40,30 +39,39 @@ class Gripper:
         return self._request is not None
 
     def start(self, request: Request) -> list[tuple[Request, GripperStatus]]:
-        """Begin a command; returns the commands that ended by it."""
-        ended = [(self._request, GripperStatus.ABORTED)] if self._request else []
-        self._request, self._stages = None, []
+        """Begin a command; returns the commands that ended by it.
+
+        One that is refused disturbs nothing.
+
+        Raises:
+            ValueError: there is no such command
+        """
+        values = read(request, GRIPPER_FORMS)
+        if values is None:
+            return [(request, GripperStatus.FAIL)]
+        ended = self.abandon()
         if request.command == GripperCommand.STOP:
             return [*ended, (request, GripperStatus.SUCCESS)]
-        try:
-            self._plan(request)
-        except struct.error:
-            return [*ended, (request, GripperStatus.FAIL)]
-        if not (self._speed > 0.0 and all(0.0 <= w <= GRIPPER_MAX_WIDTH for w in self._stages)):
-            return [*ended, (request, GripperStatus.FAIL)]
+        self._plan(request, values)
         self._request = request
         self.grasped = False
         self.closing = request.command == GripperCommand.GRASP
         return ended
 
-    def _plan(self, request: Request) -> None:
+    def abandon(self) -> list[tuple[Request, GripperStatus]]:
+        """Stop the fingers where they are; returns the command that ended by it, if one did."""
+        ended = [(self._request, GripperStatus.ABORTED)] if self._request else []
+        self._request, self._stages = None, []
+        return ended
+
+    def _plan(self, request: Request, values: tuple[float, ...]) -> None:
         if request.command == GripperCommand.HOMING:
             self._stages, self._speed = [0.0, GRIPPER_MAX_WIDTH], HOMING_SPEED
         elif request.command == GripperCommand.MOVE:
-            width, self._speed = struct.unpack("<2d", request.body)
+            width, self._speed = values
             self._stages = [width]
         else:
-            self._grasp = struct.unpack("<5d", request.body)
+            self._grasp = values
             self._stages, self._speed = [0.0], self._grasp[3]
 
     def step(self, dt: float, object_width: float) -> tuple[Request, GripperStatus] | None:

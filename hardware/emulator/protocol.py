@@ -32,6 +32,7 @@ __all__ = [
     "Request",
     "RobotCommand",
     "RobotMode",
+    "SetStatus",
     "Stream",
     "pack_gripper_state",
 ]
@@ -82,6 +83,14 @@ class MoveStatus(IntEnum):
     EMERGENCY_ABORTED = 7
     INPUT_ERROR_ABORTED = 8
     ABORTED = 9
+
+
+class SetStatus(IntEnum):
+    """How every other command to the robot ends; some know only the first two."""
+
+    SUCCESS = 0
+    NOT_POSSIBLE = 1
+    INVALID_ARGUMENT = 2
 
 
 class GripperStatus(IntEnum):

@@ -1,11 +1,11 @@
 """The robot's side of the interface: what a state says, what a command does, and how motions end.
 
-No sockets here: bytes in, bytes out, one call a tick. `server.py` decides when a tick is.
+No sockets here: requests in, answers out, one call a tick. `server.py` decides when a tick is.
 """
 
 from __future__ import annotations
 
-import struct
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,17 +17,17 @@ from .protocol import (
     ERRORS,
     ROBOT_COMMAND,
     ROBOT_STATE,
-    ROBOT_VERSION,
     ControllerMode,
     GeneratorMode,
     MoveStatus,
     Request,
     RobotCommand,
     RobotMode,
-    Stream,
+    SetStatus,
 )
+from .requests import ROBOT_FORMS, read
 
-__all__ = ["EmulatedRobot"]
+__all__ = ["Answer", "EmulatedRobot"]
 
 # Commands that may be missing in a row before the motion is aborted, as on the robot.
 MAX_MISSED = 20
@@ -36,7 +36,16 @@ RATE_WINDOW = 100
 # How much contact is too much until the client says otherwise [N m], [N, N m].
 DEFAULT_TORQUE_THRESHOLD, DEFAULT_FORCE_THRESHOLD = 20.0, 20.0
 IDENTITY = np.eye(4).ravel()
-REJECTED = 1  # of every command that only sets something: not possible now
+# What GetCartesianLimit says where there is no wall: its size, frame, and whether it is active.
+NO_WALL = bytes(8 * (3 + 16) + 1)
+
+
+class Answer(NamedTuple):
+    """A reply: to which request, how it ended, and what follows."""
+
+    request: Request
+    status: int
+    payload: bytes = b""
 
 
 class EmulatedRobot:
@@ -49,13 +58,11 @@ class EmulatedRobot:
         missed: commands missing since the start
     """
 
-    def __init__(self, model: ModelLibrary, *, q: np.ndarray, version: int = ROBOT_VERSION) -> None:
+    def __init__(self, model: ModelLibrary, *, q: np.ndarray) -> None:
         self.arm = Arm(model, q=q)
         self.mode = RobotMode.IDLE
         self.ticks = self.missed = 0
         self._model = model
-        self._version = version
-        self._stream = Stream(command="I", status="B")
         self._state = np.zeros((), ROBOT_STATE)
         self._state["EE_T_K"] = self._state["NE_T_EE"] = IDENTITY
         self._state["F_T_NE"] = self.arm.F_T_EE
@@ -84,7 +91,6 @@ class EmulatedRobot:
         """The client has gone: stop, and expect a new one."""
         self.arm.hold()
         self._end_motion()
-        self._stream = Stream(command="I", status="B")
 
     def schedule_reflex(self, name: str, *, after_ticks: int) -> None:
         """Abort by reflex `name` when `after_ticks` more commands have been obeyed."""
@@ -92,7 +98,7 @@ class EmulatedRobot:
             raise InputError(f"reflex: one of {', '.join(ERRORS)}, not {name!r}")
         self._reflex = (name, self.ticks + after_ticks)
 
-    def user_stop(self, pressed: bool) -> bytes:
+    def user_stop(self, pressed: bool) -> Answer | None:
         """Press or release the user stop; returns what the client is told over TCP.
 
         Released, the state looks like any other, but motions are refused until the client has had
@@ -101,111 +107,96 @@ class EmulatedRobot:
         if not pressed:
             if self.mode == RobotMode.USER_STOPPED:
                 self.mode = RobotMode.IDLE
-            return b""
-        reply = self._finish(MoveStatus.EMERGENCY_ABORTED) if self._move else b""
+            return None
+        answer = self._finish(MoveStatus.EMERGENCY_ABORTED) if self._move else None
         self.mode = RobotMode.USER_STOPPED
         self._locked = True
-        return reply
+        return answer
 
-    def receive(self, received: bytes) -> tuple[bytes, int | None]:
-        """Obey commands from TCP; returns the replies and the client's UDP port once known.
+    def obey(self, request: Request) -> list[Answer]:
+        """Obey a command from TCP, or refuse it without harm; returns what the client is told.
 
         Raises:
-            ValueError: the bytes are not of this protocol
+            ValueError: there is no such command
         """
-        replies, port = [], None
-        for request in self._stream.requests(received):
-            if request.command == RobotCommand.CONNECT:
-                version, port = struct.unpack("<2H", request.body)
-                accepted = version == self._version
-                payload = struct.pack("<H", self._version)
-                replies.append(self._reply(request, 0 if accepted else 1, payload))
-                port = port if accepted else None
-            else:
-                replies.append(self._obey(request))
-        return b"".join(replies), port
-
-    def _reply(self, request: Request, status: int, payload: bytes = b"") -> bytes:
-        return self._stream.reply(request.command, request.command_id, status, payload)
-
-    def _obey(self, request: Request) -> bytes:
+        values = read(request, ROBOT_FORMS)
+        if values is None:
+            return [Answer(request, ROBOT_FORMS[request.command].refusal)]
         if request.command == RobotCommand.MOVE:
-            return self._start_motion(request)
+            return [self._start_motion(request, values)]
         if request.command == RobotCommand.STOP_MOVE:
-            ended = self._finish(MoveStatus.PREEMPTED) if self._move else b""
-            return self._reply(request, 0) + ended
+            ended = [self._finish(MoveStatus.PREEMPTED)] if self._move else []
+            return [Answer(request, SetStatus.SUCCESS), *ended]
         if request.command == RobotCommand.AUTOMATIC_ERROR_RECOVERY:
             if self.mode not in (RobotMode.IDLE, RobotMode.REFLEX):
-                return self._reply(request, REJECTED)
+                return [Answer(request, SetStatus.NOT_POSSIBLE)]
             self._state["errors"] = False
             self.mode, self._locked = RobotMode.IDLE, False
-            return self._reply(request, 0)
-        if request.command == RobotCommand.LOAD_MODEL_LIBRARY:
-            return self._reply(request, 0, self._model.binary)
-        if request.command == RobotCommand.GET_CARTESIAN_LIMIT:
-            return self._reply(request, 0, bytes(8 * 22 + 1))
-        if self.moving:
-            return self._reply(request, REJECTED)
-        self._set(request)
-        return self._reply(request, 0)
+        elif request.command == RobotCommand.LOAD_MODEL_LIBRARY:
+            return [Answer(request, SetStatus.SUCCESS, self._model.binary)]
+        elif request.command == RobotCommand.GET_CARTESIAN_LIMIT:
+            return [Answer(request, SetStatus.SUCCESS, NO_WALL)]
+        elif self.moving:
+            return [Answer(request, SetStatus.NOT_POSSIBLE)]
+        else:
+            self._set(request.command, np.array(values, dtype=np.float64))
+        return [Answer(request, SetStatus.SUCCESS)]
 
-    def _set(self, request: Request) -> None:
+    def _set(self, command: int, values: np.ndarray) -> None:
         """Take over the settings that change what is emulated; accept the others."""
-        if request.command == RobotCommand.SET_COLLISION_BEHAVIOR:
-            values = np.frombuffer(request.body, "<f8")
+        if command == RobotCommand.SET_COLLISION_BEHAVIOR:
             self._torque_threshold, self._force_threshold = values[21:28], values[46:52]
-        elif request.command == RobotCommand.SET_NE_TO_EE:
-            NE_T_EE = np.frombuffer(request.body, "<f8")
+        elif command == RobotCommand.SET_NE_TO_EE:
             F_T_NE = self._state["F_T_NE"].reshape(4, 4).T
-            self._state["NE_T_EE"] = NE_T_EE
-            self.arm.F_T_EE = (F_T_NE @ NE_T_EE.reshape(4, 4).T).T.ravel()
+            self._state["NE_T_EE"] = values
+            self.arm.F_T_EE = (F_T_NE @ values.reshape(4, 4).T).T.ravel()
             self.arm.hold()
-        elif request.command == RobotCommand.SET_EE_TO_K:
-            self._state["EE_T_K"] = np.frombuffer(request.body, "<f8")
+        elif command == RobotCommand.SET_EE_TO_K:
+            self._state["EE_T_K"] = values
+        elif command == RobotCommand.SET_LOAD:
+            self._state["m_load"], self._state["F_x_Cload"] = values[0], values[1:4]
+            self._state["I_load"] = values[4:]
 
-    def _start_motion(self, request: Request) -> bytes:
-        controller, generator = struct.unpack_from("<2I", request.body)
+    def _start_motion(self, request: Request, values: tuple[Any, ...]) -> Answer:
         if self.mode != RobotMode.IDLE or self._locked:
-            return self._reply(request, MoveStatus.NOT_POSSIBLE)
-        if controller > ControllerMode.EXTERNAL or generator + 1 not in tuple(GeneratorMode):
-            return self._reply(request, MoveStatus.INVALID_ARGUMENT)
+            return Answer(request, MoveStatus.NOT_POSSIBLE)
         self.arm.hold()
         self._move, self.started, self._missed_in_a_row = request, False, 0
-        self._generator = GeneratorMode(generator + 1)
-        self._controller = ControllerMode(controller)
+        self._answered = []
+        self._controller = ControllerMode(values[0])
+        self._generator = GeneratorMode(values[1] + 1)
         self.mode = RobotMode.MOVE
         self._state["reflex_reason"] = False
-        return self._reply(request, MoveStatus.MOTION_STARTED)
+        return Answer(request, MoveStatus.MOTION_STARTED)
 
-    def _finish(self, status: MoveStatus) -> bytes:
+    def _finish(self, status: MoveStatus) -> Answer:
         """End the motion; returns its second reply."""
         assert self._move is not None
-        reply = self._reply(self._move, status)
+        answer = Answer(self._move, status)
         self.arm.hold()
         self._end_motion()
-        return reply
+        return answer
 
-    def _abort(self, name: str) -> bytes:
+    def _abort(self, name: str) -> Answer:
         self._state["errors"] = self._state["reflex_reason"] = False
         self._state["errors"][ERRORS.index(name)] = True
         self._state["reflex_reason"][ERRORS.index(name)] = True
-        reply = self._finish(MoveStatus.REFLEX_ABORTED)
+        answer = self._finish(MoveStatus.REFLEX_ABORTED)
         self.mode = RobotMode.REFLEX
-        return reply
+        return answer
 
-    def tick(self, datagram: bytes | None) -> bytes:
+    def tick(self, datagram: bytes | None) -> Answer | None:
         """Let 1 ms of a motion pass; returns what the client is to be told over TCP, if anything.
 
         Args:
-            datagram: the client's command for this tick; None where it is missing
+            datagram: the client's command for this tick, as many bytes as one has; None where it
+                is missing
         """
         if self._move is None:
-            return b""
-        command = None
-        if datagram is not None and len(datagram) == ROBOT_COMMAND.itemsize:
-            command = np.frombuffer(datagram, ROBOT_COMMAND)[0]
-        if command is None:
-            return self._miss() if self.started else b""
+            return None
+        if datagram is None:
+            return self._miss() if self.started else None
+        command = np.frombuffer(datagram, ROBOT_COMMAND)[0]
         self._count(True)
         self._missed_in_a_row = 0
         first, self.started = not self.started, True
@@ -219,34 +210,34 @@ class EmulatedRobot:
             return self._abort(violation)
         if command["motion_generation_finished"]:
             return self._finish(MoveStatus.SUCCESS)
-        return b""
+        return None
 
-    def _miss(self) -> bytes:
+    def _miss(self) -> Answer | None:
         """A command is missing: the arm stands still, and after too many the motion is over."""
         self._count(False)
         self.missed += 1
         self._missed_in_a_row += 1
         if self._missed_in_a_row >= MAX_MISSED:
             return self.lose_communication()
-        return b""
+        return None
 
-    def lose_communication(self) -> bytes:
-        """Abort the motion because the client has gone silent; returns the reply."""
+    def lose_communication(self) -> Answer:
+        """Abort the motion because the client has gone silent; returns the answer."""
         return self._abort("communication_constraints_violation")
 
     def _count(self, answered: bool) -> None:
         self._answered = [*self._answered[-RATE_WINDOW + 1 :], answered]
 
-    def feel(self, wrench: np.ndarray) -> bytes:
-        """Take the contact [N, N m] (6,) of this tick; returns the reply of a collision reflex."""
+    def feel(self, wrench: np.ndarray) -> Answer | None:
+        """Take the contact [N, N m] (6,) of this tick; returns the answer of a collision reflex."""
         self.arm.wrench = wrench
         if self._move is None:
-            return b""
+            return None
         if (np.abs(wrench) > self._force_threshold).any():
             return self._abort("cartesian_reflex")
         if (np.abs(self.arm.tau_ext) > self._torque_threshold).any():
             return self._abort("joint_reflex")
-        return b""
+        return None
 
     def state(self, message_id: int) -> bytes:
         """Return the state datagram number `message_id`, which is also its time in [ms]."""

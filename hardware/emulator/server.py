@@ -5,13 +5,14 @@ is what the client's commands make of it, a run gives the same bits every time, 
 as the two processes can. Between motions the client gets states at 1 kHz, but no simulated time
 passes. Paced mode: 1 ms of simulated time every millisecond, whatever the client does.
 
-One client at a time on each port; a second is turned away.
+One client at a time on each port; a second is turned away. What a client sends in error costs it an
+answer that says so, or its connection, and nobody else anything.
 """
 
 from __future__ import annotations
 
+import functools
 import select
-import socket
 import struct
 import time
 from collections.abc import Callable
@@ -24,24 +25,24 @@ from warp_deform.errors import InputError, WarpDeformError
 
 from ..panda_arm import GRIPPER_MAX_WIDTH, HOME_Q
 from .arm import DT
-from .clients import Client, is_loopback, send
+from .clients import Client, Port, is_loopback
 from .gripper import Gripper
 from .model_library import ModelLibrary
 from .protocol import (
     GRIPPER_COMMAND_PORT,
     GRIPPER_VERSION,
+    ROBOT_COMMAND,
     ROBOT_COMMAND_PORT,
     ROBOT_VERSION,
-    GripperCommand,
     Request,
-    Stream,
     pack_gripper_state,
 )
-from .robot import EmulatedRobot
+from .robot import Answer, EmulatedRobot
 from .world import Contact, Hand, World
 
 __all__ = ["AddressTaken", "EmulatorConfig", "FciServer"]
 
+CONNECT = 0  # the first command on either port
 # A client leaves the first state of a motion unanswered: go on after this [s].
 FIRST_STATE_WAIT = 2e-3
 # For the second it may still be starting; repeating states too early would cost determinism [s].
@@ -112,42 +113,32 @@ class FciServer:
     def __init__(self, config: EmulatorConfig, *, model: ModelLibrary, world: World) -> None:
         self._config = config
         self._world = world
-        self.robot = EmulatedRobot(model, q=np.array(config.q), version=config.version)
+        self.robot = EmulatedRobot(model, q=np.array(config.q))
         self.gripper = Gripper(width=config.gripper_width)
         self._contact = Contact()
         self.sim_seconds = 0.0
         self._message_id = 0
-        self._listeners: dict[socket.socket, str] = {}
-        self._clients: dict[str, Client] = {}
-        self._gripper_stream = Stream(command="H", status="H")
         self._command: bytes | None = None
         self._states_unanswered = 0
         self._deadline = 0.0
         self._next_tick = self._next_gripper_state = time.perf_counter()
         self._running = True
+        self._ports: list[Port] = []
         try:
-            for name, port in (("robot", ROBOT_COMMAND_PORT), ("gripper", GRIPPER_COMMAND_PORT)):
-                self._listen(name, port)
+            for number, codes in ((ROBOT_COMMAND_PORT, "IB"), (GRIPPER_COMMAND_PORT, "HH")):
+                self._ports.append(Port(config.host, number, command=codes[0], status=codes[1]))
         except OSError as error:
             self.close()
             raise AddressTaken(
                 f"cannot listen on {config.host}: {error.strerror}; stop the other emulator or "
                 "choose another --host, such as 127.0.0.2"
             ) from error
-
-    def _listen(self, name: str, port: int) -> None:
-        listener = socket.socket()
-        self._listeners[listener] = name
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((self._config.host, port))
-        listener.listen()
+        self._robot_port, self._gripper_port = self._ports
 
     def close(self) -> None:
         """Close every socket."""
-        for client in self._clients.values():
-            client.close()
-        for listener in self._listeners:
-            listener.close()
+        for port in self._ports:
+            port.close()
 
     def serve(self, control: Control | None = None) -> None:
         """Serve until `control` says "stop" or closes; without one, for ever."""
@@ -161,21 +152,32 @@ class FciServer:
     # What arrives.
 
     def _receive(self, control: Control | None) -> None:
-        sources: list[Any] = [*self._listeners]
-        for client in self._clients.values():
-            sources += [client.tcp, client.udp]
+        # In this order: who leaves makes room for who comes.
+        acts: dict[Any, Callable[[], None]] = {}
+        unwritten: dict[Any, Client] = {}
         if control is not None:
-            sources.append(control)
+            acts[control] = functools.partial(self._answer, control)
+        for port in self._ports:
+            for connection in port.connections:
+                acts[connection.tcp] = functools.partial(self._read, port, connection)
+                if connection.waits_to_be_written:
+                    unwritten[connection.tcp] = connection
+        robot = self._robot_port.client
+        if robot is not None and robot.udp is not None:
+            acts[robot.udp] = functools.partial(self._take_command, robot)
+        for port in self._ports:
+            acts[port.listener] = port.accept
         wait = max(self._wake() - time.perf_counter(), 0.0)
-        ready = select.select(sources, [], [], wait)[0]
-        # Who leaves makes room for who comes.
-        for source in sorted(ready, key=lambda source: source in self._listeners):
-            if source is control:
-                self._answer(control)
-            elif source in self._listeners:
-                self._accept(source)
-            else:
-                self._read(source)
+        readable, writable, _ = select.select(list(acts), list(unwritten), [], wait)
+        for source in writable:
+            unwritten[source].write()
+        ready = set(readable)
+        for source, act in acts.items():
+            if source in ready:
+                act()
+        for port in self._ports:
+            for connection in port.overdue(time.perf_counter()):
+                self._drop(port, connection)
 
     def _wake(self) -> float:
         """When something has to be done even if nothing arrives, by the wall clock [s]."""
@@ -186,68 +188,62 @@ class FciServer:
                 return 0.0
         return self._next_tick
 
-    def _accept(self, listener: socket.socket) -> None:
-        tcp, address = listener.accept()
-        name = self._listeners[listener]
-        if name in self._clients:
-            tcp.close()
-            return
-        self._clients[name] = Client(tcp, address, self._config.host)
+    def _take_command(self, client: Client) -> None:
+        """Keep what answers the state that was sent last, and nothing else."""
+        datagram = client.datagram()
+        if len(datagram) == ROBOT_COMMAND.itemsize and self._command is None:
+            if struct.unpack_from("<Q", datagram)[0] == self._message_id:
+                self._command = datagram
 
-    def _read(self, source: socket.socket) -> None:
-        for name, client in list(self._clients.items()):
-            if source is client.udp:
-                datagram = client.udp.recv(65536)
-                if name == "robot":
-                    self._command = datagram
-            elif source is client.tcp:
-                self._read_tcp(name, client)
-
-    def _read_tcp(self, name: str, client: Client) -> None:
-        handle = self._robot_requests if name == "robot" else self._gripper_requests
+    def _read(self, port: Port, connection: Client) -> None:
+        """Obey what has come over TCP; whoever sends what is no request is dropped."""
         try:
-            received = client.tcp.recv(65536)
-            if received:
-                handle(client, received)
-                return
-        except (OSError, ValueError, struct.error):
-            pass  # a connection reset, or bytes that are no request: the client is dropped
-        client.close()
-        del self._clients[name]
-        if name == "robot":
+            for request in connection.requests():
+                if connection is not port.client:
+                    self._greet(port, connection, request)
+                elif port is self._robot_port:
+                    self._obey_robot_request(connection, request)
+                else:
+                    self._obey_gripper_request(connection, request)
+        except (OSError, ValueError):
+            self._drop(port, connection)
+
+    def _greet(self, port: Port, connection: Client, request: Request) -> None:
+        """Let in who speaks the version of this port and comes first.
+
+        Raises:
+            OSError: the client has gone
+            ValueError: this is no greeting
+        """
+        version = self._config.version if port is self._robot_port else GRIPPER_VERSION
+        if request.command != CONNECT or len(request.body) != 4 or connection.turned_away:
+            raise ValueError("whoever connects says so first, and once")
+        claimed, udp_port = struct.unpack("<2H", request.body)
+        connection.turned_away = claimed != version
+        if not connection.turned_away:
+            connection.connect_udp(udp_port)
+            port.let_in(connection)
+        connection.reply(request, int(connection.turned_away), struct.pack("<H", version))
+
+    def _drop(self, port: Port, connection: Client) -> None:
+        if not port.drop(connection):
+            return
+        if port is self._robot_port:
             self.robot.disconnect()
         else:
-            self._gripper_stream = Stream(command="H", status="H")
+            self.gripper.abandon()
 
-    def _robot_requests(self, client: Client, received: bytes) -> None:
+    def _obey_robot_request(self, client: Client, request: Request) -> None:
         was_moving = self.robot.moving
-        replies, udp_port = self.robot.receive(received)
-        client.tcp.sendall(replies)
-        if udp_port is not None:
-            client.connect_udp(udp_port)
+        for answer in self.robot.obey(request):
+            client.reply(*answer)
         if self.robot.moving and not was_moving:
             self._command, self._states_unanswered = None, 0
             self._send_robot_state(time.perf_counter())
 
-    def _gripper_requests(self, client: Client, received: bytes) -> None:
-        for request in self._gripper_stream.requests(received):
-            if request.command == GripperCommand.CONNECT:
-                version, port = struct.unpack("<2H", request.body)
-                accepted = version == GRIPPER_VERSION
-                self._reply_gripper(
-                    request, 0 if accepted else 1, struct.pack("<H", GRIPPER_VERSION)
-                )
-                if accepted:
-                    client.connect_udp(port)
-                continue
-            for ended, status in self.gripper.start(request):
-                self._reply_gripper(ended, status)
-
-    def _reply_gripper(self, request: Request, status: int, payload: bytes = b"") -> None:
-        client = self._clients.get("gripper")
-        if client is not None:
-            frame = self._gripper_stream.reply(request.command, request.command_id, status, payload)
-            send(client.tcp, frame)
+    def _obey_gripper_request(self, client: Client, request: Request) -> None:
+        for ended, status in self.gripper.start(request):
+            client.reply(ended, status)
 
     # What time brings.
 
@@ -285,19 +281,19 @@ class FciServer:
             Hand(arm.base_T_tcp, arm.twist[:3], self.gripper.width, self.gripper.closing, DT)
         )
         self._tell_robot(self.robot.feel(np.array(self._contact.wrench, dtype=np.float64)))
-        if ended is not None:
+        if ended is not None and self._gripper_port.client is not None:
             self._send_gripper_state()
-            self._reply_gripper(*ended)
+            self._gripper_port.client.reply(*ended)
 
-    def _tell_robot(self, reply: bytes) -> None:
-        """Send a reply that ends a motion; a state that shows the end goes before it."""
-        if reply and "robot" in self._clients:
+    def _tell_robot(self, answer: Answer | None) -> None:
+        """Send the reply that ends a motion; a state that shows the end goes before it."""
+        if answer is not None and self._robot_port.client is not None:
             self._send_robot_state(time.perf_counter())
-            send(self._clients["robot"].tcp, reply)
+            self._robot_port.client.reply(*answer)
 
     def _send_robot_state(self, now: float) -> None:
-        client = self._clients.get("robot")
-        if client is None or client.udp_address is None:
+        client = self._robot_port.client
+        if client is None:
             return
         self._message_id += 1
         client.send_state(self.robot.state(self._message_id))
@@ -306,7 +302,7 @@ class FciServer:
         self._deadline = now + (SILENCE if self.robot.started else wait)
 
     def _send_gripper_state(self) -> None:
-        client = self._clients.get("gripper")
+        client = self._gripper_port.client
         if client is not None:
             gripper = self.gripper
             client.send_state(
