@@ -14,12 +14,14 @@ from itertools import pairwise
 
 import numpy as np
 
-__all__ = ["path_pieces"]
+__all__ = ["SHARP", "corner_cuts", "path_pieces"]
 
 # Joints that differ by less than this repeat the way-point [rad].
 STANDSTILL = 1e-3
-# Cosine of the turn between two steps beyond which the arm comes to rest between them: 30 degrees.
 SHARP = 0.87
+"""Cosine of the turn between two steps beyond which the arm comes to rest between them: 30 deg."""
+# How far the vendor's planner may leave a corner that it rounds [rad].
+_ROUNDED = 0.02
 
 
 def path_pieces(start: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -40,8 +42,34 @@ def path_pieces(start: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray,
     if len(kept) == 1:
         return []
     kept[-1] = points[-1]  # at most STANDSTILL away
+    while len(kept) > 1 and np.abs(kept[-1] - kept[-2]).max() <= STANDSTILL:
+        if len(kept) == 2:
+            return []
+        del kept[-2]
     steps = np.diff(kept, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
     corners = np.flatnonzero((steps[1:] * steps[:-1]).sum(axis=1) < SHARP) + 1
     bounds = [0, *corners.tolist(), len(kept) - 1]
     return [(kept[i], np.array(kept[i + 1 : j + 1])) for i, j in pairwise(bounds)]
+
+
+def corner_cuts(path: np.ndarray) -> list[np.ndarray]:
+    """Return the chords (2, 7) across the corners of a path (N, 7) [rad] that may be rounded.
+
+    What is executed there lies between the corner and its chord.
+    """
+    steps = np.diff(path, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    units = steps / lengths[:, None]
+    cuts = []
+    for i in range(len(steps) - 1):
+        cosine = float(units[i] @ units[i + 1])
+        half = 0.5 * np.arccos(np.clip(cosine, -1.0, 1.0))
+        if cosine < SHARP or half < 1e-6:
+            continue
+        reach = min(
+            0.5 * lengths[i], 0.5 * lengths[i + 1], _ROUNDED * np.sin(half) / (1.0 - np.cos(half))
+        )
+        corner = path[i + 1]
+        cuts.append(np.array([corner - reach * units[i], corner + reach * units[i + 1]]))
+    return cuts

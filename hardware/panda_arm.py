@@ -36,6 +36,8 @@ Q_MAX = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])  # [
 DQ_MAX = np.array([2.175] * 4 + [2.61] * 3)  # [rad/s]
 DDQ_MAX = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])  # [rad/s^2]
 TAU_MAX = np.array([87.0] * 4 + [12.0] * 3)  # [N m]
+for _limit in (Q_MIN, Q_MAX, DQ_MAX, DDQ_MAX, TAU_MAX):
+    _limit.flags.writeable = False  # whoever writes into them would move the limits of all
 # The vendor's ready pose: the hand points straight down, 0.31 m ahead and 0.49 m up.
 HOME_Q = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)
 GRIPPER_MAX_WIDTH = 0.08  # [m]

@@ -6,6 +6,7 @@ connection never move the arm. The command methods block until the motion has en
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol, runtime_checkable
@@ -57,10 +58,25 @@ class MoveResult:
     Attributes:
         base_T_tcp: the measured pose [m], shape (4, 4)
         contact: whether the force limit ended it before its target
+        slowed_to: greatest speed of the TCP [m/s] where a limit left less than was commanded
     """
 
     base_T_tcp: np.ndarray
     contact: bool
+    slowed_to: float | None = None
+
+
+@dataclass(frozen=True)
+class JointMoveResult:
+    """How a motion in joint space was made.
+
+    Attributes:
+        speed: share of the joints' greatest speeds
+        slowed: whether that is less than was commanded, for the sake of the TCP's speed
+    """
+
+    speed: float
+    slowed: bool
 
 
 RECOVER = "recover: press Enter if asked, else start the command again (from Python: recover())"
@@ -187,8 +203,8 @@ class Robot(Closing, Protocol):
     def move_joints(self, q: np.ndarray, *, speed: float) -> None:
         """Move through joint way-points to the last one.
 
-        The arm comes to rest where the path turns by more than 30 degrees; gentler corners may be
-        rounded a little.
+        Between two of them the joints move in proportion. The arm comes to rest where the path
+        turns by more than 30 degrees; gentler corners may be rounded, by at most 0.02 rad.
 
         Args:
             q: joint positions [rad], one way-point (7,) or several (N, 7)
@@ -237,14 +253,17 @@ class Robot(Closing, Protocol):
         ...
 
     def stop(self) -> None:
-        """End the motion in progress, if any; the gripper keeps what it has. From any thread."""
+        """End the motion in progress, if any; the gripper keeps what it has. From any thread.
+
+        It holds: every later motion is refused with a `MotionError` until `recover`.
+        """
         ...
 
     def recover(self) -> None:
         """Have the robot recover from what stopped it, so that it accepts motions; moves nothing.
 
-        Needed after a reflex and after a user stop, also where the state does not show that any
-        more; harmless otherwise.
+        Needed after a reflex, after `stop`, and after a user stop, also where the state does not
+        show that any more; harmless otherwise. A `stop` that comes meanwhile holds.
 
         Raises:
             UserStopped: the user stop is pressed
@@ -272,13 +291,47 @@ class HomesGripper(Protocol):
         ...
 
 
-def check_joints(q: np.ndarray) -> np.ndarray:
-    """Return joint way-points [rad] as (N, 7) float64.
+def check_number(name: str, value: object) -> float:
+    """Return a real number, which may be infinite or not a number at all: ranges refuse those.
 
     Raises:
-        InputError: wrong shape, not finite, or beyond the joint limits
+        InputError: it is a bool, text, None, complex, an array or anything else
     """
-    points = np.atleast_2d(np.asarray(q, dtype=np.float64))
+    real = isinstance(value, (int, float, np.integer, np.floating))
+    if not real or isinstance(value, bool):
+        raise InputError(f"{name}: a number is needed, not {shown(value)}")
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except OverflowError as error:
+        raise InputError(f"{name}: {shown(value)} is beyond any number that is meant") from error
+
+
+def shown(value: object) -> str:
+    """Return a value in a few words on one line, for a message."""
+    return f"{type(value).__name__} {' '.join(reprlib.repr(value).split())}"
+
+
+def _numbers(name: str, value: object) -> np.ndarray:
+    """Return a float64 copy of real numbers: whoever holds `value` may write into it meanwhile."""
+    try:
+        array = np.array(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{name}: an array of numbers is needed, not {shown(value)}; its rows must be as long "
+            "as each other"
+        ) from error
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{name}: an array of real numbers is needed, not {shown(value)}")
+    return array.astype(np.float64)
+
+
+def check_joints(q: np.ndarray) -> np.ndarray:
+    """Return joint way-points [rad] as a copy (N, 7), float64.
+
+    Raises:
+        InputError: no real numbers, wrong shape, not finite, or beyond the joint limits
+    """
+    points = np.atleast_2d(_numbers("q", q))
     if points.ndim != 2 or points.shape[1] != 7 or not len(points):
         raise InputError(f"q: shape (7,) or (N, 7), not {np.shape(q)}")
     if not np.isfinite(points).all():
@@ -294,17 +347,20 @@ def check_joints(q: np.ndarray) -> np.ndarray:
 
 
 def check_pose(base_T_tcp: np.ndarray) -> np.ndarray:
-    """Return a pose as (4, 4) float64.
+    """Return a pose as a copy (4, 4), float64.
 
     Raises:
-        InputError: no rigid transform
+        InputError: no real numbers, or no rigid transform
     """
-    T = np.asarray(base_T_tcp, dtype=np.float64)
+    T = _numbers("base_T_tcp", base_T_tcp)
     if T.shape != (4, 4):
         raise InputError(f"base_T_tcp: shape (4, 4), not {T.shape}")
+    if not np.isfinite(T).all():
+        raise InputError("base_T_tcp: its numbers must be finite")
     R = T[:3, :3]
-    rigid = np.allclose(R.T @ R, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0.0
-    if not (np.isfinite(T).all() and rigid and np.array_equal(T[3], [0, 0, 0, 1])):
+    # An entry of a rotation is at most 1; the product of huge ones would overflow.
+    rigid = np.abs(R).max() < 2.0 and np.allclose(R.T @ R, np.eye(3), atol=1e-6)
+    if not (rigid and np.linalg.det(R) > 0.0 and np.array_equal(T[3], [0, 0, 0, 1])):
         raise InputError("base_T_tcp: not a rigid transform; its rotation must be orthonormal")
     return T
 
@@ -313,8 +369,9 @@ def check_range(name: str, value: float, *, low: float, high: float, unit: str) 
     """Return `value`.
 
     Raises:
-        InputError: it is not above `low` and at most `high`
+        InputError: it is no number, or not above `low` and at most `high`
     """
-    if not low < value <= high:
+    number = check_number(name, value)
+    if not low < number <= high:
         raise InputError(f"{name}: above {low} and at most {high} {unit}, not {value}")
-    return float(value)
+    return number

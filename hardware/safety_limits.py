@@ -16,6 +16,7 @@ import numpy as np
 from warp_deform.errors import InputError
 
 from .panda_arm import Q_MAX, Q_MIN
+from .robot import check_number, shown
 from .table_plane import TablePlane
 
 __all__ = [
@@ -39,6 +40,7 @@ HAND_POINTS = np.array(
     [[x, y, FINGERTIP_BELOW_TCP, 1.0] for x in (-0.01, 0.01) for y in (-0.05, 0.05)]
     + [[x, y, -0.045, 1.0] for x in (-0.032, 0.032) for y in (-0.102, 0.102)]
 )
+HAND_POINTS.flags.writeable = False
 """Corners of the open fingers' tips and of the hand's lower face in the TCP frame [m], (8, 4)."""
 LIMIT_NAMES = (
     "workspace x, low side",
@@ -73,11 +75,12 @@ class SafetyLimits:
     max_tilt_rad: float = 0.52
     """How far the hand may lean from straight down: calibration needs 25 degrees."""
     max_joint_speed: float = 0.05
-    """Share of the joints' greatest speeds; a first run's value. At most 0.2."""
+    """Share of the joints' greatest speeds in joint space; a first run's value. At most 0.2."""
     max_speed: float = 0.10
-    """Speed of the TCP on a straight line [m/s]. At most 0.25, the reduced speed of ISO 10218-1."""
+    """Speed of the TCP [m/s]. At most 0.25, the reduced speed of ISO 10218-1."""
     max_descent_speed: float = 0.05
-    """Speed of the TCP on a straight line that goes down [m/s]. At most 0.05."""
+    """Speed of the TCP downwards, and of a straight line that ends lower than it begins [m/s]. At
+    most 0.05."""
     contact_height_m: float = 0.05
     """Below this height above the table nothing goes down but a straight line that stops on
     contact."""
@@ -115,13 +118,13 @@ class SafetyLimits:
             "max_recoveries": (0, 10),
         }
         for name, (low, high) in ranges.items():
-            value = getattr(self, name)
+            value = check_number(f"safety limit {name}", getattr(self, name))
             if not low <= value <= high:  # also when it is not a number
                 raise InputError(f"safety limit {name} is {value}; allowed: {low} to {high}")
         for name in ("x", "y"):
-            low, high = getattr(self, name)
-            if not (math.isfinite(low) and math.isfinite(high) and low < high):
-                raise InputError(f"safety limit {name} is ({low}, {high}); give (low, high) [m]")
+            object.__setattr__(self, name, _interval(name, getattr(self, name)))
+        if not isinstance(self.table, TablePlane):
+            raise InputError(f"safety limit table: a TablePlane is needed, not {shown(self.table)}")
 
     @property
     def q_min(self) -> np.ndarray:
@@ -158,6 +161,16 @@ class SafetyLimits:
             ],
             axis=1,
         )
+
+
+def _interval(name: str, value: object) -> tuple[float, float]:
+    """Return two numbers in their order, as a tuple that nobody can write into."""
+    if not isinstance(value, (tuple, list, np.ndarray)) or len(value) != 2:
+        raise InputError(f"safety limit {name} is {shown(value)}; give (low, high) [m]")
+    low, high = (check_number(f"safety limit {name}", end) for end in value)
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise InputError(f"safety limit {name} is ({low}, {high}); give (low, high) [m]")
+    return low, high
 
 
 def dense_path(points: np.ndarray) -> np.ndarray:

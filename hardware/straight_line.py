@@ -14,7 +14,8 @@ from typing import Protocol
 
 import numpy as np
 
-from .panda_arm import DQ_MAX, HOME_Q, Q_MAX, Q_MIN
+from .panda_arm import HOME_Q, Q_MAX, Q_MIN
+from .path_speed import OVERSHOOT, fitting_share
 from .robot import UnreachablePose
 
 __all__ = ["Kinematics", "StraightLine", "distance", "straight_line"]
@@ -30,10 +31,6 @@ ITERATIONS = 30
 DAMPING = 1e-8
 # Greatest motion towards the rest posture in one way-point [rad].
 REST_STEP = 0.02
-# Speed at which the TCP turns, at most [rad/s].
-MAX_TURN_SPEED = 0.5
-# The vendor's controller overshoots the planned speed by up to 16 % when it sets off.
-OVERSHOOT = 1.2
 
 
 class Kinematics(Protocol):
@@ -81,15 +78,9 @@ def straight_line(
             target[:3, 3] = (1 - share) * start[:3, 3] + share * base_T_tcp[:3, 3]
             target[:3, :3] = _rotation(share * axis) @ start[:3, :3]
         points.append(_solve(kinematics, points[-1], target))
-    steps = np.abs(np.diff(points, axis=0))
-    # Seconds that each step takes when the slowest joint goes at its greatest speed.
-    seconds = (steps / DQ_MAX).max(axis=1)
-    tcp_speed = length / count / np.maximum(seconds, 1e-12)
-    turn_speed = turn / count / np.maximum(seconds, 1e-12)
-    share = min(
-        speed / max(tcp_speed.max(), 1e-12), MAX_TURN_SPEED / max(turn_speed.max(), 1e-12), 1.0
-    )
-    return StraightLine(np.array(points[1:]), float(share) / OVERSHOOT)
+    path = np.array(points)
+    poses = np.array([start, *(kinematics.pose(point) for point in points[1:])])
+    return StraightLine(path[1:], min(fitting_share(path, poses, max_speed=speed), 1.0 / OVERSHOOT))
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:

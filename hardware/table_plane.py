@@ -9,6 +9,8 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
+from .robot import check_number
+
 __all__ = ["MAX_SLOPE", "TablePlane", "fit_table_plane"]
 
 MAX_SLOPE = 0.05
@@ -33,6 +35,8 @@ class TablePlane:
     slope_y: float = 0.0
 
     def __post_init__(self) -> None:
+        for name in ("height_m", "slope_x", "slope_y"):
+            check_number(f"the table's {name}", getattr(self, name))
         values = (self.height_m, self.slope_x, self.slope_y)
         if not all(math.isfinite(value) for value in values):
             raise InputError(f"the table's plane {values} is not finite; touch it off again")

@@ -28,6 +28,7 @@ from hardware.backends.franka_config import NetworkedConfig
 from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.panda_arm import PandaKinematics
+from hardware.stop_latch import StopLatch
 from hardware.straight_line import distance
 from warp_deform.errors import InputError
 
@@ -288,6 +289,7 @@ class SaidLink:
 
     def __init__(self, mode: str, errors: str = "[]") -> None:
         self.mode, self.errors, self.limits = mode, errors, []
+        self.latch = StopLatch()
 
     def read(self) -> SimpleNamespace:
         errors = None if self.errors == "[]" else self.errors
@@ -341,7 +343,18 @@ def test_stop_from_another_thread(emulator: EmulatorProcess, robot: PandaRobot) 
     error = motion.join()
     assert isinstance(error, MotionError) and "preempted" in str(error)
     assert np.abs(emulator.snapshot()["q"] - OFF_HOME).max() > 0.1
-    robot.stop()  # harmless at rest
+    robot.stop()  # harmless at rest, and it holds
+    stopped = emulator.snapshot()["q"]
+    for call in (
+        lambda: robot.move_joints(HOME, speed=0.5),
+        lambda: robot.move_linear(ABOVE_TABLE, speed=0.1),
+        robot.open_gripper,
+        lambda: robot.grasp(width_m=0.01, force_N=5.0),
+    ):
+        with pytest.raises(MotionError, match="holds until recover"):
+            call()
+    np.testing.assert_array_equal(emulator.snapshot()["q"], stopped)
+    robot.recover()
     robot.move_joints(HOME, speed=0.5)
 
 
@@ -397,6 +410,7 @@ def test_ctrl_c_stops_the_arm(emulator: EmulatorProcess, robot: PandaRobot) -> N
     assert watcher.join() is None
     assert np.abs(emulator.snapshot()["q"] - OFF_HOME).max() > 0.1
     assert emulator.snapshot()["mode"] == "idle"
+    robot.recover()
     robot.move_joints(HOME, speed=0.5)
 
 

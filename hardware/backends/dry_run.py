@@ -21,6 +21,7 @@ from ..robot import (
     check_pose,
     check_range,
 )
+from ..stop_latch import StopLatch
 from ..straight_line import straight_line
 
 __all__ = ["DryRunConfig", "DryRunRobot", "RecordedCommand"]
@@ -74,6 +75,7 @@ class DryRunRobot(Closing):
         self._kinematics = PandaKinematics()
         self._q = check_joints(np.array(self.config.q))[0]
         self._width = self.config.gripper_width_m
+        self._latch = StopLatch()
 
     def _record(self, name: str, **arguments: Any) -> None:
         command = RecordedCommand(name, arguments)
@@ -95,6 +97,7 @@ class DryRunRobot(Closing):
         """Record joint way-points; see `Robot.move_joints`."""
         points = check_joints(q)
         check_range("speed", speed, low=0.0, high=1.0, unit="of the greatest speed")
+        self._latch.check()
         self._record("move_joints", q=points, speed=speed)
         self._q = points[-1].copy()
 
@@ -104,6 +107,7 @@ class DryRunRobot(Closing):
         """Plan a straight line as the arm would, and record it; see `Robot.move_linear`."""
         target = check_pose(base_T_tcp)
         check_range("speed", speed, low=0.0, high=1.7, unit="m/s")
+        self._latch.check()
         plan = straight_line(self._kinematics, self._q, target, speed=speed)
         self._record("move_linear", base_T_tcp=target, speed=speed, stop_force_N=stop_force_N)
         self._q = plan.q[-1].copy()
@@ -112,6 +116,7 @@ class DryRunRobot(Closing):
     def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:
         """Record an opening; see `Robot.open_gripper`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
+        self._latch.check()
         self._record("open_gripper", width_m=width_m)
         self._width = width_m
 
@@ -119,16 +124,19 @@ class DryRunRobot(Closing):
         """Record a grasp, which finds what the configuration says; see `Robot.grasp`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
         check_range("force_N", force_N, low=0.0, high=70.0, unit="N")
+        self._latch.check()
         self._record("grasp", width_m=width_m, force_N=force_N)
         self._width = min(self.config.object_width_m, self._width)
         return self._width > 0.0
 
     def stop(self) -> None:
-        """Record a stop."""
+        """Record a stop; later motions are refused until `recover`."""
+        self._latch.press()
         self._record("stop")
 
     def recover(self) -> None:
-        """Record a recovery."""
+        """Record a recovery; clears a stop."""
+        self._latch.release(self._latch.mark())
         self._record("recover")
 
     def close(self) -> None:

@@ -126,6 +126,7 @@ class PandaRobot(Closing):
     def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:
         """Move the fingers; see `Robot.open_gripper`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
+        self._link.latch.check()
         if not self._link.finger(lambda hand: hand.move(width_m, self.config.gripper_speed)):
             raise GraspError(f"the fingers did not open to {width_m} m")
 
@@ -135,6 +136,7 @@ class PandaRobot(Closing):
         Raises:
             GraspError: they did not get through
         """
+        self._link.latch.check()
         if not self._link.finger(lambda hand: hand.homing()):
             raise GraspError("the fingers could not be homed")
 
@@ -142,6 +144,7 @@ class PandaRobot(Closing):
         """Close the fingers; see `Robot.grasp`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
         check_range("force_N", force_N, low=0.0, high=70.0, unit="N")
+        self._link.latch.check()
         speed = self.config.gripper_speed
         self._link.finger(lambda hand: hand.grasp(width_m, speed, force_N, WIDE, WIDE))
         width = self._link.width()
@@ -156,6 +159,7 @@ class PandaRobot(Closing):
 
         It takes up to some ten seconds, during which Python's threads stand still.
         """
+        mark = self._link.latch.mark()
         mode = self._mode(self._link.read())
         if mode == RobotMode.USER_STOPPED:
             raise UserStopped("the user stop is pressed")
@@ -174,6 +178,7 @@ class PandaRobot(Closing):
         if reading.current_errors:
             raise self._errors(reading, advice=by_hand)
         self._set_collision_force(self.config.collision_force_N)
+        self._link.latch.release(mark)
 
     def close(self) -> None:
         """End the connection; see `Robot.close`."""
@@ -200,6 +205,7 @@ class PandaRobot(Closing):
         a call to recover().
         """
         reading = self._link.read()
+        self._link.latch.check()
         mode = self._mode(reading)
         if mode == RobotMode.USER_STOPPED:
             raise UserStopped("the user stop is pressed")
@@ -218,10 +224,9 @@ class PandaRobot(Closing):
         """Go through `points` (N, 7) and check that the TCP arrived (at `target`)."""
         start = np.array(self._ready().q)
         target = self.pose(points[-1]) if target is None else target
-        self._link.stopped = False
         for begin, piece in path_pieces(start, points):
             for left in reversed(range(STARTS)):
-                if self._link.stopped:
+                if self._link.latch.pressed:
                     raise MotionError("the motion was stopped before its last way-point")
                 try:
                     self._link.follow(begin, piece, factor)

@@ -28,6 +28,7 @@ from ..robot import (
     MotionError,
     RobotError,
 )
+from ..stop_latch import StopLatch
 from .bounded import POLL, run_bounded
 from .franka_config import NetworkedConfig
 from .libfranka_errors import typed_error
@@ -57,7 +58,7 @@ class PandaLink:
 
     Attributes:
         host: the robot's address
-        stopped: whether `stop` was called; whoever begins a path sets it back
+        latch: pressed by `stop`; no motion begins before it is released
         frames: F_T_EE and EE_T_K as the vendor's model takes them, 16 numbers each
 
     Raises:
@@ -78,7 +79,8 @@ class PandaLink:
         logging.getLogger("panda").addHandler(logging.NullHandler())
         logging.getLogger("motion").addHandler(logging.NullHandler())
         self._closed = self._lost = False
-        self._following = self.stopped = False
+        self._following = False
+        self.latch = StopLatch()
         self._ended = threading.Event()
         self._begun = 0.0
         self._reading = threading.Lock()
@@ -209,6 +211,8 @@ class PandaLink:
                 self._ended.set()
 
         try:
+            # Here a stop that came too early to see the motion under way is seen.
+            self.latch.check()
             ok = run_bounded(
                 move,
                 timeout_s=2.0 * float(longest.sum()) + PLANNING_TIMEOUT,
@@ -261,12 +265,12 @@ class PandaLink:
             logging.getLogger(__name__).info("an earlier motion ended with: %s", error)
 
     def stop(self) -> None:
-        """End the motion in progress, if any; from any thread.
+        """End the motion in progress, if any, and let none begin; from any thread.
 
         Raises:
             ConnectionLost: the robot is silent
         """
-        self.stopped = True
+        self.latch.press()
         until = time.monotonic() + PLANNING_TIMEOUT
         self.command(lambda robot: robot.stop())
         # While the vendor still plans a motion a stop does nothing, and then the arm would set out.

@@ -7,7 +7,6 @@ not simulated: the arm's dynamics (for those run the vendor's client on `hardwar
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +27,7 @@ from ..robot import (
     check_pose,
     check_range,
 )
+from ..stop_latch import StopLatch
 from ..straight_line import straight_line
 
 __all__ = ["SimRobot", "SimRobotConfig"]
@@ -74,7 +74,7 @@ class SimRobot(Closing):
         self._pressing = False
         self._contact = Contact()
         self._mode = RobotMode.IDLE
-        self._stop = threading.Event()
+        self._latch = StopLatch()
         self._closed = False
 
     def state(self) -> RobotState:
@@ -112,6 +112,7 @@ class SimRobot(Closing):
         """Move the fingers; see `Robot.open_gripper`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
         self._check_open()
+        self._latch.check()
         self._pressing = False
         if not self._fingers(width_m):
             raise GraspError(f"the fingers did not get to {width_m} m: something is between them")
@@ -121,19 +122,22 @@ class SimRobot(Closing):
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
         check_range("force_N", force_N, low=0.0, high=70.0, unit="N")
         self._check_open()
+        self._latch.check()
         self._pressing = True
         self._fingers(0.0)
         self._tick()  # what the fingers have reached, they grip
         return self.config.min_held_m < self._width <= width_m + self.config.held_tolerance_m
 
     def stop(self) -> None:
-        """End the motion in progress; see `Robot.stop`."""
-        self._stop.set()
+        """End the motion in progress, and let none begin until `recover`; see `Robot.stop`."""
+        self._latch.press()
 
     def recover(self) -> None:
-        """Clear a reflex; see `Robot.recover`."""
+        """Clear a reflex and a stop; see `Robot.recover`."""
+        mark = self._latch.mark()
         self._check_open()
         self._mode = RobotMode.IDLE
+        self._latch.release(mark)
 
     def close(self) -> None:
         """Accept nothing more."""
@@ -175,7 +179,7 @@ class SimRobot(Closing):
     def _move(self, points: np.ndarray, factor: float, stop_force: float | None) -> bool:
         """Go through `points` (N, 7); returns whether contact ended it."""
         self._check_ready()
-        self._stop.clear()
+        self._latch.check()
         force = self._force()
         for begin, piece in path_pieces(self._q, points):
             for q, pose in self._samples(np.vstack([begin, piece]), factor):
@@ -186,7 +190,7 @@ class SimRobot(Closing):
                 finally:
                     self._mode = RobotMode.IDLE
                 before, force = force, self._force()
-                if self._stop.is_set():
+                if self._latch.pressed:
                     raise MotionError("the motion was stopped")
                 if force <= before:
                     continue  # an arm that leaves what it touches is not stopped
