@@ -343,19 +343,7 @@ def test_stop_from_another_thread(emulator: EmulatorProcess, robot: PandaRobot) 
     error = motion.join()
     assert isinstance(error, MotionError) and "preempted" in str(error)
     assert np.abs(emulator.snapshot()["q"] - OFF_HOME).max() > 0.1
-    robot.stop()  # harmless at rest, and it holds
-    stopped = emulator.snapshot()["q"]
-    for call in (
-        lambda: robot.move_joints(HOME, speed=0.5),
-        lambda: robot.move_linear(ABOVE_TABLE, speed=0.1),
-        robot.open_gripper,
-        lambda: robot.grasp(width_m=0.01, force_N=5.0),
-    ):
-        with pytest.raises(MotionError, match="holds until recover"):
-            call()
-    np.testing.assert_array_equal(emulator.snapshot()["q"], stopped)
-    robot.recover()
-    robot.move_joints(HOME, speed=0.5)
+    robot.stop()  # harmless at rest
 
 
 class Planning:
@@ -410,8 +398,8 @@ def test_ctrl_c_stops_the_arm(emulator: EmulatorProcess, robot: PandaRobot) -> N
     assert watcher.join() is None
     assert np.abs(emulator.snapshot()["q"] - OFF_HOME).max() > 0.1
     assert emulator.snapshot()["mode"] == "idle"
-    robot.recover()
-    robot.move_joints(HOME, speed=0.5)
+    with pytest.raises(MotionError, match="holds until recover"):
+        robot.open_gripper()
 
 
 def test_lock_step_gives_the_same_bits_twice() -> None:

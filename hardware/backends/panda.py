@@ -126,7 +126,6 @@ class PandaRobot(Closing):
     def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:
         """Move the fingers; see `Robot.open_gripper`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
-        self._link.latch.check()
         if not self._link.finger(lambda hand: hand.move(width_m, self.config.gripper_speed)):
             raise GraspError(f"the fingers did not open to {width_m} m")
 
@@ -136,7 +135,6 @@ class PandaRobot(Closing):
         Raises:
             GraspError: they did not get through
         """
-        self._link.latch.check()
         if not self._link.finger(lambda hand: hand.homing()):
             raise GraspError("the fingers could not be homed")
 
@@ -144,7 +142,6 @@ class PandaRobot(Closing):
         """Close the fingers; see `Robot.grasp`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
         check_range("force_N", force_N, low=0.0, high=70.0, unit="N")
-        self._link.latch.check()
         speed = self.config.gripper_speed
         self._link.finger(lambda hand: hand.grasp(width_m, speed, force_N, WIDE, WIDE))
         width = self._link.width()

@@ -295,9 +295,11 @@ class PandaLink:
 
         Raises:
             GraspError: it failed, or took too long
+            MotionError: `stop` holds
             ConnectionLost: the hand is silent
         """
         self.width()
+        self.latch.check()
         # Homing goes there and back at the hand's own pace.
         timeout = 4.0 * GRIPPER_MAX_WIDTH / min(self._gripper_speed, 0.05) + QUICK_TIMEOUT
         try:
