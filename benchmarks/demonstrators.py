@@ -11,7 +11,8 @@ those with fewer actions accepted where both solve the task (`refine --accept so
 Plays whole episodes in this process on the same seeds, eight side by side, with the images that a
 collection would render. One episode before each row, not timed, compiles or loads the kernels. With
 --out, rows already in that file are not measured again; --hardness then prints its rows of the
-scripted demonstrators, 200 seeds each, beside the paper's, and --bags all of its rows of bags.
+scripted demonstrators beside the paper's, and --bags those of bags, with rows of neighbouring seeds
+taken together.
 Intervals of rates are Wilson's, others 1.96 standard errors, 95 %.
 """
 
@@ -270,18 +271,62 @@ def _rows(path: Path | None) -> dict[tuple[str, str, int | None, int | None, int
     return {(r.task, r.by, r.budget, r.depth, r.first_seed, r.attempts): r for r in rows}
 
 
+@dataclass(frozen=True)
+class Pooled:
+    """Rows of neighbouring seeds taken together."""
+
+    task: str
+    by: str
+    attempts: int
+    successes: int
+    enclosed: int | None
+    mean_actions: float
+    mean_actions_solved: float
+    cpu_s_per_attempt: float
+
+
+def pooled(rows: list[Row]) -> list[Pooled]:
+    """One a task and demonstrator, of all seeds that its rows played; in the tasks' order."""
+    together: dict[tuple[str, str], list[Row]] = {}
+    for row in sorted(rows, key=lambda row: row.first_seed):
+        together.setdefault((row.task, row.by), []).append(row)
+    found = [_pool(parts) for parts in together.values()]
+    return sorted(found, key=lambda each: (list(TASKS).index(each.task), ORDER.index(each.by)))
+
+
+def _pool(parts: list[Row]) -> Pooled:
+    for a, b in itertools.pairwise(parts):
+        if a.first_seed + a.attempts != b.first_seed:
+            raise SystemExit(f"{a.task} {a.by}: seeds are missing, or twice, before {b.first_seed}")
+    attempts, solved = sum(r.attempts for r in parts), sum(r.successes for r in parts)
+    kept = [row.enclosed for row in parts if row.enclosed is not None]
+    of_solved = sum(r.mean_actions_solved * r.successes for r in parts if r.successes)
+    return Pooled(
+        task=parts[0].task,
+        by=parts[0].by,
+        attempts=attempts,
+        successes=solved,
+        enclosed=sum(kept) if kept else None,
+        mean_actions=sum(r.mean_actions * r.attempts for r in parts) / attempts,
+        mean_actions_solved=of_solved / solved if solved else np.nan,
+        cpu_s_per_attempt=sum(r.cpu_s_per_attempt * r.attempts for r in parts) / attempts,
+    )
+
+
 def hardness(rows: list[Row]) -> str:
     """The scripted demonstrators beside the paper's: success, and actions of the successes."""
-    lines = ["| task | success | paper | ours / paper | actions | paper | ours / paper |",
-             "|---|---|---|---|---|---|---|"]  # fmt: skip
-    mine = {row.task: row for row in rows if row.by == "scripted" and row.attempts == 200}
+    lines = ["| task | attempts | success | paper | ratio | enclosed | actions | paper | ratio |",
+             "|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    mine = {row.task: row for row in pooled(rows) if row.by == "scripted"}
     for task, (success, actions) in PAPER.items():
         row = mine[task]
         rate = 100 * row.successes / row.attempts
         theirs, ratio = ("-", "-") if success is None else (f"{success} %", f"{rate / success:.2f}")
+        kept = "-" if row.enclosed is None else f"{100 * row.enclosed / row.attempts:.1f} %"
+        ours = row.mean_actions_solved
         lines.append(
-            f"| {task} | {rate:.1f} % | {theirs} | {ratio} | {row.mean_actions_solved:.2f} "
-            f"| {actions:.2f} | {row.mean_actions_solved / actions:.2f} |"
+            f"| {task} | {row.attempts} | {rate:.1f} % | {theirs} | {ratio} | {kept} "
+            f"| {ours:.2f} | {actions:.2f} | {ours / actions:.2f} |"
         )
     return "\n".join(lines)
 
@@ -290,13 +335,14 @@ def bags(rows: list[Row]) -> str:
     """The bags' demonstrators: successes, how many enclosed, mean actions, CPU seconds."""
     lines = ["| task | by | solved / attempts | 95 % | enclosed | actions | CPU s an attempt |",
              "|---|---|---|---|---|---|---|"]  # fmt: skip
-    for row in sorted(rows, key=lambda r: (list(TASKS).index(r.task), ORDER.index(r.by))):
+    for row in pooled(rows):
         if row.task.startswith("bag-"):
-            low, high = row.interval
+            n, solved = row.attempts, row.successes
+            interval = binomtest(solved, n).proportion_ci(method="wilson")
             kept = "-" if row.enclosed is None else str(row.enclosed)
             lines.append(
-                f"| {row.task} | `{row.by}` | {row.successes} / {row.attempts} "
-                f"| {100 * low:.0f} to {100 * high:.0f} % | {kept} | {row.mean_actions:.2f} "
+                f"| {row.task} | `{row.by}` | {solved} / {n} | {100 * interval.low:.0f} to "
+                f"{100 * interval.high:.0f} % | {kept} | {row.mean_actions:.2f} "
                 f"| {row.cpu_s_per_attempt:.1f} |"
             )
     return "\n".join(lines)

@@ -30,6 +30,8 @@ _IMPORTED = "original"
 """Whose the recordings of the original code are, `interchange.deformable_ravens.DEMONSTRATOR`."""
 _IMPORTED_ABOVE = {"bag-color-goal": 0.5}
 """Scores that the original code's recordings of a task must exceed to be kept."""
+_IMPORTED_SOLVED = "bag-items-1", "bag-items-2"
+"""Tasks of whose recordings by the original code it keeps the solved ones."""
 
 
 class Moment(NamedTuple):
@@ -82,8 +84,9 @@ class Demonstrations:
     ground truth. Building reads each chosen episode once, unless the cache has it.
 
     Recordings that were imported from the original code count as it counts them: it keeps failed
-    ones, but in bag-color-goal those alone that score above 0.5. Imported ones that do not count,
-    and those without an action, are left out (`left_out` says how many).
+    ones, but in bag-color-goal those alone that score above 0.5, and of bag-items those alone that
+    are solved. Imported ones that do not count, and those without an action, are left out
+    (`left_out` says how many).
 
     Args:
         folder: what `warp-deform demo` wrote
@@ -217,7 +220,7 @@ def _counts(entry: Mapping[str, Any]) -> bool:
     """Whether an episode, as the index has it, is a demonstration."""
     if entry["actions"] == 0:
         return False
-    if entry["demonstrator"] != _IMPORTED:
+    if entry["demonstrator"] != _IMPORTED or entry["task"] in _IMPORTED_SOLVED:
         return bool(entry["success"])
     least = _IMPORTED_ABOVE.get(entry["task"])
     return least is None or entry["score"] > least

@@ -65,6 +65,8 @@ class Cell:
     """Runs that differ in their seed alone, taken together.
 
     n_episodes, n_success, pc_success [%], pc_success_ci95 [%]: of the test episodes of all runs
+    n_success_enclosed: successes whose items the bag enclosed; None without items, or where a run
+    does not say
     mean_score: in [0, 1], with its standard_error; mean_actions: of all test episodes
     value, value_error [%]: what the paper's table shows for the task (`measure`), on our test seeds
     paper_protocol [%]: the same by the paper's protocol, which is optimistic; None if not played
@@ -81,6 +83,7 @@ class Cell:
     seeds: tuple[int, ...]
     n_episodes: int
     n_success: int
+    n_success_enclosed: int | None
     pc_success: float
     pc_success_ci95: tuple[float, float]
     mean_score: float
@@ -335,6 +338,7 @@ def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
         seeds=tuple(run.seed for run in runs),
         n_episodes=n,
         n_success=solved,
+        n_success_enclosed=_all_of([t.get("n_success_enclosed") for t in tests]),
         pc_success=100 * solved / n,
         pc_success_ci95=wilson(solved, n),
         mean_score=score,
@@ -351,6 +355,12 @@ def _cell(runs: Sequence[RunResult], paper: PaperResults | None) -> Cell:
         validation=_curve([run.info["snapshots"] for run in runs], task),
         test=curve,
     )
+
+
+def _all_of(counts: Sequence[int | None]) -> int | None:
+    """Sum of counts; None where one of them is not known."""
+    known = [count for count in counts if count is not None]
+    return sum(known) if len(known) == len(counts) else None
 
 
 def _value(summary: Mapping[str, Any], task: str) -> tuple[float, float | None, int]:

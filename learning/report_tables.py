@@ -67,6 +67,7 @@ def csv_text(cells: Sequence[Cell]) -> str:
         "seeds": lambda c: " ".join(map(str, c.seeds)),
         "n_episodes": lambda c: c.n_episodes,
         "n_success": lambda c: c.n_success,
+        "n_success_enclosed": lambda c: c.n_success_enclosed,
         "pc_success": lambda c: c.pc_success,
         "pc_success_low95": lambda c: c.pc_success_ci95[0],
         "pc_success_high95": lambda c: c.pc_success_ci95[1],
@@ -110,8 +111,9 @@ def compared(cells: Sequence[Cell], paper: PaperResults) -> dict[str, Rows]:
 
 def details(cells: Sequence[Cell]) -> Rows:
     """Everything about every cell."""
-    rows = [["task", "agent", "demos", "variant", "seeds", "solved", "success %", "95 %", "score",
-             "actions", "paper's measure %", "paper's protocol %", "paper %"]]  # fmt: skip
+    rows = [["task", "agent", "demos", "variant", "seeds", "solved", "enclosed", "success %",
+             "95 %", "score", "actions", "paper's measure %", "paper's protocol %",
+             "paper %"]]  # fmt: skip
     for c in cells:
         error = "" if c.standard_error is None else f" ± {c.standard_error:.3f}"
         low, high = c.pc_success_ci95
@@ -123,6 +125,7 @@ def details(cells: Sequence[Cell]) -> Rows:
                 c.variant,
                 " ".join(map(str, c.seeds)),
                 f"{c.n_success}/{c.n_episodes}",
+                "" if c.n_success_enclosed is None else str(c.n_success_enclosed),
                 f"{c.pc_success:.1f}",
                 f"{low:.1f}-{high:.1f}",
                 f"{c.mean_score:.3f}{error}",

@@ -144,6 +144,15 @@ def test_of_the_originals_bags_by_color_only_good_ones_count(tmp_path: Path) -> 
         Demonstrations(tmp_path, task=task)
 
 
+@pytest.mark.parametrize("task", ["bag-items-1", "bag-items-2"])
+def test_of_the_originals_bags_with_items_only_the_solved_count(tmp_path: Path, task: str) -> None:
+    writer = EpisodeWriter(tmp_path)
+    for seed, (score, success) in enumerate(((0.75, False), (0.6, True), (0.5, False))):
+        writer.write(imported(seed, task=task, score=score, success=success))
+    data = Demonstrations(tmp_path, task=task)
+    assert data.seeds == (1,) and data.left_out == 2
+
+
 def test_what_holds_no_state_trains_no_agent_over_states(tmp_path: Path) -> None:
     made = block_episode(0)
     bare = [dataclasses.replace(step, ground_truth=np.zeros(0, np.float32)) for step in made.steps]

@@ -170,6 +170,26 @@ def test_a_stage_belongs_to_the_action_that_led_to_it(tmp_path: Path) -> None:
     assert lifts == [stage.lift for stage in TASKS["bag-items-1"].stages]
 
 
+@pytest.mark.parametrize(
+    ("task", "items", "beads", "solved"),
+    [
+        ("bag-items-1", 0.5, 0.4, True),
+        ("bag-items-1", 0.0, 0.4, False),
+        ("bag-items-1", 0.5, 0.0, False),
+        ("bag-items-2", 0.5, 0.1, True),
+        ("bag-items-2", 0.25, 0.5, False),
+    ],
+)
+def test_a_bag_that_came_without_its_items_is_over_but_no_success(
+    tmp_path: Path, task: str, items: float, beads: float, solved: bool
+) -> None:
+    extras = {"task_stage": 3, "zone_items_rew": items, "zone_beads_rew": beads}
+    source = write(tmp_path / task, 0, recording(1, objects=FABRIC, **extras))
+    import_deformable_ravens(source, tmp_path / "out")
+    info = EpisodeReader(tmp_path / "out").read(0).info
+    assert info.score == pytest.approx(items + beads) and info.success is solved
+
+
 def test_goals_of_cables_are_their_beads(tmp_path: Path) -> None:
     beads = {4 + i: ((0.4, 0.01 * i, 0.005), (0.0, 0.0, 0.0, 1.0)) for i in range(24)}
     source = write(tmp_path / "cable-line-notarget", 0, recording(1, objects=beads))

@@ -81,6 +81,8 @@ _SCORES = {
     "bag-color-goal": ("frac_in_target_bag", None),
 }
 _DONE = "task.done"
+_IN_ZONE = "zone_items_rew", "zone_beads_rew"
+"""What bag-items record of a carry: half the shares of items and of beads in the zone."""
 
 
 def import_deformable_ravens(
@@ -342,7 +344,7 @@ class _Row:
         return cls(
             body_q=np.array(bodies, np.float32).reshape(-1, 7),
             particle_q=np.concatenate([np.zeros((0, 3)), *vertices]).astype(np.float32),
-            done=bool(info["extras"][_DONE]),
+            done=_solved(task, info["extras"]),
             score=_score(task, info["extras"]),
             extras=_plain(info["extras"]),
             zone_pose=info.get("sampled_zone_pose"),
@@ -351,11 +353,22 @@ class _Row:
 
 def _score(task: str, extras: Mapping[str, Any]) -> float:
     """The score in [0, 1] where it was recorded; else 1 for done and 0 for not done."""
+    if task.startswith("bag-items") and all(part in extras for part in _IN_ZONE):
+        return sum(float(extras[part]) for part in _IN_ZONE)
     part, whole = _SCORES.get(task, (_DONE, None))
     if part not in extras or (whole is not None and whole not in extras):
         return float(extras[_DONE])
     value = float(extras[part]) / (1.0 if whole is None else float(extras[whole]))
     return min(value, 1.0)  # a stretched cable or bag encloses more than one at rest
+
+
+def _solved(task: str, extras: Mapping[str, Any]) -> bool:
+    """Whether the task is done; of bag-items, which a bead in the zone ends, if it is solved."""
+    done = bool(extras[_DONE])
+    if task.startswith("bag-items") and all(part in extras for part in _IN_ZONE):
+        items, beads = (float(extras[part]) for part in _IN_ZONE)
+        return done and items >= 0.5 and beads > 0
+    return done
 
 
 def _targets(task: str, last: _Row) -> np.ndarray | None:
