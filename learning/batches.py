@@ -17,7 +17,7 @@ from .dataset import Demonstrations
 from .models.gt_state import encode_action
 from .models.transporter import Batch, Transporter
 
-__all__ = ["StateBatch", "check_lifts", "image_batch", "state_batch", "task_lifts"]
+__all__ = ["StateBatch", "check_lifts", "check_view", "image_batch", "state_batch", "task_lifts"]
 
 _LIFT_GAP = 0.015
 """Lifts of one stage may differ by this [m]: a robot lifts 1 cm less to carry over short ways."""
@@ -46,6 +46,18 @@ def check_lifts(data: Demonstrations) -> None:
     for name, actions in data.actions():
         for action in actions:
             _lift_index(action, lifts, what=name)
+
+
+def check_view(data: Demonstrations) -> None:
+    """See that every pick and place is in view.
+
+    Raises:
+        InputError: one is not.
+    """
+    for name, actions in data.actions():
+        for action in actions:
+            pixels = data.task.grid.to_pixel(np.stack([action[:2], action[3:5]]))
+            _check_pixels(pixels, action, what=name)
 
 
 def image_batch(
@@ -80,8 +92,7 @@ def image_batch(
             turn *= moved.handed
             pictures = [move_picture(*picture, moved) for picture in pictures]
             pixels = np.round(moved.of_pixels(pixels)).astype(np.int64)
-        if not ((pixels >= 0) & (pixels < SHAPE)).all():
-            raise InputError(f"a demonstration acts out of view, at {moment.action.tolist()}")
+        _check_pixels(pixels, moment.action)
         images.append(agent.image(*pictures))
         pick, place = agent.config.to_network(pixels)
         picks.append(pick)
@@ -122,6 +133,11 @@ def state_batch(
         actions = move_actions(actions, transforms)
     indices = torch.tensor([_lift_index(action, lifts) for action in actions])
     return torch.from_numpy(states), torch.from_numpy(encode_action(actions)), indices
+
+
+def _check_pixels(pixels: np.ndarray, action: np.ndarray, *, what: str = "a demonstration") -> None:
+    if not ((pixels >= 0) & (pixels < SHAPE)).all():
+        raise InputError(f"{what} acts out of view, at {action.tolist()}")
 
 
 def _lift_index(

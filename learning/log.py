@@ -17,10 +17,25 @@ from warp_deform.extras import install_extra
 
 from .snapshots import RunFolder
 
-__all__ = ["LINE_STEPS", "TrainingLog"]
+__all__ = ["LINE_STEPS", "TrainingLog", "load_tensorboard"]
 
 LINE_STEPS = 50
 """Steps that a line of the log stands for."""
+
+
+def load_tensorboard() -> Any:
+    """The class that writes for TensorBoard.
+
+    Raises:
+        InputError: TensorBoard is not installed.
+    """
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise InputError(
+            f"TensorBoard is not installed; in the clone run: {install_extra('train')}"
+        ) from error
+    return SummaryWriter
 
 
 class TrainingLog:
@@ -45,13 +60,7 @@ class TrainingLog:
         self._count, self._since = 0, time.perf_counter()
         self._board: Any = None
         if tensorboard and enabled:
-            try:
-                from torch.utils.tensorboard import SummaryWriter
-            except ImportError as error:
-                raise InputError(
-                    f"TensorBoard is not installed; in the clone run: {install_extra('train')}"
-                ) from error
-            self._board = SummaryWriter(str(run.path / "tensorboard"), purge_step=step + 1)
+            self._board = load_tensorboard()(str(run.path / "tensorboard"), purge_step=step + 1)
 
     def __enter__(self) -> TrainingLog:
         return self

@@ -31,10 +31,10 @@ from warp_deform.progress import progress_bar
 from warp_deform.tasks.ground_truth import yaw_columns
 from warp_deform.tasks.registry import task as find_task
 
-from .batches import check_lifts, image_batch, state_batch, task_lifts
+from .batches import check_lifts, check_view, image_batch, state_batch, task_lifts
 from .dataset import Demonstrations
 from .held_out import HeldOut
-from .log import TrainingLog
+from .log import TrainingLog, load_tensorboard
 from .models.gt_state import GtStateConfig
 from .models.transporter import PRESETS, Transporter, TransporterConfig
 from .policy import AGENTS, Agent, AgentDescription, make_agent
@@ -180,6 +180,7 @@ def train(config: TrainConfig) -> TrainReport:
         description = _describe(config, data)
         agent = make_agent(description, seed=config.seed).to(device)
         held_out = HeldOut(agent, data.spared(config.hold_out)) if config.hold_out else None
+        _rehearse(config, data, agent, plan, device)
         key = claim(run, config, plan, description, data, processes=world, write=rank == 0)
         here.wait()
 
@@ -276,6 +277,22 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
         config=asdict(choices),
         state_size=data.state_size,
     )
+
+
+def _rehearse(
+    config: TrainConfig, data: Demonstrations, agent: Agent, plan: Schedule, device: torch.device
+) -> None:
+    """Do once what may be refused, before the folder is claimed: a refusal leaves no run behind.
+
+    Raises:
+        InputError: the demonstrations cannot be shown to the agent, or TensorBoard is missing.
+    """
+    if config.tensorboard:
+        load_tensorboard()
+    if isinstance(agent, Transporter):
+        for each in (data, data.spared(config.hold_out)) if config.hold_out else (data,):
+            check_view(each)
+    _batch(data, agent, plan, config.augment, np.random.default_rng(config.seed), device)
 
 
 def _batch(

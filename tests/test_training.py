@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from learning.training import TrainConfig, TrainReport, train
 from warp_deform.cli import main
 from warp_deform.episodes import Episode, EpisodeWriter
 from warp_deform.errors import InputError
+from warp_deform.tasks.cable_line import CableLineNotarget
 
 TASK = "cable-line-notarget"
 SHORT = Schedule(steps=4, batch=1, lr=1e-3, warmup=2, decay=True, ema=0.9, snapshots=2)
@@ -34,8 +36,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config(folder: Path, out: Path, **changes: Any) -> TrainConfig:
-    values = {"agent": "goal-stack", "preset": "fast", "schedule": SHORT} | changes
-    return TrainConfig(task=TASK, data=folder, out=out, demos=3, **values)
+    values = {"agent": "goal-stack", "preset": "fast", "schedule": SHORT, "demos": 3} | changes
+    return TrainConfig(task=TASK, data=folder, out=out, **values)
 
 
 @pytest.fixture(scope="module")
@@ -193,6 +195,36 @@ def test_a_lift_of_no_stage_is_refused(tmp_path: Path) -> None:
     said = str(caught.value)
     assert "episode_000000001.parquet lifts to 0.12 m" in said and "stages lift to 0.04 m" in said
     assert not (tmp_path / "run").exists(), "before anything is trained"
+
+
+def out_of_view() -> Episode:
+    """An episode whose second action picks beyond the picture."""
+    made = block_episode(1)
+    return with_step(made, 1, action=np.array([0.9, *made.steps[1].action[1:]]))
+
+
+@pytest.mark.parametrize(
+    ("agent", "changes", "said"),
+    [
+        ("gt-mlp", {}, "ground_truth_rows of its task, cannot be moved; train with --no-augment"),
+        ("goal-stack", {"augment": False}, r"episode_000000001\.parquet acts out of view"),
+        ("goal-stack", {"demos": 1, "hold_out": 1}, r"000001\.parquet acts out of view"),
+        ("gt-mlp", {"augment": False, "tensorboard": True}, "TensorBoard is not installed"),
+    ],
+)
+def test_a_refused_training_leaves_no_run(
+    agent: str, changes: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A report would list it, and the same command, mended, would meet another run's folder."""
+    monkeypatch.setattr(CableLineNotarget, "ground_truth_rows", ())
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    writer = EpisodeWriter(tmp_path / "data")
+    for episode in (block_episode(0), out_of_view()):
+        writer.write(episode)
+    wanted = config(tmp_path / "data", tmp_path / "run", agent=agent, **{"demos": 2, **changes})
+    with pytest.raises(InputError, match=said):
+        train(wanted)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_lift_that_a_robot_makes_of_a_stage_s_is_taken(tmp_path: Path) -> None:

@@ -12,8 +12,6 @@ from warp_deform.episodes import Episode, EpisodeWriter
 from warp_deform.rendering.pixels import SHAPE, pixel_to_world
 from warp_deform.tasks.registry import task as find_task
 
-STATE_SIZE = {"cable-ring": 192, "cable-line-notarget": 144, "block-notarget": 6}
-
 
 def block_episode(seed: int, *, task: str = "cable-line-notarget", actions: int = 2) -> Episode:
     """A red square that every action carries on, and a ground truth of the task's size.
@@ -35,7 +33,7 @@ def block_episode(seed: int, *, task: str = "cable-line-notarget", actions: int 
         if t < actions:
             pick, place = pixel_to_world(middles[t]), pixel_to_world(middles[t + 1])
             action = np.array([*pick, 0.0, *place, 0.0, lift])
-        truth = np.zeros(STATE_SIZE[task], np.float32)
+        truth = np.zeros(find_task(task).ground_truth_size, np.float32)
         truth[:2] = pixel_to_world(middles[t])
         steps.append(
             dataclasses.replace(step, color=color, height=height, action=action, ground_truth=truth)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from . import __version__
 from .extras import install_extra
+from .tasks.registry import all_tasks
 
 __all__ = ["DEPENDENCIES", "render", "report"]
 
@@ -73,7 +74,7 @@ def report() -> dict[str, Any]:
     return {
         "healthy": not problems,
         "problems": problems,
-        "warnings": list(_hiding()),
+        "warnings": [*_hiding(), *all_tasks()[1]],
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu": _cpu_model(),

@@ -15,6 +15,8 @@ import numpy as np
 from .episodes import Goal
 from .errors import InputError, WarpDeformError
 from .running import DEMONSTRATOR_STREAM, episode_rng
+from .tasks.registry import task as find_task
+from .tasks.task import Task
 from .worlds import Worlds
 
 __all__ = ["SLOTS", "SOLVED", "Act", "Run", "play", "worlds_for"]
@@ -47,13 +49,18 @@ Act = Callable[[Worlds, Mapping[int, Run[Row]]], Mapping[int, np.ndarray | None]
 """Next action (7,) of every running slot, or None for a slot whose episode is to end."""
 
 
-@functools.lru_cache(maxsize=2)
 def worlds_for(task: str, robot: str) -> Worlds:
     """This process's `SLOTS` worlds of a task, built once and used again.
 
-    Their number changes no bit; the same one for every use means one kernel to compile.
+    Their number changes no bit; the same one for every use means one kernel to compile. A class
+    that was registered anew under the name gets worlds of its own.
     """
-    return Worlds(task, SLOTS, robot=robot, lanes=SLOTS)
+    return _worlds(type(find_task(task)), robot)
+
+
+@functools.lru_cache(maxsize=2)
+def _worlds(task: type[Task], robot: str) -> Worlds:
+    return Worlds(task(), SLOTS, robot=robot, lanes=SLOTS)
 
 
 def play(

@@ -22,9 +22,12 @@ def env_id(task: str) -> str:
 
     The version of a task from elsewhere, which may not have been loaded, is 1.
     """
-    words = "".join(word.capitalize() for word in task.split("-"))
     known = TASKS | FURTHER_TASKS
-    return f"WarpDeform/{words}-v{known[task].version if task in known else 1}"
+    return f"WarpDeform/{_words(task)}-v{known[task].version if task in known else 1}"
+
+
+def _words(task: str) -> str:
+    return "".join(word.capitalize() for word in task.split("-"))
 
 
 def register_environments() -> None:
@@ -54,9 +57,9 @@ def register_task(task: Registered) -> Registered:
     """
     check_task(task)
     for other in (*TASKS, *FURTHER_TASKS, *(cls.name for cls in registered())):
-        if other != task.name and env_id(other) == env_id(task.name):
+        if other != task.name and _words(other) == _words(task.name):
             raise InputError(
-                f"the Gymnasium id of {task.name!r} would be {env_id(other)}, as that of {other!r}"
+                f"the Gymnasium id of {task.name!r} would be that of {other!r}; rename it"
             )
     add_task(task)
     _register(task.name)

@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..rendering.pixels import PixelGrid
 from ..robots.primitive import LIFT, PrimitiveConfig, Stage
 from ..solver.config import SolverConfig
-from .ground_truth import Row
+from .ground_truth import row_count
 from .task import Task
 
 __all__ = ["check_task"]
@@ -47,25 +47,18 @@ def _names(value: Any) -> bool:
     return isinstance(value, tuple) and all(isinstance(each, str) for each in value)
 
 
-def _rows(value: Any) -> bool:
-    return isinstance(value, tuple) and all(
-        isinstance(run, tuple) and len(run) == 2 and isinstance(run[0], Row) and _whole(run[1])
-        for run in value
-    )
-
-
 _ATTRIBUTES = {
     "stages": _Attribute(
         f"a tuple of one or more Stage, each lift {LIFT[0]} to {LIFT[1]} m", _stages
     ),
     "success_score": _Attribute("a number above 0 and at most 1", _share),
-    "ground_truth_rows": _Attribute("a tuple of pairs (Row, number of rows)", _rows),
     "ground_truth_size": _Attribute(
         "a whole number, 1 or more (or give ground_truth_rows)", _whole
     ),
     "goal_conditioned": _Attribute("True or False", lambda value: type(value) is bool),
     "max_actions": _Attribute("a whole number, 1 or more", _whole),
     "objects": _Attribute("a tuple of names", _names),
+    "version": _Attribute("a whole number, 1 or more", _whole),
     "solver": _Attribute("a SolverConfig", lambda value: isinstance(value, SolverConfig)),
     "primitive": _Attribute("a PrimitiveConfig", lambda value: isinstance(value, PrimitiveConfig)),
     "grid": _Attribute("a PixelGrid", lambda value: isinstance(value, PixelGrid)),
@@ -104,6 +97,12 @@ def check_task(task: object) -> type[Task]:
         if not needed.fits(value):
             found = repr(value)[:60] if hasattr(task, attribute) else "missing"
             raise InputError(f"{where}: {attribute} is {found}; it must be {needed.words}")
+    rows = row_count(task.ground_truth_rows)
+    if rows and task.ground_truth_size != 3 * rows:
+        raise InputError(
+            f"{where}: ground_truth_size is {task.ground_truth_size}, and ground_truth_rows are "
+            f"{rows} rows; there are three numbers a row, so leave ground_truth_size out"
+        )
     if task.goal_conditioned:
         for method in _OF_GOALS:
             if getattr(task, method) is getattr(Task, method):

@@ -11,7 +11,9 @@ from enum import Enum
 
 import numpy as np
 
-__all__ = ["YAW_SCALE", "Row", "Rows", "pose_rows", "quaternion_yaw", "row_kinds",
+from ..errors import InputError
+
+__all__ = ["YAW_SCALE", "Row", "Rows", "pose_rows", "quaternion_yaw", "row_count", "row_kinds",
            "rows_of", "yaw_columns"]  # fmt: skip
 
 YAW_SCALE = 15.0
@@ -36,13 +38,37 @@ Rows = tuple[tuple[Row, int], ...]
 """A ground truth as runs of rows: kind and number, three numbers each row."""
 
 
+def row_count(rows: Rows) -> int:
+    """Number of rows.
+
+    Raises:
+        InputError: these are no runs of rows.
+    """
+    if not (isinstance(rows, tuple) and all(map(_is_run, rows))):
+        raise InputError(
+            f"ground_truth_rows is {repr(rows)[:60]}; it must be a tuple of pairs (Row, number of "
+            "rows)"
+        )
+    return sum(count for _, count in rows)
+
+
+def _is_run(run: object) -> bool:
+    return (
+        isinstance(run, tuple)
+        and len(run) == 2
+        and isinstance(run[0], Row)
+        and type(run[1]) is int
+        and run[1] >= 1
+    )
+
+
 def row_kinds(rows: Rows) -> np.ndarray:
     """Kind of every row (n,), as objects.
 
     >>> row_kinds(((Row.POSE, 1), (Row.POINT, 2))).tolist()
     [<Row.POSE: 'pose'>, <Row.POINT: 'point'>, <Row.POINT: 'point'>]
     """
-    kinds = np.empty(sum(count for _, count in rows), dtype=object)
+    kinds = np.empty(row_count(rows), dtype=object)
     kinds[:] = [kind for kind, count in rows for _ in range(count)]
     return kinds
 

@@ -17,6 +17,7 @@ import numpy as np
 from ..rendering.pixels import TABLE_GRID, PixelGrid
 from ..robots.primitive import PrimitiveConfig, Stage
 from ..solver.config import SolverConfig
+from .ground_truth import Rows, row_count
 from .past import PastAction
 
 if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
@@ -34,7 +35,6 @@ if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     from ..rendering.topdown import TopDown
     from ..robots.jaw_primitive import JawActionConfig
     from .free_space import FreeSpace
-    from .ground_truth import Rows
 
 __all__ = ["PHYSICS", "Action", "Layout", "Snapshot", "Stage", "Task"]
 
@@ -154,7 +154,7 @@ class Task(abc.ABC):
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         if "ground_truth_rows" in vars(cls) and "ground_truth_size" not in vars(cls):
-            cls.ground_truth_size = 3 * sum(count for _, count in cls.ground_truth_rows)
+            cls.ground_truth_size = 3 * row_count(cls.ground_truth_rows)
 
     def stage_of(self, lift: float) -> Stage:
         """The stage whose lift is nearest to `lift` [m]; of equally near ones the first."""
