@@ -72,10 +72,7 @@ def test_joint_position_generator(panda: SimpleNamespace, emulator: EmulatorProc
 
 
 def test_joint_velocity_generator(panda: SimpleNamespace, emulator: EmulatorProcess) -> None:
-    def make(t: float, state: object) -> object:
-        return libfranka.JointVelocities([0.5 * np.sin(np.pi * min(t, 1.0)) ** 2, *[0.0] * 6])
-
-    panda.robot.control_joint_velocity(timed(make, seconds=1.2))
+    panda.robot.control_joint_velocity(timed(bump(0.5), seconds=1.2))
     assert emulator.snapshot()["q"][0] == pytest.approx(0.25, abs=1e-3)
 
 
@@ -107,6 +104,13 @@ def test_cartesian_velocity_generator(panda: SimpleNamespace, emulator: Emulator
 # Limits.
 
 
+def bump(speed: float) -> Callable[[float, object], object]:
+    """Turn joint 1 for a second, at rest in the end; half of `speed` on average [rad/s]."""
+    return lambda t, state: libfranka.JointVelocities(
+        [speed * np.sin(np.pi * min(t, 1.0)) ** 2, *[0.0] * 6]
+    )
+
+
 def velocities(speed: float) -> Callable[[float, object], object]:
     return lambda t, state: libfranka.JointVelocities([speed * min_jerk(2 * t), *[0.0] * 6])
 
@@ -123,12 +127,28 @@ def test_velocity_jump(panda: SimpleNamespace) -> None:
         panda.robot.control_joint_velocity(jump, limit_rate=False, cutoff_frequency=1000.0)
 
 
+def test_acceleration_jump(panda: SimpleNamespace) -> None:
+    """10 rad/s^2 from the first sample on: within the acceleration's limit, beyond the jerk's."""
+    jump = timed(lambda t, state: libfranka.JointVelocities([10.0 * t, *[0.0] * 6]), seconds=1.0)
+    only = r'reflex! \["joint_motion_generator_acceleration_discontinuity"\]'
+    with pytest.raises(RuntimeError, match=only):
+        panda.robot.control_joint_velocity(jump, limit_rate=False, cutoff_frequency=1000.0)
+
+
+def test_a_motion_that_ends_while_moving_is_none(
+    panda: SimpleNamespace, emulator: EmulatorProcess
+) -> None:
+    with pytest.raises(RuntimeError, match="finished commanded, but the robot is still moving"):
+        panda.robot.control_joint_velocity(timed(velocities(0.5), seconds=1.0))
+    assert emulator.snapshot()["mode"] == "reflex"
+
+
 def test_joint_limit(panda: SimpleNamespace, emulator: EmulatorProcess) -> None:
     with pytest.raises(RuntimeError, match="joint_motion_generator_position_limits_violation"):
         panda.robot.control_joint_velocity(timed(velocities(2.0), seconds=3.0))
     assert Q_MAX[0] - 0.01 < emulator.snapshot()["q"][0] <= Q_MAX[0]
     panda.panda.recover()
-    panda.robot.control_joint_velocity(timed(velocities(-0.5), seconds=1.0))  # and back
+    panda.robot.control_joint_velocity(timed(bump(-0.5), seconds=1.2))  # and back
     assert emulator.snapshot()["q"][0] < Q_MAX[0] - 0.1
 
 

@@ -2,10 +2,8 @@
 
 Motion generators are followed exactly. Torques accelerate joints of constant, diagonal inertia with
 a little viscous friction; contact pushes back through the Jacobian. A violated limit stops the arm
-at once and is returned by the name that libfranka prints.
-
-Source for the Cartesian and torque rate limits: Franka Control Interface documentation, "Robot and
-interface specifications", Panda.
+at once and is returned by the names that libfranka prints. Where a command is missing, the motion
+generator's goes on at its last acceleration and the last torques stay.
 """
 
 from __future__ import annotations
@@ -14,23 +12,30 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from ..panda_arm import DDQ_MAX, DQ_MAX, Q_MAX, Q_MIN, TAU_MAX, flange_T_tcp
-from .frames import difference, is_frame
+from ..panda_arm import DQ_MAX, Q_MAX, Q_MIN, flange_T_tcp
+from .frames import difference, is_frame, moved_on
 from .model_library import INERTIA, ModelLibrary
-from .protocol import ControllerMode, GeneratorMode
+from .motion_limits import (
+    DT,
+    elbow_excess,
+    excess_at_end,
+    joint_excess,
+    torque_excess,
+    twist_excess,
+)
+from .protocol import ROBOT_COMMAND, ControllerMode, GeneratorMode
 
-__all__ = ["Arm"]
+__all__ = ["ELBOW_SIGN", "Arm"]
 
-DT = 1e-3  # [s], the interface's period
-TAU_RATE_MAX = 1000.0  # [N m/s]
-# Translation [m/s], [m/s^2] and rotation [rad/s], [rad/s^2] of the end effector.
-TWIST_MAX = np.array([1.7] * 3 + [2.5] * 3)
-TWIST_RATE_MAX = np.array([13.0] * 3 + [25.0] * 3)
-# What rounding may add to a limit before it counts as violated.
+# What rounding may add to a measured velocity before it counts as too much.
 SLACK = 1.001
 FRICTION = 0.5  # [N m s/rad]
 # A generator's first command may differ from where the arm stands by this [rad, m].
 START_TOLERANCE = 1e-3
+# Joint 4 bends one way only.
+ELBOW_SIGN = -1.0
+CARTESIAN = (GeneratorMode.CARTESIAN_POSITION, GeneratorMode.CARTESIAN_VELOCITY)
+_BY_IK = "cartesian_motion_generator_joint"
 
 
 class Arm:
@@ -42,6 +47,7 @@ class Arm:
         tau_d: torques that the client commanded last [N m], shape (7,)
         O_T_EE: pose of the end effector, shape (16,), column-major
         O_T_EE_c, O_dP_EE_c, O_ddP_EE_c: what the Cartesian generator commanded last
+        elbow, delbow, ddelbow: angle of joint 3 that it commanded last [rad], and its derivatives
         wrench: contact on the end effector, in the base frame [N, N m], shape (6,)
     """
 
@@ -64,6 +70,8 @@ class Arm:
         self.q_d, self.dq_d, self.ddq_d = self.q.copy(), np.zeros(7), np.zeros(7)
         self.tau_d = np.zeros(7)
         self.O_dP_EE_c, self.O_ddP_EE_c = np.zeros(6), np.zeros(6)
+        self.elbow, self.delbow, self.ddelbow = float(self.q[2]), 0.0, 0.0
+        self._steers_elbow = False
         self._refresh()
         self.O_T_EE_c = self.O_T_EE.copy()
 
@@ -88,83 +96,139 @@ class Arm:
 
     def follow(
         self, command: np.void, *, generator: GeneratorMode, controller: ControllerMode, first: bool
-    ) -> str | None:
-        """Obey one command for 1 ms; returns the name of the limit it violates, if any.
+    ) -> tuple[str, ...]:
+        """Obey one command for 1 ms; returns the names of the limits it violates.
 
         Args:
             command: a ROBOT_COMMAND record
             generator, controller: the modes of the motion in progress
             first: whether this is the motion's first command
         """
-        if controller == ControllerMode.EXTERNAL:
-            violation = self._torque(command["tau_J_d"])
-        elif generator == GeneratorMode.JOINT_POSITION:
-            if first and not np.abs(command["q_c"] - self.q).max() <= START_TOLERANCE:
-                return "joint_position_motion_generator_start_pose_invalid"
-            violation = self._joint_velocity((command["q_c"] - self.q_d) / DT, command["q_c"])
-        elif generator == GeneratorMode.JOINT_VELOCITY:
-            violation = self._joint_velocity(command["dq_c"], self.q_d + DT * command["dq_c"])
-        elif generator == GeneratorMode.CARTESIAN_POSITION:
-            violation = self._pose(command["O_T_EE_c"], first=first)
-        else:
-            violation = self._twist(command["O_dP_EE_c"], command["O_dP_EE_c"] * DT)
+        with np.errstate(over="ignore", invalid="ignore"):  # such numbers are beyond every limit
+            if controller == ControllerMode.EXTERNAL:
+                names = self._torque(command["tau_J_d"])
+            else:
+                names = self._generate(command, generator, first=first)
+                if not names and command["motion_generation_finished"]:
+                    names = self._end(generator)
         self._refresh()
-        if generator == GeneratorMode.CARTESIAN_POSITION:
-            self.O_T_EE_c = command["O_T_EE_c"].copy()
-        return violation
+        return names
 
-    def _torque(self, tau: np.ndarray) -> str | None:
+    def go_on(self, *, generator: GeneratorMode, controller: ControllerMode) -> tuple[str, ...]:
+        """Let 1 ms pass for which no command came; returns the names of the limits it violates.
+
+        The commanded velocity goes on at its last acceleration; torques stay as they were.
+
+        Source: Franka Control Interface documentation, "Network requirements".
+        """
+        command = np.zeros(1, ROBOT_COMMAND)[0]
+        command["tau_J_d"] = self.tau_d
+        command["dq_c"] = self.dq_d + DT * self.ddq_d
+        command["q_c"] = self.q_d + DT * command["dq_c"]
+        twist = self.O_dP_EE_c + DT * self.O_ddP_EE_c
+        command["O_dP_EE_c"] = twist
+        pose = moved_on(self.O_T_EE_c.reshape(4, 4).T, DT * twist)
+        command["O_T_EE_c"] = pose.T.ravel()
+        command["valid_elbow"] = self._steers_elbow
+        elbow = self.elbow + DT * (self.delbow + DT * self.ddelbow)
+        command["elbow_c"] = (elbow, ELBOW_SIGN)
+        return self.follow(command, generator=generator, controller=controller, first=False)
+
+    def _generate(
+        self, command: np.void, generator: GeneratorMode, *, first: bool
+    ) -> tuple[str, ...]:
+        if generator == GeneratorMode.JOINT_POSITION:
+            if first and not np.abs(command["q_c"] - self.q).max() <= START_TOLERANCE:
+                return ("joint_position_motion_generator_start_pose_invalid",)
+            return self._move_joints((command["q_c"] - self.q_d) / DT, command["q_c"])
+        if generator == GeneratorMode.JOINT_VELOCITY:
+            return self._move_joints(command["dq_c"], self.q_d + DT * command["dq_c"])
+        if generator == GeneratorMode.CARTESIAN_VELOCITY:
+            twist = command["O_dP_EE_c"]
+            return self._move_end_effector(twist, DT * twist, command, first=first)
+        pose = command["O_T_EE_c"]
+        if not is_frame(pose):
+            return ("cartesian_position_motion_generator_invalid_frame_flag",)
+        target, current = pose.reshape(4, 4).T, self.base_T_tcp
+        if first and not np.linalg.norm(target[:3, 3] - current[:3, 3]) < START_TOLERANCE:
+            return ("cartesian_position_motion_generator_start_pose_invalid",)
+        twist = difference(self.O_T_EE_c.reshape(4, 4).T, target) / DT
+        # One Gauss-Newton step from where the arm is.
+        names = self._move_end_effector(twist, difference(current, target), command, first=first)
+        self.O_T_EE_c = pose.copy()
+        return names
+
+    def _end(self, generator: GeneratorMode) -> tuple[str, ...]:
+        """The names of the limits that are violated by standing still from now on."""
+        if generator not in CARTESIAN:
+            return excess_at_end(self.dq_d, self.ddq_d, joint_excess)
+        names = excess_at_end(self.O_dP_EE_c, self.O_ddP_EE_c, twist_excess)
+        if self._steers_elbow:
+            elbow = np.array([self.delbow]), np.array([self.ddelbow])
+            names += excess_at_end(*elbow, elbow_excess)
+        return names
+
+    def _torque(self, tau: np.ndarray) -> tuple[str, ...]:
         """Accelerate under the commanded torque and the contact; semi-implicit Euler."""
-        if not np.isfinite(tau).all() or (np.abs(tau) > TAU_MAX * SLACK).any():
-            return "tau_J_range_violation"
-        if (np.abs(tau - self.tau_d) > TAU_RATE_MAX * DT * SLACK).any():
-            return "controller_torque_discontinuity"
+        names = torque_excess(tau, self.tau_d)
+        if names:
+            return names
         self.tau_d = tau.copy()
         self.dq = self.dq + DT * (tau + self.tau_ext - FRICTION * self.dq) / INERTIA
         self.q = self.q + DT * self.dq
         self.q_d = self.q.copy()
         if (np.abs(self.dq) > DQ_MAX * SLACK).any():
-            return "joint_velocity_violation"
-        outward = ((self.q < Q_MIN) & (self.dq < 0)) | ((self.q > Q_MAX) & (self.dq > 0))
-        return "joint_position_limits_violation" if outward.any() else None
+            return ("joint_velocity_violation",)
+        return ("joint_position_limits_violation",) if _outward(self.q, self.dq) else ()
 
-    def _joint_velocity(
-        self, dq: np.ndarray, q: np.ndarray, prefix: str = "joint_motion_generator"
-    ) -> str | None:
+    def _move_joints(
+        self, dq: np.ndarray, q: np.ndarray, *, by: str = "joint_motion_generator"
+    ) -> tuple[str, ...]:
         """Take the joints to `q` at `dq`, unless a limit forbids it."""
         ddq = (dq - self.dq_d) / DT
-        outward = ((q < Q_MIN) & (dq < 0)) | ((q > Q_MAX) & (dq > 0))
-        if outward.any():
-            return f"{prefix}_position_limits_violation"
-        if not (np.abs(dq) <= DQ_MAX * SLACK).all():
-            return f"{prefix}_velocity_limits_violation"
-        # Rounding of positions, divided by DT twice.
-        if not (np.abs(ddq) <= DDQ_MAX * SLACK + 1e-6).all():
-            return f"{prefix}_velocity_discontinuity"
+        names = joint_excess(dq, ddq, (ddq - self.ddq_d) / DT, by=by)
+        if _outward(q, dq):
+            names = (f"{by}_position_limits_violation", *names)
+        if names:
+            return names
         self.q, self.dq = q.copy(), dq.copy()
         self.q_d, self.dq_d, self.ddq_d = q.copy(), dq.copy(), ddq
-        return None
+        return ()
 
-    def _pose(self, O_T_EE_c: np.ndarray, *, first: bool) -> str | None:
-        """Follow a commanded pose by one Gauss-Newton step from where the arm is."""
-        target, current = O_T_EE_c.reshape(4, 4).T, self.base_T_tcp
-        if not is_frame(O_T_EE_c):
-            return "cartesian_position_motion_generator_invalid_frame_flag"
-        if first and not np.linalg.norm(target[:3, 3] - current[:3, 3]) < START_TOLERANCE:
-            return "cartesian_position_motion_generator_start_pose_invalid"
-        before = self.O_T_EE_c.reshape(4, 4).T
-        twist = difference(before, target) / DT
-        return self._twist(twist, difference(current, target))
-
-    def _twist(self, twist: np.ndarray, step: np.ndarray) -> str | None:
+    def _move_end_effector(
+        self, twist: np.ndarray, step: np.ndarray, command: np.void, *, first: bool
+    ) -> tuple[str, ...]:
         """Move the end effector by `step` while `twist` is what was commanded."""
         rate = (twist - self.O_dP_EE_c) / DT
-        if not (np.abs(twist) <= TWIST_MAX * SLACK).all():
-            return "cartesian_motion_generator_velocity_limits_violation"
-        if not (np.abs(rate) <= TWIST_RATE_MAX * SLACK + 1e-6).all():
-            return "cartesian_motion_generator_velocity_discontinuity"
+        names = twist_excess(twist, rate, (rate - self.O_ddP_EE_c) / DT)
+        rows, steps = self._J, step
+        if command["valid_elbow"] or self._steers_elbow:
+            names += self._steer_elbow(command, first=first)
+            rows, steps = np.vstack([rows, np.eye(7)[2]]), np.append(step, self.elbow - self.q[2])
+        if names:
+            return names
         self.O_dP_EE_c, self.O_ddP_EE_c = twist.copy(), rate
-        dq = np.linalg.lstsq(self._J, step, rcond=1e-4)[0] / DT
-        # Joint acceleration is not held to its limit here: redundancy is resolved afresh each step.
-        self.dq_d = dq
-        return self._joint_velocity(dq, self.q + DT * dq, "cartesian_motion_generator_joint")
+        dq = np.linalg.lstsq(rows, steps, rcond=1e-4)[0] / DT
+        return self._move_joints(dq, self.q + DT * dq, by=_BY_IK)
+
+    def _steer_elbow(self, command: np.void, *, first: bool) -> tuple[str, ...]:
+        """Take over where joint 3 shall be, unless a limit forbids it."""
+        elbow, sign = (float(number) for number in command["elbow_c"])
+        if first:
+            self._steers_elbow = bool(command["valid_elbow"])
+            if sign != ELBOW_SIGN or not abs(elbow - self.q[2]) <= START_TOLERANCE:
+                return ("cartesian_motion_generator_start_elbow_invalid",)
+        if not command["valid_elbow"] or not self._steers_elbow or sign != ELBOW_SIGN:
+            return ("cartesian_motion_generator_elbow_sign_inconsistent",)
+        velocity = (elbow - self.elbow) / DT
+        rate = (velocity - self.delbow) / DT
+        jerk = (rate - self.ddelbow) / DT
+        names = elbow_excess(np.array([velocity]), np.array([rate]), np.array([jerk]))
+        if not names:
+            self.elbow, self.delbow, self.ddelbow = elbow, velocity, rate
+        return names
+
+
+def _outward(q: np.ndarray, dq: np.ndarray) -> bool:
+    """Return whether a joint is beyond its range and moves farther out."""
+    return bool((((q < Q_MIN) & (dq < 0)) | ((q > Q_MAX) & (dq > 0))).any())

@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from .arm import Arm
+from .arm import ELBOW_SIGN, Arm
 from .model_library import ModelLibrary
 from .protocol import (
     ERRORS,
@@ -177,10 +177,11 @@ class EmulatedRobot:
         self._end_motion()
         return answer
 
-    def _abort(self, name: str) -> Answer:
-        self._state["errors"] = self._state["reflex_reason"] = False
-        self._state["errors"][ERRORS.index(name)] = True
-        self._state["reflex_reason"][ERRORS.index(name)] = True
+    def _abort(self, *names: str) -> Answer:
+        flags = [ERRORS.index(name) for name in names]
+        for reasons in (self._state["errors"], self._state["reflex_reason"]):
+            reasons[:] = False
+            reasons[flags] = True
         answer = self._finish(MoveStatus.REFLEX_ABORTED)
         self.mode = RobotMode.REFLEX
         return answer
@@ -201,25 +202,26 @@ class EmulatedRobot:
         self._missed_in_a_row = 0
         first, self.started = not self.started, True
         self.ticks += 1
-        violation = self.arm.follow(
+        names = self.arm.follow(
             command, generator=self._generator, controller=self._controller, first=first
         )
-        if violation is None and self._reflex and self.ticks >= self._reflex[1]:
-            violation, self._reflex = self._reflex[0], None
-        if violation is not None:
-            return self._abort(violation)
+        if not names and self._reflex and self.ticks >= self._reflex[1]:
+            names, self._reflex = (self._reflex[0],), None
+        if names:
+            return self._abort(*names)
         if command["motion_generation_finished"]:
             return self._finish(MoveStatus.SUCCESS)
         return None
 
     def _miss(self) -> Answer | None:
-        """A command is missing: the arm stands still, and after too many the motion is over."""
+        """A command is missing: the motion goes on, and after too many of them it is over."""
         self._count(False)
         self.missed += 1
         self._missed_in_a_row += 1
         if self._missed_in_a_row >= MAX_MISSED:
             return self.lose_communication()
-        return None
+        names = self.arm.go_on(generator=self._generator, controller=self._controller)
+        return self._abort(*names) if names else None
 
     def lose_communication(self) -> Answer:
         """Abort the motion because the client has gone silent; returns the answer."""
@@ -251,7 +253,9 @@ class EmulatedRobot:
         s["O_T_EE"] = s["O_T_EE_d"] = arm.O_T_EE
         s["F_T_EE"], s["O_T_EE_c"] = arm.F_T_EE, arm.O_T_EE_c
         s["O_dP_EE_c"], s["O_ddP_EE_c"] = arm.O_dP_EE_c, arm.O_ddP_EE_c
-        s["elbow"] = s["elbow_d"] = s["elbow_c"] = (arm.q[2], -1.0)
+        s["elbow"] = s["elbow_d"] = (arm.q[2], ELBOW_SIGN)
+        s["elbow_c"] = (arm.elbow, ELBOW_SIGN)
+        s["delbow_c"][0], s["ddelbow_c"][0] = arm.delbow, arm.ddelbow
         s["O_F_ext_hat_K"] = arm.wrench
         s["cartesian_collision"] = np.abs(arm.wrench) > self._force_threshold
         s["motion_generator_mode"], s["controller_mode"] = self._generator, self._controller

@@ -24,10 +24,10 @@ import numpy as np
 from warp_deform.errors import InputError, WarpDeformError
 
 from ..panda_arm import GRIPPER_MAX_WIDTH, HOME_Q
-from .arm import DT
 from .clients import Client, Port, is_loopback
 from .gripper import Gripper
 from .model_library import ModelLibrary
+from .motion_limits import DT
 from .protocol import (
     GRIPPER_COMMAND_PORT,
     GRIPPER_VERSION,
