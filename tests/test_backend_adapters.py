@@ -106,15 +106,23 @@ def test_an_fr3s_speeds_and_reactions(franky: SimpleNamespace) -> None:
     robot = FR3Robot()
     assert not robot.move_linear(LOWER, speed=0.05, stop_force_N=8.0).contact
     motion = franky.moves[-1]
-    assert motion.factor == pytest.approx(0.05 / 2.0)
+    # Each of three axes may be at its limit at once: a slanting line went 1.7 times too fast.
+    assert np.sqrt(3.0) * motion.factor * 2.0 == pytest.approx(0.05)
     said = motion.reactions[0].condition.text
     assert all(f"{axis} > 8" in said and f"{axis} < -8" in said for axis in
                ("FORCE_X", "FORCE_Y", "FORCE_Z"))  # fmt: skip
-    robot.move_joints(np.array([HOME + 0.05, HOME]), speed=0.1)
-    # never faster than the same share of a Panda's joint speeds
-    assert franky.moves[-1].factor * np.array([2.62] * 4 + [5.26, 4.18, 5.26]).max() <= (
-        0.1 * DQ_MAX.max() + 1e-9
-    )
+    turns = np.array([0.05, -0.02, 0.0, 0.05, 0.1, 0.0, 0.2])
+    robot.move_joints(np.array([HOME + turns, HOME]), speed=0.1)
+    for motion in franky.moves[-2:]:
+        way = np.abs(motion.target.position - motion.start)
+        for limit in motion.limits:
+            # in proportion to the ways: the profiles are alike, and the joints go straight
+            moving = way > 1e-5
+            np.testing.assert_allclose((limit / limit.max())[moving], (way / way.max())[moving])
+        assert (motion.limits[0] <= 0.1 * DQ_MAX + 1e-9).all()
+        assert (motion.limits[0] / DQ_MAX).max() == pytest.approx(0.1)
+        assert (motion.limits[1] <= 0.1 * 10.0 + 1e-9).all()
+    assert robot._robot.joint_velocity_limit.get() == [2.62] * 4 + [5.26, 4.18, 5.26]
     franky.contact, franky.offset = True, 0.04
     assert robot.move_linear(LOWER, speed=0.05, stop_force_N=8.0).contact
     franky.contact = False
@@ -166,7 +174,7 @@ def test_an_fr3_recovers_whatever_its_state_says_and_not_from_the_user_stop(
 ) -> None:
     limits: list[float] = []
 
-    def spy(call: Callable[[], object], *, timeout_s: float) -> object:
+    def spy(call: Callable[[], object], *, timeout_s: float, stop: object = None) -> object:
         limits.append(timeout_s)
         return call()
 
@@ -184,6 +192,14 @@ def test_an_fr3_recovers_whatever_its_state_says_and_not_from_the_user_stop(
     assert franky.recoveries == 3
     robot.stop()
     assert franky.stops == 1
+    for call in (lambda: robot.move_joints(HOME + 0.1, speed=0.1),
+                 lambda: robot.move_linear(LOWER, speed=0.1), robot.open_gripper):  # fmt: skip
+        with pytest.raises(MotionError, match="holds until recover"):
+            call()
+    assert franky.moves == []
+    franky.mode = "Idle"
+    robot.recover()
+    robot.move_linear(LOWER, speed=0.1)
 
 
 # frankapy; the stand-in itself asserts frames and ignore_errors.
@@ -233,6 +249,19 @@ def test_frankapys_durations_keep_the_speed(frankapy: SimpleNamespace) -> None:
     assert 1.875 * 0.1 / seconds == pytest.approx(0.05) and thresholds == [8.0] * 3 + [20.0] * 3
     slow_free().move_joints(HOME + 0.1, speed=0.1)
     assert 1.875 * 0.1 / frankapy.calls[-1][1] <= 0.1 * DQ_MAX.max()
+
+
+def test_frankapys_stop_holds(frankapy: SimpleNamespace) -> None:
+    robot = slow_free()
+    robot.stop()
+    made = len(frankapy.calls)
+    for call in (lambda: robot.move_joints(HOME + 0.1, speed=0.1),
+                 lambda: robot.move_linear(LOWER, speed=0.1), robot.open_gripper):  # fmt: skip
+        with pytest.raises(MotionError, match="holds until recover"):
+            call()
+    assert len(frankapy.calls) == made
+    robot.recover()
+    robot.move_linear(LOWER, speed=0.1)
 
 
 def test_frankapys_contact_is_told_by_force_and_place(frankapy: SimpleNamespace) -> None:

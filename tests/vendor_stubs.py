@@ -74,13 +74,20 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
             assert len(position) == 7
             self.position = np.array(position)
 
-    class JointWaypoint:
-        def __init__(self, target: JointState) -> None:
-            assert isinstance(target, JointState)
-            self.target = target
+    class Limit:
+        def __init__(self, most: list[float]) -> None:
+            self.most, self.value = np.array(most), list(most)
+
+        def get(self) -> list[float]:
+            return self.value
+
+        def set(self, value: list[float]) -> None:
+            assert len(value) == 7 and (0.0 < np.array(value)).all()
+            assert (np.array(value) <= self.most + 1e-12).all()
+            self.value = value
 
     class Motion:
-        def __init__(self, target: object, *, relative_dynamics_factor: float) -> None:
+        def __init__(self, target: object, *, relative_dynamics_factor: float = 1.0) -> None:
             assert 0.0 < relative_dynamics_factor <= 1.0
             self.target, self.factor = target, relative_dynamics_factor
             self.reactions: list[Reaction] = []
@@ -91,7 +98,7 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
     class CartesianMotion(Motion):
         pass
 
-    class JointWaypointMotion(Motion):
+    class JointMotion(Motion):
         pass
 
     class CartesianStopMotion:
@@ -110,6 +117,9 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
 
         def __init__(self, host: str, *, realtime_config: str) -> None:
             assert realtime_config == "ignore"
+            self.joint_velocity_limit = Limit([2.62] * 4 + [5.26, 4.18, 5.26])
+            self.joint_acceleration_limit = Limit([10.0] * 7)
+            self.joint_jerk_limit = Limit([5000.0] * 7)
             if world.connect is not None:
                 raise world.connect
 
@@ -127,8 +137,12 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
             world.moves.append(motion)
             if world.fail is not None:
                 raise world.fail
-            if isinstance(motion, JointWaypointMotion):
-                world.q = motion.target[-1].target.position
+            if isinstance(motion, JointMotion):
+                motion.limits = [np.array(limit.get()) for limit in
+                                 (self.joint_velocity_limit, self.joint_acceleration_limit,
+                                  self.joint_jerk_limit)]  # fmt: skip
+                motion.start = world.q
+                world.q = motion.target.position
                 world.T = ARM.pose(world.q)
                 return
             follow(world, motion.target.matrix)
@@ -168,7 +182,7 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
         def stop(self) -> bool:
             return True
 
-    made = (Affine, JointState, JointWaypoint, CartesianMotion, JointWaypointMotion,
+    made = (Affine, JointState, CartesianMotion, JointMotion,
             CartesianStopMotion, Robot, Gripper)  # fmt: skip
     for cls in made:
         setattr(franky, cls.__name__, cls)

@@ -1,7 +1,12 @@
 """The Franka Research 3 through franky: server version 10, system 5.9 or later, no ROS.
 
 Straight lines are the robot's own: franky's Cartesian motions with limited jerk, ended by its
-reaction to force in the 1 kHz loop. So the elbow goes where the robot lets it.
+reaction to force in the 1 kHz loop. So the elbow goes where the robot lets it. Its planner limits
+each axis by itself and brings all to their ends at the same time, each on a profile of its own. So
+a joint motion gets limits in proportion to the joints' ways, which makes the profiles alike and the
+way straight; and a line's axes, of which three may be at their limit at once, share its speed.
+
+Source: franky, `position_waypoint_motion.hpp` and `cartesian_waypoint_motion.cpp`.
 
 Never run on a physical robot by the authors, nor on a simulated one in the tests: those use a
 stand-in for franky that has its names. Stopping by software is no safety function.
@@ -9,6 +14,7 @@ stand-in for franky that has its names. Stopping by software is no safety functi
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -37,6 +43,7 @@ from ..robot import (
     check_pose,
     check_range,
 )
+from ..stop_latch import StopLatch
 from ..straight_line import distance
 from .bounded import run_bounded
 from .franka_config import RECOVERY_TIMEOUT, NetworkedConfig
@@ -49,9 +56,7 @@ FR3_Q_MIN = np.array([-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.01
 """Lowest joint positions of an FR3 [rad]; they differ from the Panda's."""
 FR3_Q_MAX = np.array([2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159])
 """Highest joint positions of an FR3 [rad]."""
-# A share of the speeds that all backends mean: those of the Panda, which has the slower joints.
-_DQ_MAX = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])  # [rad/s]
-_SHARE = float((DQ_MAX / _DQ_MAX).min())
+_STANDSTILL = 1e-6  # [rad]: nowhere to go
 _QUICK = 5.0  # [s]
 _MOTION = 120.0  # [s]
 _MODES = {
@@ -84,6 +89,7 @@ class FR3Robot(Closing):
             ) from error
         self._franky = franky
         self._closed = False
+        self._latch = StopLatch()
         host = self.config.host
         # Without a real-time kernel, too: `franka doctor` says what that costs.
         self._robot = self._connect(
@@ -124,6 +130,8 @@ class FR3Robot(Closing):
     def move_joints(self, q: np.ndarray, *, speed: float) -> None:
         """Move through joint way-points; see `Robot.move_joints`. The arm rests at each.
 
+        A share of the greatest speeds means those of the Panda, which has the slower joints.
+
         Raises:
             InputError: also beyond the FR3's own joint limits
         """
@@ -136,13 +144,35 @@ class FR3Robot(Closing):
                 f"q: joint {joint + 1} is beyond an FR3's limits {FR3_Q_MIN[joint]} to "
                 f"{FR3_Q_MAX[joint]}; choose another way-point"
             )
-        franky = self._franky
-        way = [franky.JointWaypoint(franky.JointState(point.tolist())) for point in points]
-        motion = franky.JointWaypointMotion(way, relative_dynamics_factor=speed * _SHARE)
-        self._move(motion)
+        at = self.state().q
+        for point in points:
+            self._straight(at, point, speed)
+            at = point
         off = float(np.abs(self.state().q - points[-1]).max())
         if off > self.config.arrival_tolerance_rad:
             raise MotionError(f"a joint ended {off:.3f} rad from its target")
+
+    def _straight(self, start: np.ndarray, point: np.ndarray, speed: float) -> None:
+        """Go from `start` to `point` (7,) [rad] with the joints in proportion."""
+        ways = np.abs(point - start)
+        if ways.max() < _STANDSTILL:
+            return
+        franky, robot = self._franky, self._robot
+        # A joint that stays needs a limit above 0; it gets there at once.
+        ways = np.maximum(ways, 1e-6 * ways.max())
+        limits = (robot.joint_velocity_limit, robot.joint_acceleration_limit,
+                  robot.joint_jerk_limit)  # fmt: skip
+        before = [self._quick(limit.get) for limit in limits]
+        tops = (speed * DQ_MAX, *(speed * np.array(limit) for limit in before[1:]))
+        try:
+            for limit, top in zip(limits, tops, strict=True):
+                shares = (ways * float((top / ways).min())).tolist()
+                self._quick(functools.partial(limit.set, shares))
+            self._move(franky.JointMotion(franky.JointState(point.tolist())))
+        finally:
+            if not self._closed:
+                for limit, value in zip(limits, before, strict=True):
+                    self._quick(functools.partial(limit.set, np.array(value).tolist()))
 
     def move_linear(
         self, base_T_tcp: np.ndarray, *, speed: float, stop_force_N: float | None = None
@@ -154,7 +184,8 @@ class FR3Robot(Closing):
             high = self.config.collision_force_N
             check_range("stop_force_N", stop_force_N, low=0.0, high=high, unit="N")
         franky = self._franky
-        share = min(speed / float(self._robot.translation_velocity_limit.get()), 1.0)
+        limit = float(self._robot.translation_velocity_limit.get())
+        share = min(speed / (np.sqrt(3.0) * limit), 1.0)
         # The constructor takes a matrix: no quaternion, whose order differs between libraries.
         motion = franky.CartesianMotion(franky.Affine(target), relative_dynamics_factor=share)
         met = threading.Event()
@@ -200,11 +231,12 @@ class FR3Robot(Closing):
         return self.config.min_held_m < width <= width_m + self.config.held_tolerance_m
 
     def stop(self) -> None:
-        """End the motion in progress; see `Robot.stop`."""
-        self._quick(lambda: self._robot.stop())
+        """End the motion in progress, and let none begin until `recover`; see `Robot.stop`."""
+        self._latch.stop(lambda: self._quick(lambda: self._robot.stop()))
 
     def recover(self) -> None:
-        """Clear a reflex; see `Robot.recover`."""
+        """Clear a reflex and a stop; see `Robot.recover`."""
+        mark = self._latch.mark()
         mode = self.state().mode
         if mode == RobotMode.USER_STOPPED:
             raise UserStopped("the user stop is pressed")
@@ -218,6 +250,7 @@ class FR3Robot(Closing):
         )
         if not recovered:
             raise ReflexError("the robot does not recover", advice="recover it by hand in Desk")
+        self._latch.release(mark)
 
     def close(self) -> None:
         """End the connection; see `Robot.close`."""
@@ -246,11 +279,15 @@ class FR3Robot(Closing):
             raise self._typed(error) from error
 
     def _move(self, motion: Any) -> None:
+        """Make a motion in another thread; Ctrl-C stops it, which `SafeRobot` lets hold."""
         if self._closed:
             raise ConnectionLost("this connection was closed", advice="connect anew")
         robot = self._robot
         try:
-            run_bounded(lambda: robot.move(motion), timeout_s=_MOTION, stop=robot.stop)
+            with self._latch.motion():
+                run_bounded(lambda: robot.move(motion), timeout_s=_MOTION, stop=robot.stop)
+                if self._latch.pressed:
+                    raise MotionError("the motion was stopped")
         except TimeoutError as error:
             raise MotionError("the motion did not end in time and was stopped") from error
         except self._errors() as error:
@@ -259,6 +296,7 @@ class FR3Robot(Closing):
     def _finger(self, call: Callable[[], bool]) -> bool:
         if self._closed:
             raise ConnectionLost("this connection was closed", advice="connect anew")
+        self._latch.check()
         try:
             return bool(run_bounded(call, timeout_s=4 * _QUICK, stop=self._gripper.stop))
         except TimeoutError as error:

@@ -41,6 +41,7 @@ from ..robot import (
     check_pose,
     check_range,
 )
+from ..stop_latch import StopLatch
 from ..straight_line import distance
 from .bounded import run_bounded
 from .franka_config import FrankaConfig
@@ -104,6 +105,7 @@ class FrankapyRobot(Closing):
         self._say = say or (lambda line: print(line, file=sys.stderr, flush=True))
         self._sleep = sleep
         self._closed = False
+        self._latch = StopLatch()
         try:
             import frankapy
             import rospy
@@ -259,6 +261,7 @@ class FrankapyRobot(Closing):
     def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:
         """Move the fingers; see `Robot.open_gripper`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
+        self._latch.check()
         self._call(
             lambda: self._arm.goto_gripper(
                 width_m, grasp=False, speed=self.config.gripper_speed, block=True
@@ -272,6 +275,7 @@ class FrankapyRobot(Closing):
         """Close the fingers; see `Robot.grasp`."""
         check_range("width_m", width_m, low=0.0, high=GRIPPER_MAX_WIDTH, unit="m")
         check_range("force_N", force_N, low=0.0, high=70.0, unit="N")
+        self._latch.check()
         self._call(
             lambda: self._arm.goto_gripper(
                 width_m,
@@ -287,17 +291,19 @@ class FrankapyRobot(Closing):
         return self.config.min_held_m < reached <= width_m + self.config.held_tolerance_m
 
     def stop(self) -> None:
-        """End the motion in progress; see `Robot.stop`."""
-        self._call(self._arm.stop_skill)
+        """End the motion in progress, and let none begin until `recover`; see `Robot.stop`."""
+        self._latch.stop(lambda: self._call(self._arm.stop_skill))
 
     def recover(self) -> None:
         """End what runs; franka-interface recovers from a reflex by itself; see `Robot.recover`."""
+        mark = self._latch.mark()
         if self.state().mode is not RobotMode.IDLE:
-            self.stop()
+            self._call(self._arm.stop_skill)
         if self.state().mode is not RobotMode.IDLE:
             raise MotionError(
                 "a skill still runs after it was stopped", advice="restart franka-interface"
             )
+        self._latch.release(mark)
 
     def close(self) -> None:
         """Accept nothing more; frankapy has nothing to close."""
@@ -316,9 +322,12 @@ class FrankapyRobot(Closing):
 
     def _skill(self, motion: Callable[[], Any]) -> None:
         try:
-            self._call(motion)
+            with self._latch.motion():
+                self._call(motion)
+                if self._latch.pressed:
+                    raise MotionError("the motion was stopped")
         except KeyboardInterrupt:
-            self._arm.stop_skill()
+            self.stop()
             raise
 
     def _call(self, call: Callable[[], T]) -> T:
