@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_deform.collection import Attempt, Collection, append_attempt
+from warp_deform.enclosed import ENCLOSED
 from warp_deform.episode_loop import SOLVED, Run, play, worlds_for
 from warp_deform.episodes import (
     Episode,
@@ -199,7 +200,8 @@ def _refined(worlds: Worlds, recording: Recording, seed: int, config: RefineConf
     searcher = _Searcher(original, config.search)
     ((slot, run),) = play(worlds, [seed], act=searcher.act, look=observe, goals=lambda _: goal)
     _check_start(original, run)
-    before, improved = original.info, _better(run, original.info, config.accept)
+    before = original.info
+    improved = _better(run, before, config.accept, enclosed=worlds.enclosed(slot))
     origins = searcher.origins if improved else [RECORDED] * before.actions
     made = original
     if improved:
@@ -260,7 +262,7 @@ class _Searcher:
             return None
         best = found[0]
         if best.solved:  # the search goes by promise, but the score is what counts now
-            best = max((outlook for outlook in found if outlook.solved), key=lambda o: o.score)
+            best = max((o for o in found if o.solved), key=lambda o: (o.grade, o.score))
         same = recorded is not None and best.action.tobytes() == recorded.tobytes()
         self.origins.append(RECORDED if same else best.origin)
         return best.action
@@ -279,12 +281,19 @@ def _check_start(original: Episode, run: Run[Step]) -> None:
         )
 
 
-def _better(run: Run[Step], before: EpisodeInfo, accept: str) -> bool:
-    """Whether an episode takes the place of the original."""
+def _better(
+    run: Run[Step], before: EpisodeInfo, accept: str, *, enclosed: bool | None = None
+) -> bool:
+    """Whether an episode takes the place of the original.
+
+    enclosed: whether its bag keeps its items, see `Task.enclosed`; None where there are none
+    """
     if len(run.rows) != len(run.actions) + 1:
         return False  # the physics failed
     score, actions = run.rows[-1].score, len(run.actions)
     if before.success and run.ended != SOLVED:
+        return False
+    if before.extra.get(ENCLOSED) and enclosed is False:
         return False
     if before.success and accept == "solved":
         return (-actions, score) > (-before.actions, before.score)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_bag_tasks import delivered, snapshot, start
 
+from warp_deform import demonstrators
 from warp_deform.env import PickPlaceEnv
 from warp_deform.episode_loop import play
-from warp_deform.planning import Lookahead
+from warp_deform.planning import Lookahead, Outlook, SearchConfig, search
 from warp_deform.registration import env_id
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.bag_items import BagItems1, BagItems2
@@ -134,6 +137,77 @@ def test_enclosed_of_other_tasks_is_of_the_end_alone_or_nothing() -> None:
     assert task.enclosed(layout, snapshot(task, layout)) is False
     task, layout = start(TASKS["bag-alone-open"])
     assert task.enclosed(layout, snapshot(task, layout)) is None
+
+
+# -- who looks ahead
+
+
+def outlook(action: np.ndarray, grade: int, after: object = None) -> Outlook:
+    return Outlook(action, grade, 0.0, 0.0, after)
+
+
+class Told:
+    """A lookahead that knows what becomes of actions by their pick x, from the start or later."""
+
+    def __init__(self, first: dict[float, int], second: dict[float, int]) -> None:
+        self.first, self.second, self.tried, self.rollouts = first, second, [], 0
+
+    def try_each(self, jobs, *, keep: bool = False) -> list[Outlook]:
+        self.rollouts += len(jobs)
+        self.tried += [float(action[0]) for _, action in jobs]
+        found = []
+        for state, action in jobs:
+            grades = self.first if state is STATE else self.second
+            found.append(outlook(action, grades.get(float(action[0]), 0), LATER if keep else None))
+        return found
+
+
+def state_of(episode: object) -> SimpleNamespace:
+    return SimpleNamespace(episode=episode)
+
+
+EPISODE = SimpleNamespace(layout=None, snapshot=None)
+STATE, LATER = state_of(EPISODE), state_of(EPISODE)
+
+
+class Offers(BagItems1):
+    """Offers as many actions as asked for, which differ in their pick x."""
+
+    def candidates(self, layout, snapshot, rng, count: int) -> list[np.ndarray]:
+        xs = 0.30 + 0.01 * np.arange(count)
+        return [np.array([x, 0.0, 0.0, 0.5, 0.0, 0.0, CARRY.lift]) for x in xs]
+
+
+def pick_x(count: int) -> float:
+    return float(0.30 + 0.01 * np.arange(32)[count])
+
+
+def test_a_search_goes_on_where_a_solution_would_lose_the_item() -> None:
+    config = SearchConfig(method="enumerate", budget=8, depth=2, beam=1)
+    rng = np.random.default_rng(0)
+    lost_or_on = Told({pick_x(0): 3, pick_x(1): 2}, {pick_x(2): 4})
+    best = search(lost_or_on, Offers(), STATE, rng, config)[0]
+    assert best.action[0] == pick_x(1)  # two actions that keep it go before one that does not
+    lost_or_nothing = Told({pick_x(0): 3, pick_x(1): 2}, {})
+    assert search(lost_or_nothing, Offers(), STATE, rng, config)[0].action[0] == pick_x(0)
+    kept = Told({pick_x(0): 3, pick_x(3): 4}, {})
+    assert search(kept, Offers(), STATE, rng, config)[0].action[0] == pick_x(3)
+    assert len(kept.tried) == 4, "nothing is left to search for"
+
+
+@pytest.mark.parametrize(("early", "late", "chosen", "tries"), [
+    ({0: 4}, {}, 0, 8), ({2: 2}, {9: 4}, 2, 8), ({0: 3}, {9: 4}, 9, 32), ({0: 3}, {9: 2}, 0, 32),
+    ({}, {20: 2}, 20, 32),
+])  # fmt: skip
+def test_mpc_tries_more_where_the_best_would_end_badly(
+    monkeypatch, early, late, chosen, tries
+) -> None:
+    told = Told({pick_x(k): grade for k, grade in (early | late).items()}, {})
+    monkeypatch.setattr(demonstrators, "_lookahead", lambda worlds: told)
+    worlds = SimpleNamespace(task=Offers(), episodes={0: EPISODE}, state=lambda slot: STATE)
+    run = SimpleNamespace(rng=np.random.default_rng(0))
+    action = demonstrators.DEMONSTRATORS["mpc"](worlds, {0: run})[0]
+    assert action[0] == pick_x(chosen) and len(told.tried) == tries
 
 
 # -- simulated

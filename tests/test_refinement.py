@@ -240,6 +240,17 @@ def test_the_rules_of_what_is_better(
     assert not refinement._better(broken, info, "solved"), "the physics failed"
 
 
+def test_no_refined_episode_loses_an_item_that_the_bag_had_kept() -> None:
+    info = replace(make_episode().info, success=True, score=0.6, actions=4)
+    fewer = _played(0.9, 2)
+    for kept, enclosed, expected in (
+        (True, False, False), (True, True, True), (False, False, True), (None, None, True),
+    ):  # fmt: skip
+        before = replace(info, extra={} if kept is None else {"enclosed": kept})
+        for accept in ("score", "solved"):
+            assert refinement._better(fewer, before, accept, enclosed=enclosed) is expected
+
+
 def test_a_rule_that_is_none_is_refused() -> None:
     with pytest.raises(InputError, match="no rule 'luck'; choose from score, solved"):
         RefineConfig(source=Path("a"), out=Path("b"), accept="luck")
