@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 from drawable_samples import NO_BODIES, NO_PARTICLES, TABLE, drawables
 from drawable_samples import scene as sample_scene
 
@@ -14,7 +15,7 @@ from warp_deform.rendering.geometry import box_mesh
 from warp_deform.rendering.normals import crease_normals
 from warp_deform.rendering.perspective import Perspective
 from warp_deform.rendering.pixels import PIXEL_SIZE
-from warp_deform.rendering.scene_view import SceneView
+from warp_deform.rendering.scene_view import STUDIO, SceneView
 from warp_deform.rendering.topdown import TopDown
 
 
@@ -182,3 +183,59 @@ def test_cameras_refuse_nonsense():
         Camera(np.array([[100.0, 5, 0], [0, 100, 0], [0, 0, 1]]), np.eye(4))
     with pytest.raises(InputError, match="straight above"):
         look_at((0, 0, 1), (0, 0, 0), size=(10, 10), vertical_fov=1.0)
+
+
+@pytest.mark.parametrize(
+    ("supersample", "names"), [(1, ("color", "depth", "segmentation")), (2, ("color",))]
+)
+def test_what_is_drawn_again_in_parts_has_the_bits_of_a_picture_drawn_whole(
+    scene, supersample, names
+):
+    """Things move, stand still, turn about themselves, leave and come back; cameras alternate."""
+    shown, particle_q, body_q = scene
+    rng = np.random.default_rng(0)
+    vertices, faces = box_mesh((0.1, 0.2, 0.3))
+    vertices, pose = np.concatenate([vertices, [[0.3, 0.3, 0.3]]]), np.eye(4)
+    faces = np.concatenate([faces, [[0, 7, 8]]])
+    camera = look_at((1.3, -0.6, 0.8), (0.45, 0.0, 0.05), size=(150, 203), vertical_fov=0.7)
+    options = {"look": STUDIO, "supersample": supersample, "links": True}
+    renderer = Perspective(**options)
+    other, elsewhere = drawables(spheres=[0.05]), np.array([[0.5, 0.1, 0.1]])
+    for step in range(10):
+        particle_q, body_q, pose = particle_q.copy(), body_q.copy(), pose.copy()
+        if step in (1, 2):
+            particle_q[5:9] += rng.normal(0, 0.02, (4, 3))
+        if step == 3:
+            body_q[:, :3] += [0.05, 0.05, 0.1]
+        if step in (4, 5):
+            pose[:3, 3] = rng.uniform([0.3, -0.3, 0.1], [0.7, 0.3, 0.5])
+        if step == 6:
+            pose[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
+        if step == 7:
+            pose[2, 3] = 0.9
+        if step == 8:  # a state that is refused must not be a base for the next picture
+            with pytest.raises(InputError, match="not finite"):
+                renderer.render(shown, particle_q * np.nan, body_q, [camera])
+            renderer.render(other, elsewhere, NO_BODIES, [camera])
+        links = [(vertices, faces, pose, (200, 30, 30))]
+        scene_now = shown, particle_q, body_q, [camera, paper_cameras()[0]], links
+        seen, fresh = renderer.render(*scene_now), Perspective(**options).render(*scene_now)
+        for picture, whole in zip(seen, fresh, strict=True):
+            for name in names:
+                assert (getattr(picture, name) == getattr(whole, name)).all(), (step, name)
+
+
+def test_a_picture_of_the_same_state_shades_nothing_again(scene, monkeypatch):
+    renderer, camera = Perspective(), paper_cameras()[0]
+    launched = []
+    launch = wp.launch
+
+    def noting(kernel, *arguments, **options):
+        launched.append(kernel.key)
+        return launch(kernel, *arguments, **options)
+
+    monkeypatch.setattr(wp, "launch", noting)
+    first = renderer.render(*scene, [camera])[0].color
+    assert launched.count("shade") == 1
+    assert (first == renderer.render(*scene, [camera])[0].color).all()
+    assert launched.count("shade") == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from warp_deform.errors import InputError
+from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.rendering.caption import annotate
 from warp_deform.rendering.video import VideoWriter, write_png
 
@@ -70,3 +70,52 @@ def test_png_and_caption(tmp_path):
     assert (drawn[:45, :60] < 120).any()
     write_png(tmp_path / "a.png", drawn)
     assert (cv2.imread(str(tmp_path / "a.png"))[..., ::-1] == drawn).all()
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("echo 'Error opening output files: Encoder not found' >&2; exit 8", "Encoder not found"),
+        ("head -c 9 >/dev/null; echo 'out: No space left on device' >&2; exit 228", "No space"),
+        ("cat >/dev/null; echo 'No space left on device\nConversion failed!' >&2; exit 1", "space"),
+        ("exit 3", "no reason"),
+    ],
+)
+def test_an_encoder_that_gives_up_is_one_line_and_leaves_nothing(
+    tmp_path, monkeypatch, script, said
+):
+    encoder = tmp_path / "ffmpeg"
+    encoder.write_text(f"#!/bin/sh\n{script}\n")
+    encoder.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(encoder))
+    with (
+        pytest.raises(WarpDeformError, match="ffmpeg gave up") as raised,
+        VideoWriter(tmp_path / "a.mp4", 10) as video,
+    ):
+        for _ in range(50):  # more than the pipe holds
+            video.write(np.zeros((120, 160, 3), np.uint8))
+    assert said in str(raised.value) and "\n" not in str(raised.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
+
+
+def test_a_missing_encoder_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
+    with (
+        pytest.raises(WarpDeformError, match="no ffmpeg could be started"),
+        VideoWriter(tmp_path / "a.mp4", 10) as video,
+    ):
+        video.write(np.zeros((16, 16, 3), np.uint8))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_video_without_frames_is_refused(tmp_path):
+    with pytest.raises(InputError, match="needs a frame"), VideoWriter(tmp_path / "a.mp4", 10):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_video_leaves_nothing(tmp_path):
+    with pytest.raises(KeyboardInterrupt), VideoWriter(tmp_path / "a.mp4", 10) as video:
+        video.write(np.zeros((16, 16, 3), np.uint8))
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())

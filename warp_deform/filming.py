@@ -67,6 +67,8 @@ def film(
     """
     reader = EpisodeReader(folder)
     chosen = reader.seeds[:1] if seeds is None else seeds
+    if not len(chosen):
+        raise InputError(f"{path} would show no episode; name at least one seed")
     infos = [reader.info(seed) for seed in chosen]
     for info in infos:
         if not info.actions:

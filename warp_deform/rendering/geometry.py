@@ -6,6 +6,7 @@ particles | box corners | flat marks | corners of meshes. So a rasteriser knows 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +26,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 MESH_MATERIAL = 256
 """Materials below this are segmentation ids; those from here on are the meshes', in their order."""
 
+_STATES = itertools.count()
 # corners of a box in units of its half sides, and its faces, outwards
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
 _FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
@@ -95,22 +97,62 @@ def corner_normals(
     mesh_normals: wp.array2d(dtype=wp.vec3),
     triangle_mesh: wp.array(dtype=int),
     normals: wp.array2d(dtype=wp.vec3),
+    changed: wp.array(dtype=int),
 ):
-    """Write shading normals: smooth on sheets, flat on boxes and marks, a mesh's own."""
+    """Write shading normals: smooth on sheets, flat on boxes and marks, a mesh's own.
+
+    What has another normal looks different, even where it did not move: `changed` is 1 then.
+    """
     f, k = wp.tid()
     tri = triangles[f]
+    n = wp.vec3(0.0, 0.0, 0.0)
     if f >= mesh_triangle:
         local = mesh_normals[f - mesh_triangle, k]
-        normals[f, k] = wp.transform_vector(mesh_pose[triangle_mesh[f - mesh_triangle]], local)
+        n = wp.transform_vector(mesh_pose[triangle_mesh[f - mesh_triangle]], local)
     elif f < sheet_triangles:
-        n = wp.vec3(0.0, 0.0, 0.0)
         for s in range(star_start[tri[k]], star_start[tri[k] + 1]):
             t = triangles[star[s]]
             n += wp.cross(points[t[1]] - points[t[0]], points[t[2]] - points[t[0]])
-        normals[f, k] = wp.normalize(n)
+        n = wp.normalize(n)
     else:
-        n = wp.cross(points[tri[1]] - points[tri[0]], points[tri[2]] - points[tri[0]])
-        normals[f, k] = wp.normalize(n)
+        n = wp.normalize(wp.cross(points[tri[1]] - points[tri[0]], points[tri[2]] - points[tri[0]]))
+    for axis in range(3):
+        if normals[f, k][axis] != n[axis]:
+            changed[f] = 1
+    normals[f, k] = n
+
+
+@wp.kernel
+def find_moved(
+    points: wp.array(dtype=wp.vec3), known: wp.array(dtype=wp.vec3), moved: wp.array(dtype=int)
+):
+    """Which points are elsewhere than when this was asked last."""
+    i = wp.tid()
+    moved[i] = 0
+    for k in range(3):
+        if points[i][k] != known[i][k]:
+            moved[i] = 1
+    known[i] = points[i]
+
+
+@wp.kernel
+def find_changed(
+    scene: Scene,
+    moved: wp.array(dtype=int),
+    spheres: int,
+    links: int,
+    changed: wp.array(dtype=int),
+):
+    """Which primitives have a point that moved; triangles first, then spheres, then rods."""
+    i = wp.tid()
+    if i < spheres:
+        tri = scene.triangles[i]
+        changed[i] = moved[tri[0]] | moved[tri[1]] | moved[tri[2]]
+    elif i < links:
+        changed[i] = moved[scene.sphere_particle[i - spheres]]
+    else:
+        ends = scene.link_particle[i - links]
+        changed[i] = moved[ends[0]] | moved[ends[1]]
 
 
 class HostArray:
@@ -249,6 +291,8 @@ class Geometry:
         self._mesh_of = mesh_of
         self._meshes = tuple(meshes)
         self._smooth = False
+        self.state: int | None = None
+        self.previous_state: int | None = None
 
     def _constant(self, values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)
@@ -307,24 +351,39 @@ class Geometry:
             self._constant(self._mesh_of, wp.int32),
             self.scene.triangle_normals,
         ]
+        points = len(self.scene.points)
+        links = self.triangle_count + self.sphere_count
+        self.changed = wp.zeros(links + self.link_count, dtype=wp.int32, device=self.device)
+        self._moved = wp.zeros(points, dtype=wp.int32, device=self.device)
+        self._known = wp.zeros(points, dtype=wp.vec3, device=self.device)
 
     def move_scene(self, mesh_poses: np.ndarray) -> None:
-        """Bring the meshes to poses (M, 4, 4) and compute shading normals; call `move` first."""
+        """Bring the meshes to poses (M, 4, 4) and compute shading normals; call `move` first.
+
+        Then `changed` (primitives,) is 1 for triangles, spheres and rods that look different in
+        `state`, a number that no other state of any geometry has, than in `previous_state`; None is
+        no state.
+        """
         self.prepare_scene()
         poses = np.asarray(mesh_poses, dtype=float).reshape(-1, 4, 4)
         if len(poses) != len(self._meshes) or not np.isfinite(poses).all():
             raise InputError(f"expected {len(self._meshes)} finite mesh poses, got {len(poses)}")
+        before, self.state = self.state, None  # until all is in its place
+        device, scene = self.device, self.scene
         if len(poses):
             self._pose.write(poses)
             wp.launch(
-                place_meshes,
-                len(self._mesh_inputs[2]),
-                inputs=self._mesh_inputs,
-                device=self.device,
+                place_meshes, len(self._mesh_inputs[2]), inputs=self._mesh_inputs, device=device
             )
-        wp.launch(
-            corner_normals,
-            (self.triangle_count, 3),
-            inputs=self._normal_inputs,
-            device=self.device,
-        )
+        spheres = self.triangle_count
+        for kernel, dim, inputs in (
+            (find_moved, len(scene.points), [scene.points, self._known, self._moved]),
+            (
+                find_changed,
+                len(self.changed),
+                [scene, self._moved, spheres, spheres + self.sphere_count, self.changed],
+            ),
+            (corner_normals, (self.triangle_count, 3), [*self._normal_inputs, self.changed]),
+        ):
+            wp.launch(kernel, dim, inputs=inputs, device=device)
+        self.previous_state, self.state = before, next(_STATES)

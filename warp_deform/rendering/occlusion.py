@@ -13,9 +13,11 @@ import warp as wp
 
 from .camera import Camera
 from .geometry import Geometry
-from .pinhole import View, draw, inverse_depth, ray, to_camera, view_of
+from .pinhole import View, inverse_depth, ray, to_camera, view_of
+from .zbuffer import ZBuffer
 
-__all__ = ["Occluders", "draw_occluders", "lit_share", "occluders", "open_share"]
+__all__ = ["OccluderBuffer", "Occluders", "above_sample", "lamp_sample", "lit_share", "open_share",
+           "tap_reach"]  # fmt: skip
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -35,23 +37,20 @@ class Occluders:
     keys: wp.array2d(dtype=wp.int64)
     tops: wp.array2d(dtype=float)  # highest world z in each tile [m]
     tops_near: wp.array2d(dtype=float)  # the same over a tile and its eight neighbours
-
-
-def occluders(camera: Camera, device: wp.Device) -> Occluders:
-    """Empty buffers for what `camera` sees; its size is a multiple of the tile's."""
-    result = Occluders()
-    result.view = view_of(camera)
-    result.keys = wp.zeros(camera.size, dtype=wp.int64, device=device)
-    tiles = (camera.size[0] // TILE, camera.size[1] // TILE)
-    result.tops = wp.full(tiles, NOWHERE, dtype=float, device=device)
-    result.tops_near = wp.full(tiles, NOWHERE, dtype=float, device=device)
-    return result
+    changed_near: wp.array2d(dtype=int)  # 1 where one of these nine changed
 
 
 @wp.kernel
-def find_tops(view: View, keys: wp.array2d(dtype=wp.int64), tops: wp.array2d(dtype=float)):
-    """One thread a tile: its highest point."""
+def find_tops(
+    view: View,
+    tiles: wp.array2d(dtype=int),
+    keys: wp.array2d(dtype=wp.int64),
+    tops: wp.array2d(dtype=float),
+):
+    """One thread a tile: its highest point, where it changed."""
     i, j = wp.tid()
+    if tiles[i, j] == 0:
+        return
     top = float(NOWHERE)
     for r in range(i * TILE, (i + 1) * TILE):
         for c in range(j * TILE, (j + 1) * TILE):
@@ -64,50 +63,96 @@ def find_tops(view: View, keys: wp.array2d(dtype=wp.int64), tops: wp.array2d(dty
 
 
 @wp.kernel
-def spread_tops(tops: wp.array2d(dtype=float), tops_near: wp.array2d(dtype=float)):
-    """One thread a tile: the highest point of it and its neighbours."""
+def spread_tops(
+    tiles: wp.array2d(dtype=int),
+    tops: wp.array2d(dtype=float),
+    tops_near: wp.array2d(dtype=float),
+    changed_near: wp.array2d(dtype=int),
+):
+    """One thread a tile: the highest point of it and its neighbours, and whether one changed."""
     i, j = wp.tid()
     top = float(NOWHERE)
+    changed = int(0)
     for r in range(wp.max(i - 1, 0), wp.min(i + 2, tops.shape[0])):
         for c in range(wp.max(j - 1, 0), wp.min(j + 2, tops.shape[1])):
             top = wp.max(top, tops[r, c])
+            changed = changed | tiles[r, c]
     tops_near[i, j] = top
+    changed_near[i, j] = changed
 
 
-def draw_occluders(target: Occluders, geometry: Geometry, *, links: bool) -> None:
-    """Fill `target` with what its view sees of `geometry`."""
-    draw(geometry, target.view, target.keys, links=links)
-    tiles, device = target.tops.shape, geometry.device
-    wp.launch(find_tops, tiles, inputs=[target.view, target.keys, target.tops], device=device)
-    wp.launch(spread_tops, tiles, inputs=[target.tops, target.tops_near], device=device)
+class OccluderBuffer:
+    """A view from high up, whose size is a multiple of the tile's, and what it sees.
+
+    seen: what a shader reads
+    """
+
+    def __init__(self, camera: Camera, *, links: bool, device: wp.Device) -> None:
+        self._device = device
+        self._buffer = ZBuffer(view_of(camera), side=TILE, links=links, device=device)
+        tiles = self._buffer.shape
+        self.seen = Occluders()
+        self.seen.view, self.seen.keys = self._buffer.view, self._buffer.keys
+        self.seen.tops = wp.full(tiles, NOWHERE, dtype=float, device=device)
+        self.seen.tops_near = wp.full(tiles, NOWHERE, dtype=float, device=device)
+        self.seen.changed_near = wp.zeros(tiles, dtype=int, device=device)
+
+    def draw(self, geometry: Geometry) -> None:
+        """Bring it up to date."""
+        self._buffer.draw(geometry)
+        seen, tiles = self.seen, self._buffer.tiles
+        for kernel, inputs in (
+            (find_tops, [seen.view, tiles, seen.keys, seen.tops]),
+            (spread_tops, [tiles, seen.tops, seen.tops_near, seen.changed_near]),
+        ):
+            wp.launch(kernel, tiles.shape, inputs=inputs, device=self._device)
 
 
 @wp.func
-def lit_share(lamp: Occluders, p: wp.vec3, n: wp.vec3):
-    """Share of the lamp's light that reaches `p`: a soft-edged box filter over its z-buffer."""
-    q = to_camera(lamp.view, p + n * OFFSET)
+def lamp_sample(view: View, p: wp.vec3, n: wp.vec3):
+    """Column, row and depth [m] at which `lit_share` looks; a negative column for nowhere."""
+    q = to_camera(view, p + n * OFFSET)
     if q[2] < 0.1:
-        return 1.0
-    x = q[0] / q[2] * lamp.view.fx + lamp.view.cx
-    y = q[1] / q[2] * lamp.view.fy + lamp.view.cy
+        return wp.vec3(-1.0, -1.0, 1.0)
+    x = q[0] / q[2] * view.fx + view.cx
+    y = q[1] / q[2] * view.fy + view.cy
     edge = float(SOFT) + 1.0
     if (
         x < edge
         or y < edge
-        or x > float(lamp.view.columns) - edge - 2.0
-        or y > float(lamp.view.rows) - edge - 2.0
+        or x > float(view.columns) - edge - 2.0
+        or y > float(view.rows) - edge - 2.0
     ):
+        return wp.vec3(-1.0, -1.0, 1.0)
+    return wp.vec3(x, y, q[2])
+
+
+@wp.func
+def lit_share(
+    keys: wp.array2d(dtype=wp.int64),
+    tops_near: wp.array2d(dtype=float),
+    at: wp.vec3,
+    p: wp.vec3,
+    n: wp.vec3,
+):
+    """Share of the lamp's light that reaches `p`: a soft-edged box filter over its z-buffer.
+
+    at: `lamp_sample` of the point; tiles beyond the neighbours of its own are not read
+    """
+    if at[0] < 0.0:
         return 1.0
+    x = at[0]
+    y = at[1]
     c = int(x)
     r = int(y)
-    if lamp.tops_near[r / TILE, c / TILE] < p[2] + n[2] * OFFSET:
+    if tops_near[r / TILE, c / TILE] < p[2] + n[2] * OFFSET:
         return 1.0
-    limit = wp.int64(wp.cast(1.0 / (q[2] - SLACK), wp.int32)) << wp.int64(32)
+    limit = wp.int64(wp.cast(1.0 / (at[2] - SLACK), wp.int32)) << wp.int64(32)
     # most points are wholly lit or wholly dark: ask the filter's corners and centre first
     hidden = int(0)
     for i in range(-1, 2):
         for j in range(-1, 2):
-            if i * i == j * j and lamp.keys[r + i * SOFT, c + j * SOFT] > limit:
+            if i * i == j * j and keys[r + i * SOFT, c + j * SOFT] > limit:
                 hidden += 1
     if hidden == 0:
         return 1.0
@@ -128,35 +173,61 @@ def lit_share(lamp: Occluders, p: wp.vec3, n: wp.vec3):
                 wx = 1.0 - fx
             if j == SOFT + 1:
                 wx = fx
-            if lamp.keys[r + i, c + j] > limit:
+            if keys[r + i, c + j] > limit:
                 total += wx * wy
     width = float(2 * SOFT + 1)
     return 1.0 - total / (width * width)
 
 
 @wp.func
-def open_share(above: Occluders, p: wp.vec3, n: wp.vec3):
-    """Share of the ambient light that nearby things leave to `p`, from the heights around it."""
-    q = to_camera(above.view, p + n * (OFFSET + 0.001))
-    x = q[0] / q[2] * above.view.fx + above.view.cx + 0.5
-    y = q[1] / q[2] * above.view.fy + above.view.cy + 0.5
-    # samples between two taps; five taps reach 18 mm to either side, less than a tile
-    reach = above.view.fx / q[2] * 0.009
-    margin = 2.0 * reach + 1.0
+def tap_reach(view: View, depth: float):
+    """Samples between two of the taps of `open_share`."""
+    # five taps reach 18 mm to either side, less than a tile
+    return view.fx / depth * 0.009
+
+
+@wp.func
+def above_sample(view: View, p: wp.vec3, n: wp.vec3):
+    """Column, row and depth [m] around which `open_share` looks; a negative column for nowhere."""
+    q = to_camera(view, p + n * (OFFSET + 0.001))
+    if q[2] < 0.1:
+        return wp.vec3(-1.0, -1.0, 1.0)
+    x = q[0] / q[2] * view.fx + view.cx + 0.5
+    y = q[1] / q[2] * view.fy + view.cy + 0.5
+    margin = 2.0 * tap_reach(view, q[2]) + 1.0
     if (
         x < margin
         or y < margin
-        or x > float(above.view.columns) - margin
-        or y > float(above.view.rows) - margin
-        or above.tops_near[int(y) / TILE, int(x) / TILE] < p[2] + SLACK
+        or x > float(view.columns) - margin
+        or y > float(view.rows) - margin
     ):
+        return wp.vec3(-1.0, -1.0, 1.0)
+    return wp.vec3(x, y, q[2])
+
+
+@wp.func
+def open_share(
+    view: View,
+    keys: wp.array2d(dtype=wp.int64),
+    tops_near: wp.array2d(dtype=float),
+    at: wp.vec3,
+    p: wp.vec3,
+):
+    """Share of the ambient light that nearby things leave to `p`, from the heights around it.
+
+    at: `above_sample` of the point
+    """
+    if at[0] < 0.0 or tops_near[int(at[1]) / TILE, int(at[0]) / TILE] < p[2] + SLACK:
         return 1.0
+    x = at[0]
+    y = at[1]
+    reach = tap_reach(view, at[2])
     total = float(0.0)
     for i in range(-2, 3):
         for j in range(-2, 3):
-            key = above.keys[int(y + float(i) * reach), int(x + float(j) * reach)]
+            key = keys[int(y + float(i) * reach), int(x + float(j) * reach)]
             if key > wp.int64(0):
-                rise = q[2] - 1.0 / inverse_depth(key)
+                rise = at[2] - 1.0 / inverse_depth(key)
                 if rise > SLACK:
                     total += rise / (rise + 0.006) / (1.0 + rise * rise * 150.0)
     return 1.0 - total / 25.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -13,9 +14,11 @@ from ..errors import InputError
 from .camera import Camera, look_at
 from .drawables import Drawables
 from .geometry import Geometry, HostArray, Mesh
-from .occlusion import draw_occluders, occluders
-from .pinhole import draw, view_of
-from .shading import Look, lighting_of, shade
+from .occlusion import OccluderBuffer, Occluders
+from .patches import LOOKS, PATCH, find_stale
+from .pinhole import view_of
+from .shading import Lighting, Look, lighting_of, shade
+from .zbuffer import ZBuffer
 
 __all__ = ["RGBD", "Perspective", "RobotLink"]
 
@@ -49,8 +52,10 @@ class Perspective:
     and segmentation need 1); links: whether rods are drawn between beads.
 
     An instance is for one thread at a time. Meshes are recognised by the identity of their arrays:
-    hand in the same arrays for every picture, and they are uploaded once. Shadows fall within about
-    a metre of the table's centre.
+    hand in the same arrays for every picture, and they are uploaded once. Where a picture has the
+    drawables, meshes and camera (the same objects) of the one before, only the patches that look
+    different are shaded again; the bits are those of a picture drawn whole. Shadows fall within
+    about a metre of the table's centre.
     """
 
     def __init__(
@@ -67,17 +72,20 @@ class Perspective:
         self._device = wp.get_device(device)
         self._supersample, self._links = supersample, links
         self._lighting = lighting_of(look)
-        self._lamp = occluders(_centred(look.lamp, SHADOW_SIZE, SHADOW_REACH), self._device)
-        # a little off the vertical, which has no right or left
-        self._above = occluders(_centred((0.5, -1e-3, 3.0), ABOVE_SIZE, ABOVE_REACH), self._device)
-        self._frames: dict[tuple[int, int], tuple[wp.array, HostArray, HostArray, HostArray]] = {}
+        self._lamp, self._above = (
+            OccluderBuffer(_centred(eye, size, reach), links=links, device=self._device)
+            for eye, size, reach in (
+                (look.lamp, SHADOW_SIZE, SHADOW_REACH),
+                # a little off the vertical, which has no right or left
+                ((0.5, -1e-3, 3.0), ABOVE_SIZE, ABOVE_REACH),
+            )
+        )
+        self._whole = False
+        self._pictures: dict[tuple[tuple[int, int], int], _Picture] = {}
         self._meshes: dict[tuple[int, int], Mesh] = {}
         self._geometries: WeakKeyDictionary[Drawables, tuple[Geometry, list[Mesh]]] = (
             WeakKeyDictionary()
         )
-
-    def _buffer(self, size: tuple[int, int]) -> wp.array:
-        return wp.zeros(size, dtype=wp.int64, device=self._device)
 
     def render(
         self,
@@ -94,46 +102,30 @@ class Perspective:
         Raises:
             InputError: the state is not finite or has fewer particles or bodies than are drawn.
         """
+        whole, self._whole = self._whole, False  # an interrupted picture is no base for the next
         geometry = self._geometry(drawables, len(particle_q), len(body_q), robot_links)
         geometry.move(particle_q, body_q)
         geometry.move_scene(np.array([link[2] for link in robot_links]))
-        draw_occluders(self._lamp, geometry, links=self._links)
+        if not whole:
+            geometry.previous_state = None
+        self._lamp.draw(geometry)
         if self._lighting.occlusion > 0:
-            draw_occluders(self._above, geometry, links=self._links)
-        return [self._picture(geometry, camera) for camera in cameras]
-
-    def _picture(self, geometry: Geometry, camera: Camera) -> RGBD:
-        view = view_of(camera, supersample=self._supersample)
-        if camera.size not in self._frames:
-            self._frames[camera.size] = (
-                self._buffer((view.rows, view.columns)),
-                HostArray(camera.size, wp.vec3ub, self._device),
-                HostArray(camera.size, wp.float32, self._device),
-                HostArray(camera.size, wp.uint8, self._device),
-            )
-        buffer, color, depth, segmentation = self._frames[camera.size]
-        draw(geometry, view, buffer, links=self._links)
-        wp.launch(
-            shade,
-            camera.size,
-            inputs=[
-                geometry.scene,
-                view,
-                self._lighting,
-                self._supersample,
-                geometry.triangle_count,
-                geometry.sphere_count,
-                FAR,
-                buffer,
-                self._lamp,
-                self._above,
-                color.array,
-                depth.array,
-                segmentation.array,
-            ],
-            device=self._device,
-        )
-        return RGBD(color.read(), depth.read(), segmentation.read())
+            self._above.draw(geometry)
+        # cameras of one size have a picture each, so that every one finds its own again
+        sizes: Counter[tuple[int, int]] = Counter()
+        seen = []
+        for camera in cameras:
+            key = camera.size, sizes[camera.size]
+            sizes[camera.size] += 1
+            picture = self._pictures.get(key)
+            if picture is None or picture.camera is not camera:
+                picture = self._pictures[key] = _Picture(
+                    camera, supersample=self._supersample, links=self._links, device=self._device
+                )
+            picture.draw(geometry, self._lighting, self._lamp.seen, self._above.seen)
+            seen.append(picture.read())
+        self._whole = True
+        return seen
 
     def _geometry(
         self, drawables: Drawables, particles: int, bodies: int, robot_links: Sequence[RobotLink]
@@ -155,6 +147,67 @@ class Perspective:
         geometry = Geometry(drawables, particles, bodies, self._device, meshes=meshes)
         self._geometries[drawables] = geometry, meshes
         return geometry
+
+
+class _Picture:
+    """What one camera saw last, and what it takes to bring that up to date."""
+
+    def __init__(self, camera: Camera, *, supersample: int, links: bool, device: wp.Device) -> None:
+        self.camera, self._supersample, self._device = camera, supersample, device
+        view = view_of(camera, supersample=supersample)
+        self._buffer = ZBuffer(view, side=PATCH * supersample, links=links, device=device)
+        patches = self._buffer.shape
+        self._stale = HostArray(patches, wp.uint8, device)
+        self._list = HostArray(patches[0] * patches[1], wp.int32, device)
+        self._looks = wp.zeros((patches[0] * patches[1], LOOKS), dtype=wp.int32, device=device)
+        self._color = HostArray(camera.size, wp.vec3ub, device)
+        self._depth = HostArray(camera.size, wp.float32, device)
+        self._segmentation = HostArray(camera.size, wp.uint8, device)
+
+    def draw(
+        self, geometry: Geometry, lighting: Lighting, lamp: Occluders, above: Occluders
+    ) -> None:
+        """Shade the patches that look different; lamp and above: of the same state."""
+        buffer = self._buffer
+        buffer.draw(geometry)
+        wp.launch(
+            find_stale,
+            buffer.shape,
+            inputs=[buffer.tiles, lamp, above, self._looks, self._stale.array],
+            device=self._device,
+        )
+        stale = np.flatnonzero(self._stale.read())
+        if not len(stale):
+            return
+        self._list.mirror[: len(stale)] = stale
+        self._list.write(self._list.mirror)
+        wp.launch(
+            shade,
+            (len(stale), PATCH * PATCH),
+            inputs=[
+                geometry.scene,
+                buffer.view,
+                lighting,
+                self._supersample,
+                geometry.triangle_count,
+                geometry.sphere_count,
+                FAR,
+                buffer.keys,
+                lamp,
+                above,
+                self._list.array,
+                buffer.shape[1],
+                self._looks,
+                self._color.array,
+                self._depth.array,
+                self._segmentation.array,
+            ],
+            device=self._device,
+        )
+
+    def read(self) -> RGBD:
+        """A copy of the picture."""
+        return RGBD(self._color.read(), self._depth.read(), self._segmentation.read())
 
 
 def _centred(eye: tuple[float, float, float], size: int, reach: float) -> Camera:

@@ -1,8 +1,10 @@
-"""Kernels of the pinhole z-buffer: which primitive every sample of a camera sees.
+"""Arithmetic of the pinhole z-buffer: which primitive every sample of a camera sees.
 
 A sample (row, column) looks along the ray d = ((column - cx) / fx, (row - cy) / fy, 1) in the
 camera's frame. The buffer's 64-bit keys hold the bits of the inverse depth above the primitive's
 number, so an atomic maximum keeps the nearest surface whatever the order of threads; 0 is nothing.
+A primitive's window is the rows and columns of its samples: r0, r1, c0, c1, both ends included. The
+kernels fill the samples of marked tiles alone, squares of samples of which the buffer is made.
 
 Source: Olano and Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates", 1997 (edge
 functions from camera coordinates, so triangles need no clipping).
@@ -13,9 +15,11 @@ from __future__ import annotations
 import warp as wp
 
 from .camera import Camera
-from .geometry import Geometry, Scene
+from .geometry import Scene
 
-__all__ = ["View", "draw", "inverse_depth", "primitive_of", "ray", "to_camera", "view_of"]
+__all__ = ["View", "inverse_depth", "link_window", "primitive_of", "raster_links", "raster_spheres",
+           "raster_triangles", "ray", "sphere_window", "to_camera", "triangle_window",
+           "view_of"]  # fmt: skip
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -103,33 +107,75 @@ def narrowed(view: View, slope: float, offset: float, span: wp.vec2):
     return wp.vec2(span[0], wp.clamp(wp.ceil(root) + 1.0, span[0] - 1.0, span[1]))
 
 
-@wp.kernel
-def raster_triangles(scene: Scene, view: View, buffer: wp.array2d(dtype=wp.int64)):
-    """One thread a triangle, seen from either side."""
-    f = wp.tid()
-    tri = scene.triangles[f]
-    a = to_camera(view, scene.points[tri[0]])
-    b = to_camera(view, scene.points[tri[1]])
-    c = to_camera(view, scene.points[tri[2]])
+@wp.func
+def touches(window: wp.vec4i, side: int, tiles: wp.array2d(dtype=int)):
+    """Whether a window has a sample in a marked tile."""
+    found = bool(False)
+    if window[0] <= window[1] and window[2] <= window[3]:
+        for i in range(window[0] / side, window[1] / side + 1):
+            for j in range(window[2] / side, window[3] / side + 1):
+                if tiles[i, j] != 0:
+                    found = True
+    return found
+
+
+@wp.func
+def window_in_tile(window: wp.vec4i, row: int, column: int, side: int):
+    """The part of a window that lies in one tile of `side` samples."""
+    return wp.vec4i(
+        wp.max(window[0], row * side),
+        wp.min(window[1], row * side + side - 1),
+        wp.max(window[2], column * side),
+        wp.min(window[3], column * side + side - 1),
+    )
+
+
+@wp.func
+def triangle_window(
+    points: wp.array(dtype=wp.vec3), triangles: wp.array(dtype=wp.vec3i), view: View, f: int
+):
+    """Window of a triangle, seen from either side; the whole picture where it comes too near."""
+    tri = triangles[f]
+    a = to_camera(view, points[tri[0]])
+    b = to_camera(view, points[tri[1]])
+    c = to_camera(view, points[tri[2]])
     if wp.max(a[2], wp.max(b[2], c[2])) < NEAR:
+        return wp.vec4i(0, -1, 0, -1)
+    if wp.min(a[2], wp.min(b[2], c[2])) <= NEAR:
+        return wp.vec4i(0, view.rows - 1, 0, view.columns - 1)
+    ax = a[0] / a[2]
+    bx = b[0] / b[2]
+    cx = c[0] / c[2]
+    ay = a[1] / a[2]
+    by = b[1] / b[2]
+    cy = c[1] / c[2]
+    return wp.vec4i(
+        first_sample(wp.min(ay, wp.min(by, cy)) * view.fy + view.cy, view.rows),
+        last_sample(wp.max(ay, wp.max(by, cy)) * view.fy + view.cy, view.rows),
+        first_sample(wp.min(ax, wp.min(bx, cx)) * view.fx + view.cx, view.columns),
+        last_sample(wp.max(ax, wp.max(bx, cx)) * view.fx + view.cx, view.columns),
+    )
+
+
+@wp.kernel
+def raster_triangles(
+    points: wp.array(dtype=wp.vec3),
+    triangles: wp.array(dtype=wp.vec3i),
+    view: View,
+    windows: wp.array(dtype=wp.vec4i),
+    side: int,
+    tiles: wp.array2d(dtype=int),
+    buffer: wp.array2d(dtype=wp.int64),
+):
+    """One thread a triangle."""
+    f = wp.tid()
+    window = windows[f]
+    if not touches(window, side, tiles):
         return
-    c0 = int(0)
-    c1 = view.columns - 1
-    r0 = int(0)
-    r1 = view.rows - 1
-    if wp.min(a[2], wp.min(b[2], c[2])) > NEAR:
-        ax = a[0] / a[2]
-        bx = b[0] / b[2]
-        cx = c[0] / c[2]
-        ay = a[1] / a[2]
-        by = b[1] / b[2]
-        cy = c[1] / c[2]
-        c0 = first_sample(wp.min(ax, wp.min(bx, cx)) * view.fx + view.cx, view.columns)
-        c1 = last_sample(wp.max(ax, wp.max(bx, cx)) * view.fx + view.cx, view.columns)
-        r0 = first_sample(wp.min(ay, wp.min(by, cy)) * view.fy + view.cy, view.rows)
-        r1 = last_sample(wp.max(ay, wp.max(by, cy)) * view.fy + view.cy, view.rows)
-    if c0 > c1 or r0 > r1:
-        return
+    tri = triangles[f]
+    a = to_camera(view, points[tri[0]])
+    b = to_camera(view, points[tri[1]])
+    c = to_camera(view, points[tri[2]])
     # edge functions; a shared edge gets the same numbers, negated, so there are no cracks
     ea = wp.cross(b, c)
     eb = wp.cross(c, a)
@@ -146,27 +192,35 @@ def raster_triangles(scene: Scene, view: View, buffer: wp.array2d(dtype=wp.int64
         ec = -ec
     # along a row the edge functions change by this
     step = 1.0 / view.fx
-    for r in range(r0, r1 + 1):
-        y = (float(r) - view.cy) / view.fy
-        ra = ea[1] * y + ea[2]
-        rb = eb[1] * y + eb[2]
-        rc = ec[1] * y + ec[2]
-        rn = n[1] * y + n[2]
-        low = float(c0)
-        high = float(c1)
-        # a wide triangle: go only where the row can be inside, a sample more to either side
-        if c1 - c0 > 12:
-            span = narrowed(view, ea[0], ra, wp.vec2(low, high))
-            span = narrowed(view, eb[0], rb, span)
-            span = narrowed(view, ec[0], rc, span)
-            low = span[0]
-            high = span[1]
-        for q in range(int(low), int(high) + 1):
-            x = (float(q) - view.cx) * step
-            if ea[0] * x + ra >= 0.0 and eb[0] * x + rb >= 0.0 and ec[0] * x + rc >= 0.0:
-                inverse = n[0] * x + rn
-                if inverse > 0.0 and inverse * NEAR < 1.0:
-                    wp.atomic_max(buffer, r, q, key_of(inverse, f))
+    for i in range(window[0] / side, window[1] / side + 1):
+        for j in range(window[2] / side, window[3] / side + 1):
+            if tiles[i, j] != 0:
+                part = window_in_tile(window, i, j, side)
+                for r in range(part[0], part[1] + 1):
+                    y = (float(r) - view.cy) / view.fy
+                    ra = ea[1] * y + ea[2]
+                    rb = eb[1] * y + eb[2]
+                    rc = ec[1] * y + ec[2]
+                    rn = n[1] * y + n[2]
+                    low = float(part[2])
+                    high = float(part[3])
+                    # a wide part: go only where the row can be inside, a sample more to both sides
+                    if part[3] - part[2] > 12:
+                        span = narrowed(view, ea[0], ra, wp.vec2(low, high))
+                        span = narrowed(view, eb[0], rb, span)
+                        span = narrowed(view, ec[0], rc, span)
+                        low = span[0]
+                        high = span[1]
+                    for q in range(int(low), int(high) + 1):
+                        x = (float(q) - view.cx) * step
+                        if (
+                            ea[0] * x + ra >= 0.0
+                            and eb[0] * x + rb >= 0.0
+                            and ec[0] * x + rc >= 0.0
+                        ):
+                            inverse = n[0] * x + rn
+                            if inverse > 0.0 and inverse * NEAR < 1.0:
+                                wp.atomic_max(buffer, r, q, key_of(inverse, f))
 
 
 @wp.func
@@ -177,86 +231,108 @@ def sphere_span(x: float, z: float, radius: float):
     return wp.vec2((x * z - span) * scale, (x * z + span) * scale)
 
 
-@wp.kernel
-def raster_spheres(scene: Scene, view: View, first: int, buffer: wp.array2d(dtype=wp.int64)):
-    """One thread a sphere."""
-    s = wp.tid()
-    radius = scene.sphere_radius[s]
-    p = to_camera(view, scene.points[scene.sphere_particle[s]])
+@wp.func
+def sphere_window(centre: wp.vec3, radius: float, view: View):
+    """Window of a sphere; empty unless all of it is ahead of the camera."""
+    p = to_camera(view, centre)
     if p[2] - radius < NEAR:
-        return
+        return wp.vec4i(0, -1, 0, -1)
     across = sphere_span(p[0], p[2], radius)
     along = sphere_span(p[1], p[2], radius)
-    c0 = first_sample(across[0] * view.fx + view.cx, view.columns)
-    c1 = last_sample(across[1] * view.fx + view.cx, view.columns)
-    r0 = first_sample(along[0] * view.fy + view.cy, view.rows)
-    r1 = last_sample(along[1] * view.fy + view.cy, view.rows)
-    for r in range(r0, r1 + 1):
-        for q in range(c0, c1 + 1):
-            d = ray(view, float(r), float(q))
-            square = wp.dot(d, d)
-            # the ray's closest point to the centre; subtracting squares instead loses digits
-            nearest = wp.dot(d, p) / square
-            gap = d * nearest - p
-            inside = radius * radius - wp.dot(gap, gap)
-            if inside > 0.0:
-                wp.atomic_max(
-                    buffer, r, q, key_of(1.0 / (nearest - wp.sqrt(inside / square)), first + s)
-                )
+    return wp.vec4i(
+        first_sample(along[0] * view.fy + view.cy, view.rows),
+        last_sample(along[1] * view.fy + view.cy, view.rows),
+        first_sample(across[0] * view.fx + view.cx, view.columns),
+        last_sample(across[1] * view.fx + view.cx, view.columns),
+    )
 
 
 @wp.kernel
-def raster_links(scene: Scene, view: View, first: int, buffer: wp.array2d(dtype=wp.int64)):
+def raster_spheres(
+    scene: Scene,
+    view: View,
+    windows: wp.array(dtype=wp.vec4i),
+    side: int,
+    tiles: wp.array2d(dtype=int),
+    first: int,
+    buffer: wp.array2d(dtype=wp.int64),
+):
+    """One thread a sphere; `first`: primitives before the spheres."""
+    s = wp.tid()
+    window = windows[first + s]
+    if not touches(window, side, tiles):
+        return
+    radius = scene.sphere_radius[s]
+    p = to_camera(view, scene.points[scene.sphere_particle[s]])
+    for r in range(window[0], window[1] + 1):
+        for q in range(window[2], window[3] + 1):
+            if tiles[r / side, q / side] != 0:
+                d = ray(view, float(r), float(q))
+                square = wp.dot(d, d)
+                # the ray's closest point to the centre; subtracting squares instead loses digits
+                nearest = wp.dot(d, p) / square
+                gap = d * nearest - p
+                inside = radius * radius - wp.dot(gap, gap)
+                if inside > 0.0:
+                    wp.atomic_max(
+                        buffer, r, q, key_of(1.0 / (nearest - wp.sqrt(inside / square)), first + s)
+                    )
+
+
+@wp.func
+def link_window(start: wp.vec3, end: wp.vec3, radius: float, view: View):
+    """Window of a rod; empty unless all of it is ahead of the camera."""
+    a = to_camera(view, start)
+    b = to_camera(view, end)
+    if wp.min(a[2], b[2]) - radius < NEAR or wp.length(b - a) < 1.0e-9:
+        return wp.vec4i(0, -1, 0, -1)
+    xa = sphere_span(a[0], a[2], radius)
+    xb = sphere_span(b[0], b[2], radius)
+    ya = sphere_span(a[1], a[2], radius)
+    yb = sphere_span(b[1], b[2], radius)
+    return wp.vec4i(
+        first_sample(wp.min(ya[0], yb[0]) * view.fy + view.cy, view.rows),
+        last_sample(wp.max(ya[1], yb[1]) * view.fy + view.cy, view.rows),
+        first_sample(wp.min(xa[0], xb[0]) * view.fx + view.cx, view.columns),
+        last_sample(wp.max(xa[1], xb[1]) * view.fx + view.cx, view.columns),
+    )
+
+
+@wp.kernel
+def raster_links(
+    scene: Scene,
+    view: View,
+    windows: wp.array(dtype=wp.vec4i),
+    side: int,
+    tiles: wp.array2d(dtype=int),
+    first: int,
+    buffer: wp.array2d(dtype=wp.int64),
+):
     """One thread a rod: a cylinder without caps, as its ends lie inside of beads."""
     k = wp.tid()
+    window = windows[first + k]
+    if not touches(window, side, tiles):
+        return
     radius = scene.link_radius[k]
     ends = scene.link_particle[k]
     a = to_camera(view, scene.points[ends[0]])
     b = to_camera(view, scene.points[ends[1]])
     length = wp.length(b - a)
-    if wp.min(a[2], b[2]) - radius < NEAR or length < 1.0e-9:
-        return
     axis = (b - a) / length
-    xa = sphere_span(a[0], a[2], radius)
-    xb = sphere_span(b[0], b[2], radius)
-    ya = sphere_span(a[1], a[2], radius)
-    yb = sphere_span(b[1], b[2], radius)
-    c0 = first_sample(wp.min(xa[0], xb[0]) * view.fx + view.cx, view.columns)
-    c1 = last_sample(wp.max(xa[1], xb[1]) * view.fx + view.cx, view.columns)
-    r0 = first_sample(wp.min(ya[0], yb[0]) * view.fy + view.cy, view.rows)
-    r1 = last_sample(wp.max(ya[1], yb[1]) * view.fy + view.cy, view.rows)
     flat_a = a - axis * wp.dot(axis, a)
-    for r in range(r0, r1 + 1):
-        for q in range(c0, c1 + 1):
-            d = ray(view, float(r), float(q))
-            # seen along the axis, the rod is a disc
-            flat_d = d - axis * wp.dot(axis, d)
-            square = wp.dot(flat_d, flat_d)
-            if square > 1.0e-12:
-                nearest = wp.dot(flat_d, flat_a) / square
-                gap = flat_d * nearest - flat_a
-                inside = radius * radius - wp.dot(gap, gap)
-                if inside > 0.0:
-                    depth = nearest - wp.sqrt(inside / square)
-                    along = wp.dot(axis, d * depth - a)
-                    if depth > NEAR and along >= 0.0 and along <= length:
-                        wp.atomic_max(buffer, r, q, key_of(1.0 / depth, first + k))
-
-
-def draw(geometry: Geometry, view: View, buffer: wp.array, *, links: bool) -> None:
-    """Clear `buffer` (rows, columns) and fill it with what `view` sees of `geometry`.
-
-    Primitives count triangles first, then spheres, then rods.
-    """
-    buffer.zero_()
-    scene, device = geometry.scene, geometry.device
-    spheres = geometry.triangle_count
-    rods = spheres + geometry.sphere_count
-    wp.launch(raster_triangles, spheres, inputs=[scene, view, buffer], device=device)
-    wp.launch(
-        raster_spheres, geometry.sphere_count, inputs=[scene, view, spheres, buffer], device=device
-    )
-    if links:
-        wp.launch(
-            raster_links, geometry.link_count, inputs=[scene, view, rods, buffer], device=device
-        )
+    for r in range(window[0], window[1] + 1):
+        for q in range(window[2], window[3] + 1):
+            if tiles[r / side, q / side] != 0:
+                d = ray(view, float(r), float(q))
+                # seen along the axis, the rod is a disc
+                flat_d = d - axis * wp.dot(axis, d)
+                square = wp.dot(flat_d, flat_d)
+                if square > 1.0e-12:
+                    nearest = wp.dot(flat_d, flat_a) / square
+                    gap = flat_d * nearest - flat_a
+                    inside = radius * radius - wp.dot(gap, gap)
+                    if inside > 0.0:
+                        depth = nearest - wp.sqrt(inside / square)
+                        along = wp.dot(axis, d * depth - a)
+                        if depth > NEAR and along >= 0.0 and along <= length:
+                            wp.atomic_max(buffer, r, q, key_of(1.0 / depth, first + k))

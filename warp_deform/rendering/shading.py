@@ -13,7 +13,8 @@ import warp as wp
 from ..objects.colors import TABLE, Color
 from .drawables import WORKSPACE_SEGMENT
 from .geometry import MESH_MATERIAL, Scene
-from .occlusion import Occluders, lit_share, open_share
+from .occlusion import Occluders, above_sample, lamp_sample, lit_share, open_share, tap_reach
+from .patches import PATCH, note_look
 from .pinhole import View, inverse_depth, primitive_of, ray, to_camera
 from .pixels import BOUNDS
 
@@ -32,6 +33,7 @@ X_LOW, X_HIGH = (wp.constant(value) for value in BOUNDS[0])
 Y_LOW, Y_HIGH = (wp.constant(value) for value in BOUNDS[1])
 TABLE_COLOR = wp.constant(wp.vec3(*(float(c) for c in TABLE)))
 NOTHING = wp.constant(-1)
+PATCH_SIDE = wp.constant(PATCH)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,6 +157,50 @@ def ground(lighting: Lighting, view: View, row: float, column: float):
 
 
 @wp.func
+def on_triangle(
+    points: wp.array(dtype=wp.vec3),
+    triangles: wp.array(dtype=wp.vec3i),
+    normals: wp.array2d(dtype=wp.vec3),
+    view: View,
+    f: int,
+    d: wp.vec3,
+):
+    """Normal of a triangle where the ray `d` meets it, and the depth there."""
+    tri = triangles[f]
+    a = to_camera(view, points[tri[0]])
+    b = to_camera(view, points[tri[1]])
+    c = to_camera(view, points[tri[2]])
+    n = wp.cross(b - a, c - a)
+    depth = wp.dot(n, a) / wp.dot(n, d)
+    p = d * depth
+    square = wp.dot(n, n)
+    wb = wp.clamp(wp.dot(wp.cross(p - a, c - a), n) / square, 0.0, 1.0)
+    wc = wp.clamp(wp.dot(wp.cross(b - a, p - a), n) / square, 0.0, 1.0)
+    wa = wp.max(1.0 - wb - wc, 0.0)
+    normal = wp.normalize(normals[f, 0] * wa + normals[f, 1] * wb + normals[f, 2] * wc)
+    return normal, depth
+
+
+@wp.func
+def on_sphere(centre: wp.vec3, radius: float, view: View, d: wp.vec3, world_d: wp.vec3):
+    """Normal of a sphere where the ray `d`, `world_d` in the world, meets it; the depth there."""
+    p = to_camera(view, centre)
+    square = wp.dot(d, d)
+    nearest = wp.dot(d, p) / square
+    gap = d * nearest - p
+    depth = nearest - wp.sqrt(wp.max(radius * radius - wp.dot(gap, gap), 0.0) / square)
+    return wp.normalize(view.origin + world_d * depth - centre), depth
+
+
+@wp.func
+def on_link(start: wp.vec3, end: wp.vec3, view: View, depth: float, world_d: wp.vec3):
+    """Normal of a rod at a depth along the world's ray `world_d`."""
+    axis = wp.normalize(end - start)
+    p = view.origin + world_d * depth - start
+    return wp.normalize(p - axis * wp.dot(axis, p))
+
+
+@wp.func
 def surface_at(
     scene: Scene,
     view: View,
@@ -165,48 +211,34 @@ def surface_at(
     row: float,
     column: float,
 ):
-    """The surface of the primitive in `key` where the ray through (row, column) meets it."""
+    """The surface of the primitive in `key` where the ray through (row, column) meets it.
+
+    An array that is a structure's member is copied at every use, so each is handed on once.
+    """
     d = ray(view, row, column)
     world_d = world_ray(view, row, column)
     primitive = primitive_of(key)
     s = Surface()
     material = int(0)
     if primitive < triangles:
-        tri = scene.triangles[primitive]
-        a = to_camera(view, scene.points[tri[0]])
-        b = to_camera(view, scene.points[tri[1]])
-        c = to_camera(view, scene.points[tri[2]])
-        n = wp.cross(b - a, c - a)
-        s.depth = wp.dot(n, a) / wp.dot(n, d)
-        p = d * s.depth
-        square = wp.dot(n, n)
-        wb = wp.clamp(wp.dot(wp.cross(p - a, c - a), n) / square, 0.0, 1.0)
-        wc = wp.clamp(wp.dot(wp.cross(b - a, p - a), n) / square, 0.0, 1.0)
-        wa = wp.max(1.0 - wb - wc, 0.0)
-        s.normal = wp.normalize(
-            scene.triangle_normals[primitive, 0] * wa
-            + scene.triangle_normals[primitive, 1] * wb
-            + scene.triangle_normals[primitive, 2] * wc
+        normal, depth = on_triangle(
+            scene.points, scene.triangles, scene.triangle_normals, view, primitive, d
         )
+        s.normal = normal
+        s.depth = depth
         material = scene.triangle_material[primitive]
     elif primitive < triangles + spheres:
         k = primitive - triangles
-        radius = scene.sphere_radius[k]
         centre = scene.points[scene.sphere_particle[k]]
-        p = to_camera(view, centre)
-        square = wp.dot(d, d)
-        nearest = wp.dot(d, p) / square
-        gap = d * nearest - p
-        s.depth = nearest - wp.sqrt(wp.max(radius * radius - wp.dot(gap, gap), 0.0) / square)
-        s.normal = wp.normalize(view.origin + world_d * s.depth - centre)
+        normal, depth = on_sphere(centre, scene.sphere_radius[k], view, d, world_d)
+        s.normal = normal
+        s.depth = depth
         material = scene.sphere_material[k]
     else:
         k = primitive - triangles - spheres
         s.depth = 1.0 / inverse_depth(key)
-        start = scene.points[scene.link_particle[k][0]]
-        axis = wp.normalize(scene.points[scene.link_particle[k][1]] - start)
-        p = view.origin + world_d * s.depth - start
-        s.normal = wp.normalize(p - axis * wp.dot(axis, p))
+        ends = scene.link_particle[k]
+        s.normal = on_link(scene.points[ends[0]], scene.points[ends[1]], view, s.depth, world_d)
         material = scene.link_material[k]
     if wp.dot(s.normal, world_d) > 0.0:
         s.normal = -s.normal
@@ -227,8 +259,10 @@ def radiance(
     lighting: Lighting,
     lamp: Occluders,
     above: Occluders,
+    patch: int,
+    looks: wp.array2d(dtype=int),
 ):
-    """Linear colour that a surface sends to the camera."""
+    """Linear colour that a surface sends to the camera; notes in `looks` what it depends on."""
     if s.segment == NOTHING:
         return s.color
     to_lamp = wp.normalize(lighting.lamp - s.position)
@@ -236,7 +270,9 @@ def radiance(
     direct = float(0.0)
     highlight = float(0.0)
     if cosine > 0.0:
-        seen = lit_share(lamp, s.position, s.normal)
+        at = lamp_sample(lamp.view, s.position, s.normal)
+        seen = lit_share(lamp.keys, lamp.tops_near, at, s.position, s.normal)
+        note_look(at, 0.0, patch, 0, looks)
         direct = lighting.direct * cosine * seen
         if s.gloss > 0.0:
             half = wp.normalize(to_lamp + wp.normalize(view.origin - s.position))
@@ -249,7 +285,9 @@ def radiance(
     # the sky is bright, the floor throws a little back
     ambient = lighting.ambient * (0.7 + 0.3 * s.normal[2])
     if lighting.occlusion > 0.0:
-        closed = 1.0 - open_share(above, s.position, s.normal)
+        around = above_sample(above.view, s.position, s.normal)
+        closed = 1.0 - open_share(above.view, above.keys, above.tops_near, around, s.position)
+        note_look(around, 2.0 * tap_reach(above.view, around[2]), patch, 4, looks)
         ambient = ambient * wp.max(1.0 - lighting.occlusion * closed, 0.0)
     color = s.color * (direct + ambient) + wp.vec3(highlight, highlight, highlight)
     if s.segment == 0 and lighting.haze > 0.0:
@@ -271,16 +309,24 @@ def shade(
     buffer: wp.array2d(dtype=wp.int64),
     lamp: Occluders,
     above: Occluders,
+    patches: wp.array(dtype=int),
+    patch_columns: int,
+    looks: wp.array2d(dtype=int),
     out_color: wp.array2d(dtype=wp.vec3ub),
     out_depth: wp.array2d(dtype=float),
     out_segmentation: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread a pixel: the mean of its samples.
+    """One thread a pixel of the listed patches: the mean of its samples.
 
     A pixel whose samples all see one primitive is shaded once. Depth and segmentation are whole
     only with one sample a pixel.
     """
-    i, j = wp.tid()
+    n, k = wp.tid()
+    patch = patches[n]
+    i = patch / patch_columns * PATCH_SIDE + k / PATCH_SIDE
+    j = patch % patch_columns * PATCH_SIDE + k % PATCH_SIDE
+    if i >= out_color.shape[0] or j >= out_color.shape[1]:
+        return
     r0 = i * supersample
     c0 = j * supersample
     key = buffer[r0, c0]
@@ -300,7 +346,7 @@ def shade(
             s = ground(lighting, view, row, column)
         else:
             s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-        total = radiance(s, view, lighting, lamp, above)
+        total = radiance(s, view, lighting, lamp, above, patch, looks)
         out_depth[i, j] = wp.where(s.segment == NOTHING or s.depth > far, far, s.depth)
         out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
     else:
@@ -314,7 +360,7 @@ def shade(
                     s = ground(lighting, view, row, column)
                 else:
                     s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-                total += radiance(s, view, lighting, lamp, above)
+                total += radiance(s, view, lighting, lamp, above, patch, looks)
         total = total / float(supersample * supersample)
     out_color[i, j] = wp.vec3ub(
         wp.uint8(wp.sqrt(wp.min(total[0], 1.0)) * 255.0 + 0.5),

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Generator
+import subprocess
+import tempfile
 from pathlib import Path
 from types import TracebackType
 
 import cv2
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, WarpDeformError
 
 __all__ = ["VideoWriter", "write_png"]
 
@@ -61,10 +63,12 @@ class VideoWriter:
     """Writes an H.264 video (yuv420p, so every player shows it), one frame in memory at a time.
 
     path: ends with .mp4; fps: frames a second. Use it as a context manager: the file appears when
-    the block ends well and holds at least a frame, and nothing is left of it otherwise.
+    the block ends well, and nothing is left of it otherwise.
 
     Raises:
-        InputError: the path does not end with .mp4 or cannot be written, or fps is not positive.
+        InputError: the path does not end with .mp4 or cannot be written, fps is not positive, or
+            the block ends without a frame.
+        WarpDeformError: ffmpeg is missing or gives up, because a disk is full, say.
     """
 
     def __init__(self, path: str | os.PathLike[str], fps: float) -> None:
@@ -73,7 +77,7 @@ class VideoWriter:
             raise InputError(f"fps must be between 0 and 1000, got {fps}")
         self._fps = fps
         self._size: tuple[int, int] | None = None
-        self._stream: Generator[None, np.ndarray, None] | None = None
+        self._encoder: subprocess.Popen[bytes] | None = None
         self.frames = 0
 
     def __enter__(self) -> VideoWriter:
@@ -87,31 +91,48 @@ class VideoWriter:
         frame = _checked(frame)
         if self._size is None:
             self._size = frame.shape[:2]
-            self._stream = self._open(frame)
+            self._encoder = self._start(_even(frame).shape[:2])
         if frame.shape[:2] != self._size:
             raise InputError(f"a frame is {frame.shape[:2]}, the first one was {self._size}")
-        assert self._stream is not None
-        self._stream.send(_even(frame))
+        assert self._encoder is not None and self._encoder.stdin is not None
+        # ffmpeg converts, too, for four times the time
+        planes = cv2.cvtColor(_even(frame), cv2.COLOR_RGB2YUV_I420)
+        try:
+            self._encoder.stdin.write(planes)
+        except BrokenPipeError as error:
+            self._encoder.wait()
+            raise self._failure() from error
         self.frames += 1
 
-    def _open(self, frame: np.ndarray) -> Generator[None, np.ndarray, None]:
+    def _start(self, size: tuple[int, ...]) -> subprocess.Popen[bytes]:
         import imageio_ffmpeg
 
-        rows, columns = _even(frame).shape[:2]
-        stream: Generator[None, np.ndarray, None] = imageio_ffmpeg.write_frames(
-            str(self._partial),
-            (columns, rows),
-            fps=self._fps,
-            codec="libx264",
-            pix_fmt_out="yuv420p",
-            macro_block_size=2,
-            quality=None,
-            ffmpeg_log_level="error",
+        self._log = tempfile.TemporaryFile()
+        # superfast at 22 is a third of the time of the default preset at 20, and no worse (PSNR)
+        command = (
+            f"-y -loglevel error -f rawvideo -pix_fmt yuv420p -s {size[1]}x{size[0]} "
+            f"-r {self._fps} -i - -an -c:v libx264 -preset superfast -crf 22 -threads 1 "
             # faststart: a browser can play before it has the whole file
-            output_params=["-crf", "20", "-movflags", "+faststart", "-threads", "1"],
+            "-pix_fmt yuv420p -movflags +faststart"
         )
-        stream.send(None)  # type: ignore[arg-type]  # starts the generator
-        return stream
+        try:
+            return subprocess.Popen(
+                [imageio_ffmpeg.get_ffmpeg_exe(), *command.split(), str(self._partial.absolute())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=self._log,
+            )
+        except (OSError, RuntimeError) as error:
+            raise WarpDeformError(
+                f"{self._path} was not written: no ffmpeg could be started "
+                f"({_last_line(str(error))}); `warp-deform doctor` says which one is used"
+            ) from error
+
+    def _failure(self) -> WarpDeformError:
+        """What ffmpeg said last."""
+        self._log.seek(0)
+        said = _last_line(self._log.read().decode(errors="replace"))
+        return WarpDeformError(f"{self._path} was not written, as ffmpeg gave up: {said}")
 
     def __exit__(
         self,
@@ -119,13 +140,31 @@ class VideoWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        encoder = self._encoder
         try:
-            if self._stream is not None:
-                self._stream.close()
-                if kind is None:
-                    self._partial.replace(self._path)
+            if kind is None:
+                if encoder is None:
+                    raise InputError(f"{self._path} was not written: a video needs a frame")
+                # also closes the pipe, which tells ffmpeg that this is all
+                encoder.communicate()
+                if encoder.returncode != 0:
+                    raise self._failure()
+                self._partial.replace(self._path)
         finally:
+            if encoder is not None and encoder.stdin is not None:
+                encoder.kill()
+                encoder.wait()
+                # a dead encoder does not take what is still buffered
+                with contextlib.suppress(BrokenPipeError):
+                    encoder.stdin.close()
+                self._log.close()
             self._partial.unlink(missing_ok=True)
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines()]
+    told = [line for line in lines if line and line != "Conversion failed!"]
+    return told[-1] if told else "it gave no reason"
 
 
 def _even(frame: np.ndarray) -> np.ndarray:
