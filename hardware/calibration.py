@@ -18,6 +18,7 @@ from .frozen import freeze_arrays
 from .homography import MAX_ERROR, apply_homography
 from .json_file import read_json, read_numbers, require, write_json
 from .table_plane import TablePlane
+from .workplace import Workplace
 
 __all__ = ["SCHEMA", "Calibration"]
 
@@ -37,6 +38,7 @@ class Calibration:
         intrinsics: of the camera
         base_H_pixel: from undistorted pixels (column, row, 1) to base x, y [m], shape (3, 3)
         table: the touched-off plane
+        x, y: ends of the workspace [m]
         method: what gave the homography: "charuco", "touched points" or "hand-eye"
         error_m: error to expect, as the method measures it [m]
         details: further figures, JSON types: residuals, the board, tcp_T_camera
@@ -51,6 +53,8 @@ class Calibration:
     table: TablePlane
     method: str
     error_m: float
+    x: tuple[float, float] = Workplace.x
+    y: tuple[float, float] = Workplace.y
     details: dict[str, Any] = field(default_factory=dict)
     created: str = field(
         default_factory=lambda: datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -69,12 +73,19 @@ class Calibration:
             raise InputError("calibration: base_H_pixel is no invertible (3, 3) matrix")
         if np.asarray(self.home_q).shape != (7,) or not np.isfinite(self.home_q).all():
             raise InputError("calibration: home_q is not seven joint positions")
+        self.workplace  # noqa: B018  refuses what the arm cannot do
         width, height = self.intrinsics.size
         frame = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
         depth = np.column_stack([frame, np.ones(4)]) @ H[2]
         if depth.min() * depth.max() <= 0.0:
             raise InputError("calibration: part of the picture looks past the table's horizon")
         freeze_arrays(self, "home_q", "base_H_pixel")
+
+    @property
+    def workplace(self) -> Workplace:
+        """The home pose and the workspace."""
+        home_q = tuple(float(value) for value in np.asarray(self.home_q))
+        return Workplace(home_q=home_q, x=self.x, y=self.y)
 
     def pixel_to_base(self, pixels: np.ndarray) -> np.ndarray:
         """Return the points on the table (n, 3) [m] seen at pixels (n, 2), column and row."""
@@ -102,6 +113,7 @@ class Calibration:
             },
             "method": self.method,
             "error_m": self.error_m,
+            "workspace": [*self.x, *self.y],
             "details": self.details,
             "created": self.created,
         }
@@ -126,6 +138,10 @@ class Calibration:
         what = f"calibration {path}"
         try:
             table = require(record, "table", dict, what=what)
+            # Files from before the workspace was a setting are of the one there was.
+            ends = [*Workplace.x, *Workplace.y]
+            if "workspace" in record:
+                ends = read_numbers(record, "workspace", (4,), what=what).tolist()
             return cls(
                 robot_id=require(record, "robot_id", str, what=what),
                 camera_id=require(record, "camera_id", str, what=what),
@@ -137,6 +153,8 @@ class Calibration:
                 ),
                 method=require(record, "method", str, what=what),
                 error_m=float(require(record, "error_m", float, what=what)),
+                x=(ends[0], ends[1]),
+                y=(ends[2], ends[3]),
                 details=require(record, "details", dict, what=what),
                 created=require(record, "created", str, what=what),
             )

@@ -21,6 +21,7 @@ from warp_deform.tasks.task import Layout, Snapshot
 from .episode import Observation
 from .finger_room import has_finger_room
 from .pick_place import PickPlaceAction, PickPlaceOutcome
+from .task_frame import PIXEL_RATIO, fits_task, to_base
 from .top_down_view import TopDownView
 from .twin import TwinLook
 
@@ -160,7 +161,7 @@ class PolicyChooser:
 
     Args:
         path: a run's folder or a snapshot
-        view: the workspace; must be the policy's own
+        view: the workspace; its pixels must be about as large as the task's
 
     Raises:
         InputError: no such policy, one of another task, or one that needs the simulator's state
@@ -174,13 +175,12 @@ class PolicyChooser:
         task = policy.description.task
         if not isinstance(policy, ImagePolicy):
             raise InputError(f"{path} sees the simulator's state; give a policy that sees pictures")
-        grid = CableMaskGoal.grid
-        corners = np.array([[0, 0], [self._view.shape[0] - 1, self._view.shape[1] - 1]])
-        same = np.allclose(grid.to_world(corners), self._view.pixel_to_base(corners), atol=1e-9)
-        if task != CableMaskGoal.name or not same:
+        if task != CableMaskGoal.name or not fits_task(self._view):
             raise InputError(
-                f"{path} was trained on {task} and sees another table; give a policy of "
-                f"{CableMaskGoal.name} and its workspace"
+                f"{path} was trained on {task}, and the workspace's pixels are "
+                f"{1e3 * self._view.pixel_m:.3g} mm; give a policy of {CableMaskGoal.name} and a "
+                f"workspace whose pixels are within {100 * PIXEL_RATIO:.0f} % of its "
+                f"{1e3 * CableMaskGoal.grid.pixel_size:.3g} mm"
             )
         self._policy = policy
         self.reset()
@@ -207,14 +207,20 @@ class PolicyChooser:
         proposed = []
         for _ in range(_MOST_PROPOSALS):
             proposed.append(self._policy.act(_picture(seen.mask), goal, avoid=avoid))
-            if has_finger_room(seen.mask, to_action(proposed[-1]), view=self._view):
+            if has_finger_room(seen.mask, self._in_base(proposed[-1]), view=self._view):
                 break
             avoid.append((proposed[-1][:2], _NEAR))
         else:
             proposed = proposed[:1]
         action = proposed[-1]
         self._memory.chose(action[:2], action[3:5])
-        return to_action(action)
+        return self._in_base(action)
+
+    def _in_base(self, action: np.ndarray) -> PickPlaceAction:
+        """The policy's action (7,), which is on the task's table, on this one."""
+        moved = np.array(action, dtype=float)
+        moved[:2], moved[3:5] = (to_base(moved[i : i + 2], self._view) for i in (0, 3))
+        return to_action(moved)
 
 
 def _moved(seen: Observation, before: np.ndarray | None) -> bool:

@@ -11,7 +11,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,7 +23,14 @@ from warp_deform.flag_range import SEED, FlagRange
 from warp_deform.quiet import quiet_warp
 
 from .cli_records import ReplayOptions, ScoreOptions, replay, score
-from .cli_setup import CalibrateOptions, DoctorOptions, calibrate, doctor
+from .cli_setup import (
+    CalibrateOptions,
+    DoctorOptions,
+    HomeFlag,
+    WorkspaceFlag,
+    calibrate,
+    doctor,
+)
 from .rig_config import AgentName, CameraName, RigConfig, RobotName
 
 if TYPE_CHECKING:
@@ -60,14 +67,17 @@ class _RigOptions(CommandOptions):
     """Let a real arm move; without it, its commands are printed."""
     auto: bool = False
     """Do not ask before every action of a real arm."""
+    home: HomeFlag = None
+    """Joint positions of the home pose [rad]; a setup has it from its calibration, and others are
+    refused. With --camera sim, any that the arm can wait at."""
+    workspace: WorkspaceFlag = None
+    """Ends of the workspace along x and y [m]; as for --home."""
     joint_speed: Annotated[float, FlagRange(1e-3, 0.2)] = 0.05
     """Share of the joints' greatest speeds between poses, at most 0.2; begin with 0.05."""
 
     def rig(self) -> RigConfig:
         """What to open."""
-        names = ("robot", "camera", "host", "setup", "device", "frames", "seed", "execute")
-        values = {name: getattr(self, name) for name in names}
-        return RigConfig(**values, joint_speed=self.joint_speed)
+        return RigConfig(**{field.name: getattr(self, field.name) for field in fields(RigConfig)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +138,8 @@ class EmulateOptions(CommandOptions):
     """Toss a bead chain onto foam under the hand, and show it to --camera sim."""
     table_z: Annotated[float | None, arg(metavar="M"), FlagRange(-1.0, 1.0)] = None
     """Height of a bare table instead [m]."""
+    workspace: WorkspaceFlag = None
+    """Ends of the workspace along x and y [m] into which the chain is tossed, as `run` has them."""
     paced: bool = False
     """1 kHz by the wall clock, as a robot; else in lock-step, as fast as it goes."""
 
@@ -289,7 +301,7 @@ def _goal(options: RunOptions, rig: Rig, seed: int) -> GoalSeen | None:
     if options.goal is not None:
         return read_goal(options.goal, rig.view)
     if options.camera == "sim":
-        return sampled_goal(seed)
+        return sampled_goal(seed, rig.view)
     if isinstance(options, CollectOptions):
         return None
     raise InputError("run needs --goal; capture one with `warp-deform franka capture-goal`")
@@ -304,7 +316,7 @@ def _capture_goal(options: CaptureGoalOptions) -> Outcome:
 
     with open_rig(options.rig()) as rig:
         if rig.lay is not None:
-            targets = sampled_goal(options.seed).targets
+            targets = sampled_goal(options.seed, rig.view).targets
             assert targets is not None
             z = float(rig.calibration.table.height_m) + 0.003
             rig.lay(np.column_stack([targets, np.full(len(targets), z)]))
@@ -329,8 +341,10 @@ def _emulate(options: EmulateOptions) -> Outcome:
         if options.chain is not None:
             from .look_server import LookServer, WatchedTwin
             from .twin import TwinConfig
+            from .workplace import Workplace
 
-            world = WatchedTwin(TwinConfig(seed=options.chain))
+            place = Workplace().with_flags(RigConfig(workspace=options.workspace))
+            world = WatchedTwin(TwinConfig(seed=options.chain, view=place.view))
             stack.enter_context(LookServer(world.look, host=options.host))
         pace = "1 kHz" if options.paced else "in lock-step"
         _say(f"an emulated Panda serves {options.host}, {pace}; Ctrl-C ends it")

@@ -13,7 +13,16 @@ from warp_deform.flag_range import FlagRange
 
 from .rig_config import CameraName, RigConfig, RobotName
 
-__all__ = ["CalibrateOptions", "DoctorOptions", "calibrate", "doctor"]
+__all__ = ["CalibrateOptions", "DoctorOptions", "HomeFlag", "WorkspaceFlag", "calibrate", "doctor"]
+
+HomeFlag = Annotated[
+    tuple[float, float, float, float, float, float, float] | None,
+    arg(metavar="Q1 ... Q7"),
+    FlagRange(-4.0, 4.0),
+]
+WorkspaceFlag = Annotated[
+    tuple[float, float, float, float] | None, arg(metavar="X0 X1 Y0 Y1"), FlagRange(-1.0, 1.0)
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +87,12 @@ class CalibrateOptions(CommandOptions):
     """Number of a video device, or serial number of a RealSense."""
     setup: Annotated[Path, arg(metavar="DIR")] = field(default_factory=lambda: Path("franka-setup"))
     """Folder of the setup."""
+    home: HomeFlag = None
+    """Joint positions [rad] at which pictures are taken; left out, as stored in --setup, at first
+    the vendor's and the paper's."""
+    workspace: WorkspaceFlag = None
+    """Ends of the workspace along x and y [m]; left out, as stored, at first 0.335 0.635 -0.3 0.3.
+    Both are stored with the calibration."""
     execute: bool = False
     """Let a real arm move."""
     table_z: Annotated[float | None, arg(metavar="M"), FlagRange(-1.0, 1.0)] = None
@@ -107,6 +122,8 @@ class CalibrateOptions(CommandOptions):
             setup=self.setup,
             device=self.device,
             execute=self.execute,
+            home=self.home,
+            workspace=self.workspace,
         )
 
 

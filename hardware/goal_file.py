@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from warp_deform.errors import InputError
+from warp_deform.rendering.strand_mask import strand_mask
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.chain_shapes import curved_chain
 
@@ -35,12 +36,14 @@ class GoalSeen:
     targets: np.ndarray | None
 
 
-def sampled_goal(seed: int) -> GoalSeen:
-    """Return a goal as the simulated task draws it: a smooth curve."""
-    rng, task = np.random.default_rng([seed, _GOAL_STREAM]), CableMaskGoal()
+def sampled_goal(seed: int, view: TopDownView | None = None) -> GoalSeen:
+    """Return a goal as the simulated task draws it: a smooth curve in the workspace."""
+    rng, task = np.random.default_rng([seed, _GOAL_STREAM]), CableMaskGoal
+    view = view or TopDownView()
     bend = rng.uniform(*task.goal_bend)
-    beads = curved_chain(rng, task.cable, task.x, task.y, bend=bend)
-    return GoalSeen(task.mask(beads), beads[:, :2])
+    beads = curved_chain(rng, task.cable, view.x, view.y, bend=bend)
+    mask = strand_mask(beads[:, :2], 2 * task.cable.visual_radius, view.grid)
+    return GoalSeen(mask, beads[:, :2])
 
 
 def read_goal(path: Path, view: TopDownView) -> GoalSeen:

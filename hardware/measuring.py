@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -12,14 +14,17 @@ from warp_deform.errors import InputError
 from .calibration import Calibration
 from .camera import CameraIntrinsics
 from .human import Terminal
-from .panda_arm import HOME_Q
-from .rig import open_robot, read_intrinsics
+from .json_file import read_json, read_numbers
+from .picture_coverage import check_picture
+from .reach import check_workplace
+from .rig import open_robot, read_intrinsics, read_table
 from .rig_config import REAL_ROBOTS, RigConfig
 from .safety import SafeRobot
-from .safety_limits import SafetyLimits
 from .table_plane import TablePlane
+from .workplace import Workplace, workplace_of
 
-__all__ = ["confirm", "lens_of", "make_calibration", "marked", "open_arm"]
+__all__ = ["confirm", "keep", "lens_of", "make_calibration", "marked", "open_arm",
+           "touched_table"]  # fmt: skip
 
 
 def confirm(operator: Terminal, text: str) -> None:
@@ -32,12 +37,46 @@ def open_arm(config: RigConfig, table: TablePlane) -> SafeRobot:
     """The arm that a calibration moves, kept above a table.
 
     Raises:
-        InputError: it is none, or may not move
+        InputError: it is none, or may not move, or cannot work there
     """
     if config.robot not in REAL_ROBOTS or not config.execute:
         raise InputError("this calibration moves an arm: give --robot panda and --execute")
-    limits = SafetyLimits(table=table, max_joint_speed=config.joint_speed)
-    return SafeRobot(open_robot(config), limits)
+    workplace = workplace_of(config)
+    limits = workplace.limits(table, max_joint_speed=config.joint_speed)
+    part = check_workplace(workplace, limits)
+    if part is not None:
+        print(part, file=sys.stderr, flush=True)
+    return SafeRobot(open_robot(config), limits, home_q=workplace.home_q)
+
+
+def touched_table(config: RigConfig) -> TablePlane:
+    """Return the plane that `calibrate table` wrote for this workspace.
+
+    Raises:
+        InputError: it is missing, damaged, or was touched off within another workspace: between its
+            points a plane is measured, beyond them it is a guess, and the safety floor
+    """
+    path = config.setup / "table.json"
+    table = read_table(path)
+    record = read_json(path, what="table", schema=1)
+    wanted, touched = workplace_of(config), Workplace()
+    if "workspace" in record:
+        x0, x1, y0, y1 = read_numbers(record, "workspace", (4,), what=f"table {path}").tolist()
+        touched = Workplace(x=(x0, x1), y=(y0, y1))
+    if not touched.has_workspace_of(wanted):
+        raise InputError(
+            f"{path} was touched off within {touched.workspace_text()}, not "
+            f"{wanted.workspace_text()}; calibrate table with that workspace first"
+        )
+    return table
+
+
+def keep(config: RigConfig, calibration: Calibration) -> Path:
+    """Write the setup's calibration, and its home pose and workspace; returns its file."""
+    calibration.workplace.save(config.setup)
+    path = config.setup / "calibration.json"
+    calibration.save(path)
+    return path
 
 
 def lens_of(config: RigConfig) -> CameraIntrinsics | None:
@@ -55,18 +94,27 @@ def make_calibration(
     error_m: float,
     details: dict[str, Any],
 ) -> Calibration:
-    """Return the setup's calibration, of pictures from the home pose; see `Calibration`."""
-    return Calibration(
+    """Return the setup's calibration, of pictures from the home pose; see `Calibration`.
+
+    Raises:
+        InputError: the pictures do not show all of the workspace; it says what would cure that
+    """
+    workplace = workplace_of(config)
+    calibration = Calibration(
         robot_id=config.robot_id,
         camera_id=config.camera_id,
-        home_q=np.array(HOME_Q),
+        home_q=np.array(workplace.home_q),
         intrinsics=intrinsics,
         base_H_pixel=base_H_pixel,
         table=table,
         method=method,
         error_m=error_m,
+        x=workplace.x,
+        y=workplace.y,
         details=details,
     )
+    check_picture(calibration, workplace.limits(table))
+    return calibration
 
 
 def marked(rgb: np.ndarray, pixels: np.ndarray) -> np.ndarray:

@@ -13,6 +13,8 @@ from .camera import read_image
 from .json_file import read_numbers, require
 from .recording import Recording
 from .scoring import SUCCESS_IOU, score_masks, score_recording
+from .task_frame import to_task
+from .top_down_view import TopDownView
 
 __all__ = ["pack"]
 
@@ -22,6 +24,8 @@ def pack(
     images: Literal["mask", "view"] = "mask",
 ) -> Episode:  # fmt: skip
     """Return the recording as an episode of the dataset format.
+
+    Actions are those of the task's table at the same pixels, see `task_frame`.
 
     There is no simulation: particles, bodies and ground truth are empty, heights are zero, and the
     simulated time is 0. Score and success are computed from the pictures. An episode without a goal
@@ -40,6 +44,7 @@ def pack(
     meta, what = recording.meta, f"recording {folder}"
     # A picture shows what an action did; an action after the last picture is left out.
     rows = len(recording.observations)
+    view = recording.view_settings() or TopDownView()
     goal_mask = recording.goal_mask()
     hindsight = goal_mask is None
     if goal_mask is None:
@@ -53,7 +58,10 @@ def pack(
         mask = recording.mask(i)
         iou = score.iou[i]
         record = {} if last else recording.actions[i]
-        action = None if last else read_numbers(record, "action", (7,), what=f"{what}, action {i}")
+        action = None
+        if not last:
+            action = read_numbers(record, "action", (7,), what=f"{what}, action {i}")
+            action[:2], action[3:5] = (to_task(action[k : k + 2], view) for k in (0, 3))
         outcome = None if last else require(record, "outcome", str, what=f"{what}, action {i}")
         color = _triple(mask) if images == "mask" else recording.view(i)
         empty = {"particle_q": 3, "particle_qd": 3, "body_q": 7, "body_qd": 6}

@@ -58,8 +58,9 @@ class SeenChain(CableMaskGoal):
 
     randomised = False
 
-    def __init__(self, goal: np.ndarray) -> None:
+    def __init__(self, goal: np.ndarray, view: TopDownView | None = None) -> None:
         self._goal = goal
+        self.grid = (view or TopDownView()).grid  # type: ignore[misc]  # one task for each workspace
         self.start = np.zeros((self.cable.beads, 3))
 
     def sample(self, rng: np.random.Generator, space: FreeSpace) -> Layout:
@@ -152,7 +153,7 @@ class PlannerChooser:
         """Worlds for a goal; made once."""
         if self._goal is not None and np.array_equal(goal, self._goal):
             return
-        task = SeenChain(goal)
+        task = SeenChain(goal, self._view)
         targets = estimate_chain(goal, self._view, task.cable.beads)
         if targets is None:
             raise InputError("the goal's mask shows no chain; capture it again")

@@ -20,6 +20,7 @@ from warp_deform.errors import InputError
 from .camera import CameraIntrinsics
 from .json_file import write_whole
 from .rig_config import RigConfig
+from .workplace import Workplace, workplace_of
 
 __all__ = ["TouchedPoint", "origin_line", "read_points", "write_points"]
 
@@ -46,6 +47,9 @@ def origin_line(config: RigConfig, intrinsics: CameraIntrinsics) -> str:
     """Return the line that says of what robot, camera and size of picture points are."""
     width, height = intrinsics.size
     names = f"robot {config.robot_id}, camera {config.camera_id}"
+    workplace = workplace_of(config)
+    if not workplace.has_home_of(Workplace()):
+        names += f", {workplace.home_text()}"
     return f"{_MARK}{names}, {width} x {height} px"
 
 
@@ -75,7 +79,7 @@ def read_points(path: Path, origin: str) -> list[TouchedPoint]:
     points: list[TouchedPoint] = []
     for number, line in enumerate(text.splitlines(), start=1):
         if line.startswith(_MARK) and line.strip() != origin:
-            theirs, ours = (each.removeprefix(_MARK).strip()[:80] for each in (line, origin))
+            theirs, ours = (each.removeprefix(_MARK).strip()[:160] for each in (line, origin))
             raise InputError(
                 f"the points in {path} are of {theirs!r}, not of {ours!r}; give the flags as then, "
                 "or move that file away to begin anew"

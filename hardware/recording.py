@@ -19,13 +19,15 @@ import numpy as np
 from warp_deform.errors import InputError
 
 from .camera import read_image
-from .json_file import read_json, require
+from .json_file import read_json, read_numbers, require
+from .top_down_view import TopDownView
 
 __all__ = ["SCHEMA", "Recording"]
 
 SCHEMA = 1
 """Version of the live folder's format."""
 _MAX_LINES_BYTES = 2**30
+_VIEW_KEYS = ("x", "y", "shape")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +108,23 @@ class Recording:
         if not require(self.meta, "has_goal", bool, what=f"recording {self.folder}"):
             return None
         return _mask(self.folder / "goal_mask.png")
+
+    def view_settings(self) -> TopDownView | None:
+        """Return the workspace and its pixels, None of a recording that does not tell.
+
+        Raises:
+            InputError: what is recorded is no workspace
+        """
+        episode = self.meta.get("config", {}).get("episode", {})
+        if "view" not in episode:
+            return None
+        what = f"the view of recording {self.folder}"
+        x, y, shape = (read_numbers(episode["view"], k, (2,), what=what) for k in _VIEW_KEYS)
+        return TopDownView(
+            x=(float(x[0]), float(x[1])),
+            y=(float(y[0]), float(y[1])),
+            shape=(int(shape[0]), int(shape[1])),
+        )
 
     def view(self, index: int) -> np.ndarray:
         """Return an observation seen from above, (H, W, 3) uint8."""

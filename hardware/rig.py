@@ -19,13 +19,15 @@ from .calibration import Calibration
 from .camera import Camera, CameraIntrinsics, FileCamera, read_image
 from .emulator.world import World
 from .json_file import read_json, require
+from .picture_coverage import check_picture
+from .reach import check_workplace
 from .rig_config import REAL_ROBOTS, RigConfig
 from .robot import Robot
 from .safety import SafeRobot
-from .safety_limits import SafetyLimits
 from .table_plane import TablePlane
 from .top_down_view import TopDownView
 from .twin import TwinConfig, TwinLook
+from .workplace import Workplace
 
 __all__ = ["Rig", "open_camera", "open_rig", "open_robot", "read_calibration", "read_intrinsics",
            "read_table"]  # fmt: skip
@@ -68,8 +70,10 @@ def open_rig(config: RigConfig) -> Iterator[Rig]:
         if config.camera == "sim":
             from .cameras.sim import SimCamera, sim_calibration
 
-            twin = TwinConfig(seed=config.seed)
-            calibration, view = sim_calibration(twin), twin.view
+            place = Workplace().with_flags(config)
+            twin = TwinConfig(seed=config.seed, home_q=place.home_q, view=place.view)
+            calibration = sim_calibration(twin)
+            _check_simulated(calibration)
             if config.robot in REAL_ROBOTS and config.execute:
                 host = config.host or "127.0.0.1"
                 from .look_server import remote_look
@@ -86,23 +90,35 @@ def open_rig(config: RigConfig) -> Iterator[Rig]:
         else:
             if config.robot == "sim":
                 raise InputError("the robot sim needs --camera sim: nothing else sees its chain")
-            calibration, view = read_calibration(config), TopDownView()
+            calibration = read_calibration(config)
             camera = open_camera(config, calibration.intrinsics)
         stack.enter_context(camera)
         empty = config.setup / "empty_view.png"
         seen = config.camera != "sim" and empty.is_file()
         picture = read_image(empty, color=True) if seen else None
-        limits = SafetyLimits(
-            table=calibration.table, x=view.x, y=view.y, max_joint_speed=config.joint_speed
-        )
+        workplace = calibration.workplace
+        limits = workplace.limits(calibration.table, max_joint_speed=config.joint_speed)
         backend = open_robot(config, world=world, home_q=calibration.home_q)
         try:
-            robot = SafeRobot(backend, limits, home_q=tuple(calibration.home_q))
+            robot = SafeRobot(backend, limits, home_q=workplace.home_q)
         except BaseException:
             backend.close()
             raise
         stack.enter_context(robot)
-        yield Rig(robot, camera, calibration, view, look, toss, lay, picture)
+        yield Rig(robot, camera, calibration, workplace.view, look, toss, lay, picture)
+
+
+def _check_simulated(calibration: Calibration) -> None:
+    """Refuse a home pose or workspace that a simulated setup cannot have; say what is not reached.
+
+    Raises:
+        InputError: out of reach, or out of the simulated camera's picture
+    """
+    limits = calibration.workplace.limits(calibration.table)
+    part = check_workplace(calibration.workplace, limits)
+    if part is not None:
+        print(part, file=sys.stderr, flush=True)
+    check_picture(calibration, limits)
 
 
 def open_robot(
@@ -115,11 +131,13 @@ def open_robot(
         ConnectionFailed: it cannot be reached, or the vendor's package is missing
     """
     if config.robot == "sim":
-        from .backends.sim import SimRobot
+        from .backends.sim import SimRobot, SimRobotConfig
 
         if world is None:
             raise InputError("the robot sim needs --camera sim, which brings its chain")
-        return SimRobot(world)
+        return SimRobot(
+            world, SimRobotConfig() if home_q is None else SimRobotConfig(q=tuple(home_q))
+        )
     if config.robot == "dry_run" or not config.execute:
         start = DryRunConfig() if home_q is None else DryRunConfig(q=tuple(home_q))
         return DryRunRobot(start, on_command=_tell)
@@ -195,14 +213,22 @@ def read_calibration(config: RigConfig) -> Calibration:
 
     Raises:
         InputError: missing or damaged, the table was touched off anew since, or it is that of
-            another robot or camera
+            another robot, camera, home pose or workspace
     """
     calibration = Calibration.load(config.setup / "calibration.json")
+    theirs = calibration.workplace
+    flags = "leave the flag out, or calibrate camera (or points, or hand) with it"
+    stored = Workplace.load(config.setup)
+    again = "calibrate camera (or points, or hand) again"
+    for wanted, advice in ((theirs.with_flags(config), flags), (stored or theirs, again)):
+        difference = theirs.difference(wanted)
+        if difference is not None:
+            raise InputError(f"the calibration in {config.setup} is of {difference}; {advice}")
     touched = config.setup / "table.json"
     if touched.is_file() and read_table(touched) != calibration.table:
         raise InputError(
             f"{touched} is another table than the calibration's, whose floor would be wrong; "
-            "calibrate camera (or points, or hand) again"
+            f"{again}"
         )
     if config.robot in REAL_ROBOTS:
         pairs = [("robot", "--robot and --host", calibration.robot_id, config.robot_id)]

@@ -38,6 +38,10 @@ class RigConfig:
     """Whether a real robot moves; without it its commands are printed."""
     joint_speed: float = 0.05
     """Share of the joints' greatest speeds, between poses."""
+    home: tuple[float, ...] | None = None
+    """Seven joint positions of the home pose [rad]; None: as stored, see `hardware.workplace`."""
+    workspace: tuple[float, float, float, float] | None = None
+    """Ends of the workspace along x, then y [m]; None: as stored."""
 
     @property
     def moves(self) -> bool:

@@ -35,15 +35,23 @@ from .hand_eye import MIN_POSES, HandEye, calibrate_hand_eye
 from .homography import board_on_table, fit_homography, plane_homography
 from .human import Terminal
 from .json_file import write_json
-from .measuring import confirm, lens_of, make_calibration, marked, open_arm
+from .measuring import (
+    confirm,
+    keep,
+    lens_of,
+    make_calibration,
+    marked,
+    open_arm,
+    touched_table,
+)
 from .operators import until_cleared
 from .poor_fit import PoorFit
-from .rig import open_camera, read_calibration, read_table
+from .rig import open_camera, read_calibration
 from .rig_config import RigConfig
 from .safety import SafeRobot
 from .table_plane import TablePlane, fit_table_plane
-from .top_down_view import TopDownView
 from .touch_off import close_fingers, touch_off
+from .workplace import workplace_of
 
 __all__ = ["measure_camera", "measure_hand_eye", "measure_lens", "measure_table",
            "photograph_empty", "print_board"]  # fmt: skip
@@ -152,11 +160,14 @@ def measure_table(
         arm.open_gripper()
     plane, residuals = fit_table_plane(points)
     path = config.setup / "table.json"
+    workplace = workplace_of(config)
+    workplace.save(config.setup)
     record = {
         "schema": 1,
         "height_m": plane.height_m,
         "slope_x": plane.slope_x,
         "slope_y": plane.slope_y,
+        "workspace": [*workplace.x, *workplace.y],
         "points": points.tolist(),
         "residuals_m": residuals.tolist(),
     }
@@ -188,7 +199,7 @@ def measure_camera(
         RobotError, CameraError: robot or camera fail
     """
     operator = operator or Terminal()
-    table = read_table(config.setup / "table.json")
+    table = touched_table(config)
     lens = lens_of(config)
     with robot or open_arm(config, table) as arm:
         confirm(
@@ -219,8 +230,7 @@ def measure_camera(
         error_m=fit.error_m,
         details={"board": board.to_record(), "report": fit.report()},
     )
-    path = config.setup / "calibration.json"
-    calibration.save(path)
+    path = keep(config, calibration)
     write_picture(config.setup / "board_seen.png", marked(frame.rgb, corners.pixels))
     return {"calibration": path, "report": fit.report(), "error_m": fit.error_m}
 
@@ -246,7 +256,7 @@ def measure_hand_eye(
     """
     _check_views(views, MIN_POSES)
     operator = operator or Terminal()
-    table = read_table(config.setup / "table.json")
+    table = touched_table(config)
     lens = lens_of(config)
     with (
         robot or open_arm(config, table) as arm,
@@ -298,8 +308,7 @@ def measure_hand_eye(
                     "tcp_T_camera": hand_eye.tcp_T_camera.tolist(),
                 },
             )
-            path = config.setup / "calibration.json"
-            calibration.save(path)
+            path = keep(config, calibration)
         kept.remove()
     return {"calibration": path, "report": hand_eye.report(), "error_m": hand_eye.error_m}
 
@@ -313,7 +322,7 @@ def photograph_empty(config: RigConfig) -> dict[str, Any]:
     """
     calibration = read_calibration(config)
     with open_camera(config, calibration.intrinsics) as device:
-        view = TopDownView().rectify(device.read().rgb, calibration)
+        view = calibration.workplace.view.rectify(device.read().rgb, calibration)
     path = config.setup / "empty_view.png"
     write_picture(path, view)
     return {"empty": path}

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from warp_deform.errors import InputError
+from warp_deform.rendering.pixels import PixelGrid
 
-from .calibration import Calibration
+if TYPE_CHECKING:
+    from .calibration import Calibration
 
 __all__ = ["TopDownView"]
 
@@ -36,6 +39,12 @@ class TopDownView:
         across = (self.x[1] - self.x[0]) / self.shape[1]
         if abs((self.y[1] - self.y[0]) / self.shape[0] / across - 1.0) > 1e-6:
             raise InputError(f"a view needs square pixels; {self} has none")
+
+    @property
+    def grid(self) -> PixelGrid:
+        """The same pixels as the simulated tasks name them."""
+        half = 0.5 * self.pixel_m
+        return PixelGrid((self.x[0] + half, self.y[0] + half), self.pixel_m)
 
     @property
     def pixel_m(self) -> float:
@@ -81,7 +90,7 @@ class TopDownView:
             share = float(outside.any(axis=-1).mean())
             raise InputError(
                 f"{100 * share:.1f} % of the workspace is outside of the camera's picture; choose "
-                "a higher home pose or a smaller workspace, and calibrate anew"
+                "another home pose or a smaller workspace, and calibrate anew"
             )
         big = cv2.remap(image, seen, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         size = self.shape[::-1]

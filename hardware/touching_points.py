@@ -24,15 +24,24 @@ from .gathering import Kept, gather
 from .goal_file import write_picture
 from .homography import MIN_POINTS, HomographyFit, solve_homography
 from .human import Terminal
-from .measuring import confirm, lens_of, make_calibration, marked, open_arm
+from .measuring import (
+    confirm,
+    keep,
+    lens_of,
+    make_calibration,
+    marked,
+    open_arm,
+    touched_table,
+)
 from .operators import until_cleared
 from .points_file import TouchedPoint, origin_line, read_points, write_points
-from .rig import open_camera, read_table
+from .rig import open_camera
 from .rig_config import REAL_ROBOTS, RigConfig
 from .safety import SafeRobot
 from .safety_limits import FINGERTIP_BELOW_TCP, SafetyLimits
 from .table_plane import TablePlane
 from .touch_off import close_fingers
+from .workplace import workplace_of
 
 __all__ = ["Show", "click_point", "measure_points", "points_from_file", "type_point"]
 
@@ -73,7 +82,7 @@ def measure_points(
     if show is None:
         _pyplot()  # a missing display is said before the arm moves
     operator, show = operator or Terminal(), show or click_point
-    table = read_table(config.setup / "table.json")
+    table = touched_table(config)
     lens = lens_of(config)
     with robot or open_arm(config, table) as arm:
         confirm(
@@ -134,13 +143,13 @@ def points_from_file(
     """
     if config.robot not in REAL_ROBOTS or (config.host is None and config.robot != "frankapy"):
         raise InputError("whose are the points? give --robot and --host, as later for run")
-    table = read_table(config.setup / "table.json")
+    table = touched_table(config)
     intrinsics = lens_of(config)
     if intrinsics is None:
         with camera or open_camera(config, None) as device:
             intrinsics = device.read().intrinsics
     points = read_points(path, origin_line(config, intrinsics))
-    limits = SafetyLimits(table=table)
+    limits = workplace_of(config).limits(table)
     _check(points, intrinsics, limits)
     return _save(config, points, _fit(points, intrinsics, limits), intrinsics, table)
 
@@ -317,6 +326,9 @@ def _save(
         error_m=fit.error_m,
         details={"report": fit.report(), **measured},
     )
-    path = config.setup / "calibration.json"
-    calibration.save(path)
-    return {"calibration": path, "report": fit.report(), "error_m": fit.error_m, **measured}
+    return {
+        "calibration": keep(config, calibration),
+        "report": fit.report(),
+        "error_m": fit.error_m,
+        **measured,
+    }

@@ -56,6 +56,8 @@ class TwinConfig:
     """The workspace: where the chain is tossed."""
     foam_height_m: float = 0.03
     """Upper side of the foam in the base frame [m]."""
+    home_q: tuple[float, ...] = HOME_Q
+    """Where the arm stands at first [rad]."""
     seed: int = 0
     """Of grips that slip, and of the first toss."""
 
@@ -111,7 +113,8 @@ class CableTwin:
         self._jaw = Jaw(self._solver, 0, self._chain, self.config.jaw, rng=rng)
         self._left = 0.0
         self._still = 0.0
-        self._hand = Hand(PandaKinematics().pose(np.array(HOME_Q)), np.zeros(3), 0.08, False, 1e-3)
+        home = PandaKinematics().pose(np.array(self.config.home_q))
+        self._hand = Hand(home, np.zeros(3), 0.08, False, 1e-3)
         self.toss(self.config.seed)
 
     # What the owner does.

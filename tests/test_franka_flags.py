@@ -26,13 +26,20 @@ VERBS: dict[str, type[CommandOptions]] = {
 NEEDED = {"calibrate": ["lens"], "capture-goal": ["--out", "g.png"], "collect": ["--out", "demos"]}
 
 
+def alternatives(hint: Any) -> tuple[Any, ...]:
+    """What an annotation is the union of."""
+    if typing.get_origin(hint) is typing.Annotated:
+        return alternatives(typing.get_args(hint)[0])
+    union = typing.get_origin(hint) in (types.UnionType, typing.Union)
+    return typing.get_args(hint) if union else (hint,)
+
+
 def kinds(hint: Any) -> set[type]:
     """The scalar types in an annotation."""
-    if typing.get_origin(hint) is typing.Annotated:
-        return kinds(typing.get_args(hint)[0])
-    if typing.get_origin(hint) in (types.UnionType, typing.Union, tuple):
-        return set().union(*map(kinds, typing.get_args(hint)))
-    return {hint} if isinstance(hint, type) else set()
+    found: set[type] = set()
+    for kind in alternatives(hint):
+        found |= set(typing.get_args(kind)) if typing.get_origin(kind) is tuple else {kind}
+    return found
 
 
 def numeric_flags() -> list[tuple[str, str, Any]]:
@@ -63,7 +70,7 @@ def test_every_number_has_a_range(verb: str, name: str, hint: Any) -> None:
     allowed = flag_range(hint)
     assert allowed is not None, f"franka {verb} --{name} takes any number"
     assert math.isfinite(allowed.low) and math.isfinite(allowed.high)
-    many = tuple in {typing.get_origin(typing.get_args(hint)[0])}
+    many = any(typing.get_origin(kind) is tuple for kind in alternatives(hint))
 
     given = make_dataclass("Given", [(name, hint)])
 
@@ -89,7 +96,8 @@ def test_what_cannot_be_meant_is_one_line_and_leaves_nothing(
     allowed = flag_range(hint)
     assert allowed is not None
     bad = [str(int(allowed.low) - 1)] if int in kinds(hint) else ["nan"]
-    count = len(typing.get_args(typing.get_args(hint)[0])) if name == "size" else 1
+    many = [kind for kind in alternatives(hint) if typing.get_origin(kind) is tuple]
+    count = len([kind for kind in typing.get_args(many[0]) if kind is not ...]) if many else 1
     flag = f"--{name.replace('_', '-')}"
     code = main(["franka", verb, *NEEDED.get(verb, []), flag, *(bad * count)])
     said = capfd.readouterr()

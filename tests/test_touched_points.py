@@ -91,7 +91,7 @@ class Person:
         self.shown.clear()
         robot = SafeRobot(self.robot, SafetyLimits(table=TABLE))
         return measure_points(
-            setup(folder), camera=BlindCamera(), robot=robot, operator=Terminal(self.answer),
+            setup(folder, None), camera=BlindCamera(), robot=robot, operator=Terminal(self.answer),
             **{"show": self.show, **options},
         )  # fmt: skip
 
@@ -110,7 +110,7 @@ def test_touched_marks_find_the_camera(tmp_path: Path, capsys: pytest.CaptureFix
     left = [float(line.split("left out ")[1].split()[0]) for line in lines]
     np.testing.assert_allclose(left, 1e3 * np.array(found["left_out_m"]), atol=0.006)
     assert {path.name for path in tmp_path.iterdir()} == {
-        "table.json", "calibration.json", "points_seen.png",
+        "table.json", "calibration.json", "points_seen.png", "workplace.json",
     }  # fmt: skip
 
 
@@ -238,7 +238,7 @@ PANDA = ("--robot", "panda", "--host", "10.0.0.1")
 
 def lab(folder: Path) -> RigConfig:
     """A measured table and lens."""
-    setup(folder)
+    setup(folder, None)
     write_json(folder / "lens.json", {"schema": 1, **INTRINSICS.to_record(), "error_px": 0.2})
     return RigConfig(setup=folder, robot="panda", host="10.0.0.1", camera="uvc")
 
@@ -345,7 +345,7 @@ def test_whose_pairs_and_which_lens_must_be_known(
 
 
 def test_a_camera_that_tells_its_intrinsics_is_opened_for_them(tmp_path: Path) -> None:
-    setup(tmp_path)
+    setup(tmp_path, None)
     file = tmp_path / "pairs.csv"
     file.write_text("\n".join(rows()))
     config = RigConfig(setup=tmp_path, robot="fr3", host="10.0.0.2", camera="realsense")

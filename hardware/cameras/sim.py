@@ -23,7 +23,7 @@ from ..calibration import Calibration
 from ..camera import CameraError, CameraIntrinsics, Frame
 from ..closing import Closing
 from ..homography import plane_homography
-from ..panda_arm import HOME_Q, PandaKinematics
+from ..panda_arm import PandaKinematics
 from ..table_plane import TablePlane
 from ..twin import TwinConfig, TwinLook
 
@@ -98,17 +98,20 @@ def sim_calibration(
     as thick as the chain is calibrated on: at the workspace's ends half a thickness is a pixel.
     """
     twin, camera = twin or TwinConfig(), camera or SimCameraConfig()
-    base_T_camera = PandaKinematics().pose(np.array(HOME_Q)) @ camera.tcp_T_camera
+    home_q = np.array(twin.home_q)
+    base_T_camera = PandaKinematics().pose(home_q) @ camera.tcp_T_camera
     middle = TablePlane(twin.foam_height_m + twin.chain.radius)
     return Calibration(
         robot_id="sim",
         camera_id="sim",
-        home_q=np.array(HOME_Q),
+        home_q=home_q,
         intrinsics=camera.intrinsics,
         base_H_pixel=plane_homography(camera.intrinsics, base_T_camera, middle),
         table=twin.table,
         method="hand-eye",
         error_m=0.0,
+        x=twin.view.x,
+        y=twin.view.y,
         details={"exact": True},
     )
 
