@@ -15,15 +15,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warp_deform.errors import InputError
+
 from .joint_path import corner_cuts, path_pieces
 from .panda_arm import PandaKinematics
 from .path_speed import fitting_share
-from .robot import SafetyViolation, check_number
+from .robot import SafetyViolation, check_number, check_pose
 from .safety_limits import LIMIT_NAMES, PATH_TOLERANCE, SafetyLimits, dense_path
 from .straight_line import StraightLine, distance, straight_line
 
 __all__ = ["LEVEL", "CheckedLine", "CheckedPath", "MotionChecks", "Planner",
-           "sunk_after"]  # fmt: skip
+           "as_lines", "sunk_after"]  # fmt: skip
 
 Planner = Callable[..., StraightLine]
 """What solves a straight line: the signature of `straight_line`."""
@@ -296,3 +298,12 @@ def _within(limit: str, name: str, value: float, low: float, high: float, unit: 
             f"{limit}: {number:g}{unit} is commanded, {low:g} to {high:g}{unit} allowed"
         )
     return number
+
+
+def as_lines(lines: object) -> list[tuple[np.ndarray, float, float | None]]:
+    """Return lines as triples whose poses are copies, or refuse what is none."""
+    try:
+        triples = [(target, speed, force) for target, speed, force in lines]  # type: ignore[attr-defined]
+    except (TypeError, ValueError) as error:
+        raise InputError("lines: a list of (pose, speed, stop force) is needed") from error
+    return [(check_pose(target), speed, force) for target, speed, force in triples]

@@ -21,7 +21,7 @@ import numpy as np
 from warp_deform.errors import InputError
 from warp_deform.tasks.strand_grasp import wrap_half_turn
 
-from .robot import MotionError
+from .robot import MotionError, check_number
 from .safety import SafeRobot
 from .table_plane import TablePlane
 
@@ -71,7 +71,7 @@ class PickPlaceConfig:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
+            value = check_number(f"pick_place: {field.name}", getattr(self, field.name))
             if not 0.0 <= value < math.inf:
                 raise InputError(f"pick_place: {field.name} is {value}, needed is 0 or more")
         if not self.grasp_m < self.hover_m or not self.place_m < self.short_lift_m <= self.lift_m:
@@ -100,6 +100,8 @@ class PickPlaceAction:
 
     def __post_init__(self) -> None:
         values = (*self.pick_xy, self.pick_yaw, *self.place_xy, self.place_yaw)
+        for value in values:
+            check_number("an action's number", value)
         if not all(math.isfinite(value) for value in values):
             raise InputError(f"an action's numbers must be finite, not {values}")
 

@@ -7,6 +7,7 @@ connection never move the arm. The command methods block until the motion has en
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol, runtime_checkable
@@ -325,7 +326,7 @@ def _numbers(name: str, value: object) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def check_joints(q: np.ndarray) -> np.ndarray:
+def check_joints(q: np.ndarray | Sequence[float]) -> np.ndarray:
     """Return joint way-points [rad] as a copy (N, 7), float64.
 
     Raises:

@@ -25,7 +25,7 @@ import numpy as np
 from warp_deform.errors import InputError
 
 from .arrival import check_arrival, pressed_contact
-from .motion_checks import LEVEL, MotionChecks, Planner, sunk_after
+from .motion_checks import LEVEL, MotionChecks, Planner, as_lines, sunk_after
 from .panda_arm import GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
 from .robot import (
     HomesGripper,
@@ -97,7 +97,7 @@ class SafeRobot:
         self._latch = StopLatch()
         self._arm = kinematics or PandaKinematics()
         self._checks = MotionChecks(limits, self._arm, planner)
-        self._home = check_joints(np.array(home_q))[0]
+        self._home = check_joints(home_q)[0]
         self._home.flags.writeable = False
         self._recoveries = 0
         self._sunk = 0.0
@@ -215,7 +215,7 @@ class SafeRobot:
         Raises:
             SafetyViolation, UnreachablePose, InputError: one of them would be refused
         """
-        wanted = [(check_pose(target), speed, force) for target, speed, force in lines]
+        wanted = as_lines(lines)
         with self._lock:
             state = self._ready()
             q, pose, sunk = state.q, state.base_T_tcp, self._sunk
@@ -244,8 +244,7 @@ class SafeRobot:
             rise = limits.contact_height_m - float(limits.height(state.base_T_tcp))
             if rise > 0.0:
                 above = state.base_T_tcp.copy()
-                # A millimetre more: the arm may end a little short, and the next motion must start
-                # above the limit.
+                # A millimetre more: the arm may end short, and has to start above the limit next.
                 above[2, 3] += rise + 1e-3
                 self.move_linear(_orthonormal(above), speed=limits.max_speed)
                 state = self._ready()
@@ -259,9 +258,9 @@ class SafeRobot:
 
     def stands_at(self, q: np.ndarray) -> bool:
         """Whether the TCP is where joint positions q (7,) [rad] put it, as near as an arrival."""
-        off, turned = distance(self.state().base_T_tcp, self._arm.pose(np.asarray(q)))
-        limits = self.limits
-        return off <= limits.arrival_tolerance_m and turned <= limits.arrival_tolerance_rad
+        off, turned = distance(self.state().base_T_tcp, self._arm.pose(check_joints(q)[0]))
+        most = self.limits.arrival_tolerance_m, self.limits.arrival_tolerance_rad
+        return off <= most[0] and turned <= most[1]
 
     # The gripper.
 
@@ -305,8 +304,7 @@ class SafeRobot:
     def stop(self) -> None:
         """End the motion in progress, and let none begin until `recover`; from any thread.
 
-        It holds also where it comes between the check of a motion and its start, and where the
-        backend does not answer.
+        It holds also between the check of a motion and its start, and without the backend's answer.
         """
         self._latch.stop(self._robot.stop)
 
@@ -322,6 +320,8 @@ class SafeRobot:
             SafetyViolation: it was done `max_recoveries` times since `begin_episode`, unconfirmed
             UserStopped: the user stop is pressed: that takes an operator
         """
+        if not isinstance(confirmed, bool):
+            raise InputError(f"confirmed: True or False, not {shown(confirmed)}")
         with self._lock:
             mark = self._latch.mark()
             if self._robot.state().mode == RobotMode.USER_STOPPED:

@@ -17,6 +17,7 @@ from hardware.backends.dry_run import DryRunRobot
 from hardware.backends.sim import SimRobot
 from hardware.emulator.world import TableWorld
 from hardware.panda_arm import DQ_MAX
+from hardware.pick_place import PickPlaceAction, PickPlaceConfig
 from hardware.safety import SafeRobot
 from hardware.safety_limits import SafetyLimits
 from hardware.stop_latch import StopLatch
@@ -69,6 +70,26 @@ def test_poses_that_are_none_are_refused(bent: object) -> None:
     for q in (HOME * 1j, HOME.astype(str), HOME > 0, [*HOME[:6], None], "q", None, {}):
         with pytest.raises(InputError, match=r"^q: "):
             robot.move_joints(q, speed=0.05)
+    assert spy.log == ["recover"]
+
+
+def test_other_arguments_that_are_none_are_refused() -> None:
+    robot = SafeRobot(spy := SpyRobot(), FLAT)
+    for lines in (None, 3, [pose()], [(pose(), 0.05)], "abc"):
+        with pytest.raises(InputError, match="lines"):
+            robot.check_lines(lines)
+    for confirmed in ("no", None, 1):
+        with pytest.raises(InputError, match="confirmed"):
+            robot.recover(confirmed=confirmed)
+    for q in (None, "q", [[1.0], [2.0, 3.0]], HOME[:3]):
+        with pytest.raises(InputError, match=r"^q: "):
+            robot.stands_at(q)
+        with pytest.raises(InputError, match=r"^q: "):
+            SafeRobot(SpyRobot(), FLAT, home_q=q)
+    with pytest.raises(InputError, match="grasp_m"):
+        PickPlaceConfig(grasp_m="low")
+    with pytest.raises(InputError, match="number"):
+        PickPlaceAction((0.5, "0"), 0.0, (0.5, 0.1), 0.0)
     assert spy.log == ["recover"]
 
 
