@@ -189,6 +189,29 @@ def test_stdout_holds_the_report_alone(capfd: pytest.CaptureFixture[str]) -> Non
     assert capfd.readouterr().out == "three\n"
 
 
+def test_the_shell_completes_verbs_flags_and_tasks(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """As bash does it: the words of a line are handed to the function that the script defines."""
+    assert main(["--completion"]) == 0
+    script = tmp_path / "completion.sh"
+    script.write_text(capfd.readouterr().out)
+
+    def completed(*line: str) -> list[str]:
+        words = " ".join(f"'{word}'" for word in line)
+        asked = f"COMP_WORDS=({words}); COMP_CWORD={len(line) - 1}; _warp_deform"
+        run = ["bash", "-c", f'source {script}; {asked}; printf "%s\\n" "${{COMPREPLY[@]}}"']
+        return subprocess.run(run, capture_output=True, text=True, check=True).stdout.split()
+
+    assert completed("warp-deform", "re") == ["replay", "report", "refine"]
+    assert completed("warp-deform", "replay", "demos", "--ver") == ["--verify"]
+    assert completed("warp-deform", "demo", "cable-r") == ["cable-ring", "cable-ring-notarget"]
+    assert "--hold-out" in completed("warp-deform", "train", "--")
+    assert completed("warp-deform", "inspect", "cable-r") == []
+    assert main(["list", "--tyro-print-completion", "bash"]) == 2
+    assert "`warp-deform --completion`" in capfd.readouterr().err
+
+
 def test_list_keeps_its_contract(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--json"]) == 0
     tasks = json.loads(capfd.readouterr().out)["tasks"]

@@ -135,6 +135,9 @@ def _dispatch(arguments: list[str]) -> int:
     if name in ("-V", "--version"):
         print(f"warp-deform {__version__}")
         return 0
+    if name == "--completion":
+        print(_completion(), end="")
+        return 0
     if name not in VERBS:
         near = difflib.get_close_matches(name, VERBS, n=1, cutoff=0.5)
         hint = f"did you mean `{near[0]}`?" if near else f"use one of: {', '.join(VERBS)}"
@@ -168,9 +171,28 @@ def _usage() -> str:
             *(f"  {name:<{width}}  {verb.summary}" for name, verb in VERBS.items()),
             "",
             "  -h, --help     show this text",
+            "  --completion   a script that completes verbs, flags and tasks in the shell",
             "  -V, --version  show the version",
         ]
     )
+
+
+def _completion() -> str:
+    """The script that `--completion` prints: flags are those of every verb's help."""
+    from .completion import completion_script
+    from .tasks.elsewhere import offered
+    from .tasks.registry import FURTHER_TASKS, TASKS
+
+    tasks = (*TASKS, *FURTHER_TASKS, *offered())
+    words: dict[str, list[str]] = {}
+    for name, verb in VERBS.items():
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said):
+            _parse(f"warp-deform {name}", _load(verb.target), ["--help"])
+        flags = dict.fromkeys(re.findall(r"(?<![\w-])--[a-z](?:[\w-]*\w)?", said.getvalue()))
+        takes_task = re.search(r"^\W*TASK\b", said.getvalue(), re.MULTILINE)
+        words[name] = [*flags, *(tasks if takes_task else ())]
+    return completion_script(words)
 
 
 def _load(target: str) -> Callable[[Any], Outcome]:
@@ -189,6 +211,8 @@ def _parse(
     """
     import tyro
 
+    if any(each.startswith("--tyro-") for each in arguments):
+        raise InputError("tyro's completions are of one verb; use `warp-deform --completion`")
     hints = typing.get_type_hints(verb, include_extras=True)
     kind = next(hint for name, hint in hints.items() if name != "return")
     said = io.StringIO()
