@@ -45,6 +45,14 @@ def test_what_the_grid_of_actions_costs() -> None:
     assert module.table([module.Row(**row) for row in rows]) in DOCUMENT
 
 
+def test_how_hard_the_tasks_are_and_what_bags_enclose() -> None:
+    module, lines = measured("demonstrators", "results")
+    rows = [module.Row(**line) for line in lines]
+    results = (ROOT / "docs" / "results.md").read_text()
+    assert module.hardness(rows) in results and module.bags(rows) in results
+    assert all(row.enclosed is not None for row in rows if row.task.startswith("bag-items"))
+
+
 def test_rows_of_neighbouring_seeds_count_as_one() -> None:
     module, lines = measured("demonstrators", "results")
     row = module.Row(**lines[0])
