@@ -8,7 +8,7 @@ no heat maps; their frames show observation and goal alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,9 @@ import numpy as np
 import torch
 
 from warp_deform.episode_loop import Run, worlds_for
+from warp_deform.episodes import Goal
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.filming import Take, TakeRow, film_takes, seen
 from warp_deform.rendering.pixels import PixelGrid
 from warp_deform.rendering.video import VideoWriter
 from warp_deform.tasks.registry import task as find_task
@@ -90,8 +92,10 @@ def heat_maps(
 def film_episodes(
     run: RunFolder, evaluation: Evaluation, protocol: Protocol, folder: Path, *, count: int
 ) -> list[Path]:
-    """Write an MP4 of each of the first `count` episodes of an evaluation; returns their paths.
+    """Write MP4s of each of the first `count` episodes of an evaluation; returns their paths.
 
+    `TASK_SEED.mp4` shows heat maps, `TASK_SEED_arm.mp4` the arm at work, as `filming.film` shows a
+    demonstrator's; the latter is missing where no action was done or the physics failed.
     They are played again, and have to come out as they did.
 
     Raises:
@@ -110,12 +114,17 @@ def film_episodes(
     goals = goals_for(run, task, protocol)
     worlds = worlds_for(task, protocol.robot)
     sights: dict[int, list[Sight]] = {}
+    hashes: dict[int, list[str]] = {}
+    takes: list[Take] = []
     paths = []
+    given = None if goals is None else goals_of(goals, protocol, list(known))
 
     def watch(slot: int, observation: Mapping[str, np.ndarray], action: np.ndarray) -> None:
         images = isinstance(policy, ImagePolicy)
         heat = heat_maps(policy, observation, action) if images else None
-        sights.setdefault(worlds.episodes[slot].seed, []).append(_look(worlds, slot, heat))
+        seed = worlds.episodes[slot].seed
+        sights.setdefault(seed, []).append(_look(worlds, slot, heat))
+        hashes.setdefault(seed, []).append(worlds.hash(slot))
 
     with single_threaded():
         plays = play_policy(
@@ -123,7 +132,7 @@ def film_episodes(
             worlds,
             protocol,
             list(known),
-            None if goals is None else goals_of(goals, protocol, list(known)),
+            given,
             watch=watch,
         )
         for slot, played, episode in plays:
@@ -132,13 +141,44 @@ def film_episodes(
                     f"seed {played.seed} comes out differently here, so its video would show "
                     "something else; evaluate a copy of the run without its evaluations/ here"
                 )
-            seen = sights.pop(played.seed, [])
-            if len(episode.rows) > len(seen):  # else the last state cannot be trusted
-                seen.append(_look(worlds, slot, None))
-            if seen:
+            shown = sights.pop(played.seed, [])
+            if len(episode.rows) > len(shown):  # else the last state cannot be trusted
+                shown.append(_look(worlds, slot, None))
+                if episode.actions:
+                    states = [*hashes[played.seed], worlds.hash(slot)]
+                    goal = None if given is None else given[played.seed]
+                    takes.append(_take(worlds, slot, episode, shown, states, goal))
+            if shown:
                 paths.append(folder / f"{task}_{played.seed}.mp4")
-                _write_video(paths[-1], task, played, episode, seen)
+                _write_video(paths[-1], task, played, episode, shown)
+    for take in takes:  # not before all are played, as they are simulated in the same worlds
+        paths.append(folder / f"{task}_{take.seed}_arm.mp4")
+        film_takes([take], paths[-1])
     return sorted(paths)
+
+
+def _take(
+    worlds: Worlds,
+    slot: int,
+    run: Run[Measured],
+    sights: Sequence[Sight],
+    hashes: Sequence[str],
+    goal: Goal | None,
+) -> Take:
+    """An episode that is over, for a film with the arm."""
+    episode = worlds.episodes[slot]
+    return Take(
+        task=worlds.task.name,
+        robot=worlds.robot.name,
+        seed=run.seed,
+        goal=goal,
+        actions=tuple(run.actions),
+        rows=tuple(
+            TakeRow(state, row.score, seen(sight.color, episode.goal))
+            for state, row, sight in zip(hashes, run.rows, sights, strict=True)
+        ),
+        sim_seconds=episode.sim_seconds,
+    )
 
 
 def draw(

@@ -19,6 +19,7 @@ from learning.protocol import Protocol
 from learning.schedules import Schedule
 from learning.snapshots import RunFolder
 from learning.training import TrainConfig, train
+from warp_deform import filming
 from warp_deform.cli import main
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.rendering.pixels import SHAPE, TABLE_GRID
@@ -116,8 +117,12 @@ def test_videos_of_evaluated_episodes(run: RunFolder, tmp_path: Path) -> None:
     arguments = ["eval", str(run.path), "--episodes", "2", "--validation-episodes", "1",
                  "--workers", "1", "--video", str(tmp_path / "films"), "--videos", "1"]  # fmt: skip
     assert main(arguments) == 0
-    (path,) = (tmp_path / "films").iterdir()
-    assert path.name == f"{TASK}_10000.mp4"
+    path, arm = sorted((tmp_path / "films").iterdir())
+    assert (path.name, arm.name) == (f"{TASK}_10000.mp4", f"{TASK}_10000_arm.mp4")
+    scene = iio.imread(arm)
+    assert scene.shape[1:] == (540, 960, 3) and len(scene) > 24
+    still = round(filming.STILL_SECONDS * filming.FPS)
+    assert np.abs(scene[still + 20].astype(int) - scene[0]).max() > 60  # the arm moves
     frames = list(iio.imiter(path))
     protocol = Protocol(split="test", episodes=2)
     evaluation = evaluate_snapshot(run, 1, protocol)

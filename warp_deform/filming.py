@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .episode_loop import worlds_for
-from .episodes import Episode, EpisodeReader
+from .episodes import Episode, EpisodeReader, Goal
 from .errors import InputError, WarpDeformError
 from .recording import recorded_task
 from .rendering.caption import annotate
@@ -20,7 +20,7 @@ from .running import StepReport
 from .workers import single_threaded
 from .worlds import Worlds
 
-__all__ = ["check_video", "film"]
+__all__ = ["Take", "TakeRow", "check_video", "film", "film_takes", "seen"]
 
 FPS = 24
 LONGEST = 20.0
@@ -37,6 +37,32 @@ class _Shot:
     body_q: np.ndarray
     q: np.ndarray
     row: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Take:
+    """An episode as it was played: enough to simulate it again, and what its frames tell.
+
+    goal: the one it was given, None where the start makes it; actions: (7,) each
+    rows: at the start and after every action, what was seen and came of it
+    """
+
+    task: str
+    robot: str
+    seed: int
+    goal: Goal | None
+    actions: tuple[np.ndarray, ...]
+    rows: tuple[TakeRow, ...]
+    sim_seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class TakeRow:
+    """One state: its hash, its score, and the picture (h, w, 3) uint8 that a policy sees."""
+
+    state_hash: str
+    score: float
+    seen: np.ndarray
 
 
 def check_video(path: Path) -> None:
@@ -74,39 +100,54 @@ def film(
         if not info.actions:
             raise InputError(f"{reader.path(info.seed)} has no action that could be shown")
         recorded_task(info)
-    length = LONGEST - 2 * STILL_SECONDS * len(infos)
-    speed = max(1.0, sum(info.sim_seconds for info in infos) / length)
+    recording = Recording(reader)
+    film_takes([_take(recording, reader.read(seed)) for seed in chosen], path, size=size)
+
+
+def film_takes(takes: Sequence[Take], path: Path, *, size: tuple[int, int] = (540, 960)) -> None:
+    """Write an MP4 of episodes, one after the other; see `film`."""
+    length = LONGEST - 2 * STILL_SECONDS * len(takes)
+    speed = max(1.0, sum(take.sim_seconds for take in takes) / length)
     view = SceneView(size)
     with single_threaded(), VideoWriter(path, FPS) as video:
-        for info in infos:
-            worlds = worlds_for(info.task, info.robot)
-            episode, robot = reader.read(info.seed), worlds.robot
+        for take in takes:
+            worlds = worlds_for(take.task, take.robot)
+            robot = worlds.robot
             arm = ArmMeshes(robot.meshes())
-            inset: tuple[int, np.ndarray | None] = -1, None
-            for shot in _shots(worlds, Recording(reader), episode, speed):
-                if shot.row != inset[0]:
-                    inset = shot.row, _seen(episode, shot.row)
+            for shot in _shots(worlds, take, speed):
                 links = arm.at(robot.link_poses(shot.q))
                 drawables = worlds.episodes[0].drawables
                 frame = view.render(drawables, shot.particle_q, shot.body_q, links)
-                lines = _caption(episode, shot.row, speed)
-                video.write(annotate(frame, lines=lines, inset=inset[1]))
+                lines = _caption(take, shot.row, speed)
+                video.write(annotate(frame, lines=lines, inset=take.rows[shot.row].seen))
 
 
-def _shots(worlds: Worlds, recording: Recording, episode: Episode, speed: float) -> Iterator[_Shot]:
+def _take(recording: Recording, episode: Episode) -> Take:
+    info = episode.info
+    return Take(
+        task=info.task,
+        robot=info.robot,
+        seed=info.seed,
+        goal=recording.goal(info.seed),
+        actions=tuple(s.action for s in episode.steps if s.action is not None),
+        rows=tuple(
+            TakeRow(s.state_hash, s.score, seen(s.color, episode.goal)) for s in episode.steps
+        ),
+        sim_seconds=info.sim_seconds,
+    )
+
+
+def _shots(worlds: Worlds, take: Take, speed: float) -> Iterator[_Shot]:
     """Every frame of an episode, while it is simulated again in slot 0."""
-    seed = episode.info.seed
-    goal = recording.goal(seed)
-    worlds.reset({0: seed}, goals={} if goal is None else {0: goal})
-    _check(worlds, episode, 0)
+    worlds.reset({0: take.seed}, goals={} if take.goal is None else {0: take.goal})
+    _check(worlds, take, 0)
     interval = speed / FPS
     still = round(STILL_SECONDS * FPS)
     waiting = worlds.robot.home_q
-    for t, step in enumerate(episode.steps[:-1]):
+    for t, action in enumerate(take.actions):
         start = worlds.episodes[0].snapshot
-        assert step.action is not None
-        report = worlds.step({0: step.action}, record=interval)[0]
-        _check(worlds, episode, t + 1)
+        report = worlds.step({0: action}, record=interval)[0]
+        _check(worlds, take, t + 1)
         arm = _ArmPath(report, waiting)
         waiting = arm.at(arm.seconds)
         if t == 0:
@@ -144,26 +185,25 @@ class _ArmPath:
         return np.array([np.interp(time, self._times, q) for q in self._joints.T])
 
 
-def _check(worlds: Worlds, episode: Episode, t: int) -> None:
-    """Raise unless the simulated state is the recorded one of row t."""
-    if worlds.hash(0) != episode.steps[t].state_hash:
+def _check(worlds: Worlds, take: Take, t: int) -> None:
+    """Raise unless the simulated state is the one of row t."""
+    if worlds.hash(0) != take.rows[t].state_hash:
         raise WarpDeformError(
-            f"row {t} of seed {episode.info.seed} comes out differently here, so its video would "
+            f"row {t} of seed {take.seed} comes out differently here, so its video would "
             "show something else; `warp-deform replay --verify` compares everything"
         )
 
 
-def _caption(episode: Episode, row: int, speed: float) -> tuple[str, ...]:
-    info, step = episode.info, episode.steps[row]
-    doing = f"action {row + 1} of {info.actions}" if row < info.actions else "done"
+def _caption(take: Take, row: int, speed: float) -> tuple[str, ...]:
+    total = len(take.actions)
+    doing = f"action {row + 1} of {total}" if row < total else "done"
     fast = f"   {speed:.1f} x" if speed > 1.05 else ""
-    return info.task, f"{doing}   score {step.score:.2f}{fast}", f"seed {info.seed}"
+    return take.task, f"{doing}   score {take.rows[row].score:.2f}{fast}", f"seed {take.seed}"
 
 
-def _seen(episode: Episode, row: int) -> np.ndarray:
-    """What a policy sees in a row: the top-down picture, beside the goal's where there is one."""
-    color = episode.steps[row].color
-    if episode.goal is None:
+def seen(color: np.ndarray, goal: Goal | None) -> np.ndarray:
+    """What a policy sees: the top-down picture, beside the goal's where there is one."""
+    if goal is None:
         return color
     gap = np.full((len(color), 4, 3), 255, np.uint8)
-    return np.concatenate([color, gap, episode.goal.color], axis=1)
+    return np.concatenate([color, gap, goal.color], axis=1)
