@@ -73,7 +73,7 @@ def test_the_adapters_have_the_protocols_methods(cls: type) -> None:
 
 @pytest.mark.parametrize(
     ("cls", "module", "advice"),
-    [(FR3Robot, "franky", r"warp-deform\[fr3\]"), (FrankapyRobot, "frankapy", "ROS workspace")],
+    [(FR3Robot, "franky", r"-e '\.\[fr3\]'"), (FrankapyRobot, "frankapy", "ROS workspace")],
 )
 def test_a_missing_package_says_how_to_get_it(
     monkeypatch: pytest.MonkeyPatch, cls: type, module: str, advice: str
