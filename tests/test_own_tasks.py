@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 import sys
@@ -108,11 +109,15 @@ def refused(capfd: pytest.CaptureFixture[str], *words: object) -> str:
     return said
 
 
-def box_away() -> type[Task]:
-    """The class, as a user's script defines it."""
-    scope: dict[str, Any] = {"__name__": "__main__"}
-    exec(BOX, scope)
-    found: type[Task] = scope["BoxAway"]
+def box_away(folder: Path) -> type[Task]:
+    """The class, as a user's script defines it: its module is no module to import."""
+    path = folder / "script.py"
+    path.write_text(BOX)
+    spec = importlib.util.spec_from_file_location("__main__", path)
+    assert spec is not None and spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    found: type[Task] = script.BoxAway
     return found
 
 
@@ -151,7 +156,7 @@ def test_a_task_of_a_script_reaches_the_workers(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Its module is the script, which no worker could import; nor is it imported by replay."""
-    warp_deform.register_task(box_away())
+    warp_deform.register_task(box_away(tmp_path))
     demos = tmp_path / "demos"
     made = reported(capfd, "demo", "box-away", "-n", 9, "--workers", 2, "--out", demos)
     assert made["successes"] == 9
@@ -309,8 +314,8 @@ def test_rows_of_another_form_are_refused(rows: Any, size: dict[str, int]) -> No
         warp_deform.register_task(variant(ground_truth_rows=rows, **size))
 
 
-def test_a_class_takes_the_place_of_its_earlier_self_alone() -> None:
-    first, again = box_away(), box_away()
+def test_a_class_takes_the_place_of_its_earlier_self_alone(tmp_path: Path) -> None:
+    first, again = box_away(tmp_path), box_away(tmp_path)
     assert warp_deform.register_task(first) is first
     warp_deform.register_task(again)
     assert type(find_task("box-away")) is again
