@@ -213,7 +213,7 @@ def test_frames_are_frames() -> None:
 def test_a_frame_moved_on_is_as_far_as_it_was_moved() -> None:
     rng = np.random.default_rng(0)
     T = FRAME.reshape(4, 4).T
-    for size in (1e-9, 1e-4, 1e-2, 1.0):
+    for size in (1e-9, 1e-4, 1e-2, 1.0, 1.8):
         step = size * rng.uniform(-1.0, 1.0, 6)
         np.testing.assert_allclose(difference(T, moved_on(T, step)), step, atol=1e-15 + 1e-9 * size)
         assert is_frame(moved_on(T, step).T.ravel())

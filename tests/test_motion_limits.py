@@ -197,6 +197,26 @@ def test_the_joints_of_a_cartesian_motion_keep_their_limits_too() -> None:
     assert reasons(robot) == [f"{CARTESIAN}_joint_{kind}" for kind in KINDS[1:]]
 
 
+@needs_compiler
+@pytest.mark.parametrize("degrees", [1.0, 90.0, 120.0, 180.0])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_pose_that_is_turned_at_once_is_a_reflex(axis: int, degrees: float) -> None:
+    """Also by half a turn, whose sine is that of none."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    R = np.roll(np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]]), (axis, axis), axis=(0, 1))
+    for begun in (False, True):
+        robot = moving(POSE)
+        pose = robot.arm.O_T_EE.copy()
+        if begun:
+            assert robot.tick(command(O_T_EE_c=pose).tobytes()) is None
+        turned = pose.reshape(4, 4).T.copy()
+        turned[:3, :3] = R @ turned[:3, :3]
+        assert robot.tick(command(O_T_EE_c=turned.T.ravel()).tobytes()) is not None
+        jump = f"{CARTESIAN}_velocity_discontinuity"
+        expected = jump if begun else "cartesian_position_motion_generator_start_pose_invalid"
+        assert expected in reasons(robot)
+
+
 # The elbow.
 
 

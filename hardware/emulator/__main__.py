@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
+from typing import NoReturn
 
 from warp_deform.errors import InputError, WarpDeformError
 
@@ -12,9 +14,16 @@ from .server import EmulatorConfig
 from .world import TableWorld, World
 
 
-def main() -> int:
-    """Serve as the command line says; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m hardware.emulator", description=__doc__)
+class _Parser(argparse.ArgumentParser):
+    """Answers a mistake in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; --help lists the flags")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve as the command line, or `arguments`, says; returns the exit code."""
+    parser = _Parser(prog="python -m hardware.emulator", description=__doc__)
     parser.add_argument("--host", default=EmulatorConfig.host, help="address to listen on")
     parser.add_argument("--paced", action="store_true", help="1 kHz by the wall clock, as a robot")
     parser.add_argument("--table-z", type=float, help="height of a table under the hand [m]")
@@ -24,11 +33,13 @@ def main() -> int:
     parser.add_argument(
         "--chain", type=int, metavar="SEED", help="a bead chain on foam, instead of table or object"
     )
-    options = parser.parse_args()
     try:
+        options = parser.parse_args(arguments)
         config = EmulatorConfig(host=options.host, paced=options.paced)
         world: World = TableWorld(table_z=options.table_z, object_width=options.object_width)
         if options.chain is not None:
+            if options.table_z is not None or options.object_width:
+                raise InputError("--chain brings its own table and object: leave the others out")
             from ..twin import CableTwin, TwinConfig  # loads the simulator
 
             world = CableTwin(TwinConfig(seed=options.chain))

@@ -150,11 +150,12 @@ class Arm:
         if not is_frame(pose):
             return ("cartesian_position_motion_generator_invalid_frame_flag",)
         target, current = pose.reshape(4, 4).T, self.base_T_tcp
-        if first and not np.linalg.norm(target[:3, 3] - current[:3, 3]) < START_TOLERANCE:
+        # One Gauss-Newton step from where the arm is.
+        step = difference(current, target)
+        if first and not np.abs(step).max() <= START_TOLERANCE:
             return ("cartesian_position_motion_generator_start_pose_invalid",)
         twist = difference(self.O_T_EE_c.reshape(4, 4).T, target) / DT
-        # One Gauss-Newton step from where the arm is.
-        names = self._move_end_effector(twist, difference(current, target), command, first=first)
+        names = self._move_end_effector(twist, step, command, first=first)
         self.O_T_EE_c = pose.copy()
         return names
 

@@ -31,7 +31,7 @@ DT = 1e-3  # [s], the interface's period
 DDDQ_MAX = np.array([7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0])  # [rad/s^3]
 JOINT_MAX = (DQ_MAX, DDQ_MAX, DDDQ_MAX)
 # Translation [m/s], [m/s^2], [m/s^3] and rotation [rad/s], [rad/s^2], [rad/s^3].
-TWIST_MAX = tuple(np.array(pair) for pair in ((1.7, 2.5), (13.0, 25.0), (6500.0, 12500.0)))
+TWIST_MAX = ((1.7, 2.5), (13.0, 25.0), (6500.0, 12500.0))
 ELBOW_MAX = tuple(np.array([limit]) for limit in (2.175, 10.0, 5000.0))
 TAU_RATE_MAX = 1000.0  # [N m/s]
 # Doubles of some radians, subtracted and divided by DT three times, are off by so much; libfranka
@@ -64,8 +64,16 @@ def twist_excess(twist: np.ndarray, rate: np.ndarray, jerk: np.ndarray) -> tuple
     return tuple(
         f"cartesian_motion_generator_{name}"
         for name, value, limit in zip(_NAMES, (twist, rate, jerk), TWIST_MAX, strict=True)
-        if not (np.linalg.norm(value.reshape(2, 3), axis=1) <= limit + ROUNDING).all()
+        if not _within(value, *limit)
     )
+
+
+def _within(twist: np.ndarray, translation: float, rotation: float) -> bool:
+    """Return whether the two halves of a twist are as long as allowed; not where one is NaN."""
+    x, y, z, a, b, c = twist.tolist()
+    longest, fastest = translation + ROUNDING, rotation + ROUNDING
+    within = x * x + y * y + z * z <= longest * longest
+    return bool(within and a * a + b * b + c * c <= fastest * fastest)
 
 
 def elbow_excess(velocity: np.ndarray, rate: np.ndarray, jerk: np.ndarray) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ answer that says so, or its connection, and nobody else anything.
 from __future__ import annotations
 
 import functools
+import math
 import select
 import struct
 import time
@@ -90,8 +91,10 @@ class EmulatorConfig:
                 f"host: {self.host!r} is not an address of this machine alone; the emulator takes "
                 "commands from whoever reaches it: choose 127.0.0.1 to 127.255.255.254"
             )
-        if len(self.q) != 7:
-            raise InputError(f"q: seven joint positions [rad], not {len(self.q)}")
+        if len(self.q) != 7 or not all(math.isfinite(angle) for angle in self.q):
+            raise InputError(f"q: seven finite joint positions [rad], not {self.q}")
+        if not 0 <= self.version <= 0xFFFF:
+            raise InputError(f"version: 0 to 65535, as two bytes hold, not {self.version}")
         if not 0.0 <= self.gripper_width <= GRIPPER_MAX_WIDTH:
             raise InputError(
                 f"gripper_width: within 0 and {GRIPPER_MAX_WIDTH} m, not {self.gripper_width}"

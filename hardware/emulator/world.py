@@ -9,6 +9,7 @@ the second after which the client takes the robot for lost, and in paced mode un
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -79,6 +80,8 @@ class TableWorld:
     ) -> None:
         if not 0.0 <= object_width <= 0.08:
             raise InputError(f"object_width: 0 to 0.08 m fits between the fingers, {object_width}")
+        if table_z is not None and not math.isfinite(table_z):
+            raise InputError(f"table_z: a height [m], or None for no table, not {table_z}")
         self.table_z = table_z
         self.object_width = object_width
         self._stiffness = stiffness
