@@ -112,6 +112,11 @@ def test_tosses_of_one_goal_are_no_further_goals(twin: ModuleType) -> None:
         ("twin.jsonl", "planner", "| `planner`, no demonstrations |"),
         ("twin.jsonl", "policy", "| `policy`, Goal-Split, 500 demonstrations |"),
         ("twin_goal_stack.jsonl", "policy", "| `policy`, Goal-Stack, 100 demonstrations |"),
+        (
+            "twin_paper_protocol.jsonl",
+            "policy",
+            "| `policy`, Goal-Split, 24 + 6 demonstrations, one",
+        ),
         ("twin.jsonl", "scripted", "| `scripted`, which knows the chain |"),
         ("twin.jsonl", "random", "| `random` | 0 |"),
     ],
