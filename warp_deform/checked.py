@@ -13,9 +13,11 @@ import numpy as np
 from .errors import InputError
 
 __all__ = [
+    "BELOW_ONE",
     "COUNT",
     "NOT_NEGATIVE",
     "POSITIVE",
+    "SHARE",
     "Interval",
     "check_fields",
     "check_number",
@@ -25,7 +27,7 @@ __all__ = [
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """Numbers from `low` to `high`, both included unless said otherwise; none of them infinite."""
+    """Numbers from `low` to `high`, both included unless said otherwise; finite, too."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -34,6 +36,8 @@ class Interval:
     below_high: bool = False
     """Whether `high` itself is left out."""
     whole: bool = False
+    infinite: bool = False
+    """Whether infinity is allowed, for limits that may be off."""
 
     def holds(self, value: object) -> bool:
         """Whether `value` is such a number; truth values, text and arrays are none."""
@@ -41,7 +45,7 @@ class Interval:
             return False
         number = float(value)
         return (
-            math.isfinite(number)
+            (math.isfinite(number) or (self.infinite and number == math.inf))
             and (number > self.low if self.above_low else number >= self.low)
             and (number < self.high if self.below_high else number <= self.high)
         )
@@ -58,6 +62,8 @@ class Interval:
 
 POSITIVE = Interval(low=0.0, above_low=True)
 NOT_NEGATIVE = Interval(low=0.0)
+BELOW_ONE = Interval(low=0.0, high=1.0, below_high=True)
+SHARE = Interval(low=0.0, high=1.0)
 COUNT = Interval(low=1, whole=True)
 
 

@@ -69,7 +69,7 @@ class DifferentiableRollout:
     release and the like are those of the rollout, so a derivative is that of the smooth piece that
     it ran on; a derivative over many contacts may be as large as the rollout is chaotic.
 
-    storage, memory, sleep: see `Recorder`. `sleep` False lets fabrics creep instead of sleeping.
+    storage, memory, sleep, dt: see `Recorder`. `sleep` False lets fabrics creep, not sleep.
     """
 
     def __init__(
@@ -79,9 +79,10 @@ class DifferentiableRollout:
         storage: str = "replay",
         memory: int = 2**30,
         sleep: bool = True,
+        dt: float | None = None,
     ) -> None:
         self.solver = solver
-        self.recorder = Recorder(solver, storage=storage, memory=memory, sleep=sleep)
+        self.recorder = Recorder(solver, storage=storage, memory=memory, sleep=sleep, dt=dt)
         self.watch: list[WatchValues] = []
         self._worlds: list[int] = []
         self.times = np.zeros(0)
@@ -122,7 +123,7 @@ class DifferentiableRollout:
         Raises:
             InputError: worlds of several topologies, times that do not ascend, too little memory.
         """
-        data, dt = self.solver.data, self.solver.config.dt
+        data, dt = self.solver.data, self.recorder.dt
         self._worlds = [int(w) for w in worlds]
         if len({int(data.world_topology[w]) for w in self._worlds}) != 1:
             raise InputError(
@@ -148,7 +149,7 @@ class DifferentiableRollout:
         end = marks[-1] * dt if marks else 0.0
         prepare(
             self.solver, self._worlds, paths=paths, pushes=pushes, most=2 * end,
-            least=0.0 if until_rest else 2 * end, calm=calm, calm_after=calm_after,
+            least=0.0 if until_rest else 2 * end, calm=calm, calm_after=calm_after, dt=dt,
         )  # fmt: skip
         knot, end_knot = (data.arrays[f"grips.{n}"].view for n in ("knot", "knot_end"))
         self._knots = {

@@ -136,9 +136,13 @@ def prepare(
     most: float | Mapping[int, float] = 10.0,
     calm: float | Mapping[int, float] = 0.0,
     calm_after: float = 0.0,
+    dt: float | None = None,
 ) -> int:
-    """Set a rollout up without running it, see `rollout`; returns its substeps at most."""
-    data, dt = solver.data, solver.config.dt
+    """Set a rollout up without running it, see `rollout`; returns its substeps at most.
+
+    dt: length of a substep [s]; None: the solver's
+    """
+    data, dt = solver.data, dt or solver.config.dt
     for w in worlds:
         if not 0 <= w < data.world_count:
             raise InputError(f"no world {w}: the solver has {data.world_count}")
@@ -146,7 +150,7 @@ def prepare(
     data.clear_grips()
     _write_paths(solver, paths)
     for w, kicks in (pushes or {}).items():
-        _write_pushes(solver, w, kicks)
+        _write_pushes(solver, w, kicks, dt)
     solver.activate(np.asarray(worlds, dtype=int))
     longest = 1
     for w in worlds:
@@ -165,8 +169,8 @@ def _substeps(value: float | Mapping[int, float], world: int, name: str, dt: flo
     return round(check_number(seconds, name, NOT_NEGATIVE) / dt)
 
 
-def _write_pushes(solver: SolverFusedXPBD, world: int, pushes: Sequence[Push]) -> None:
-    data, dt = solver.data, solver.config.dt
+def _write_pushes(solver: SolverFusedXPBD, world: int, pushes: Sequence[Push], dt: float) -> None:
+    data = solver.data
     if len(pushes) > MOST_PUSHES:
         raise InputError(
             f"{len(pushes)} pushes in world {world}; there may be {MOST_PUSHES} at once"

@@ -14,6 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..checked import (
+    BELOW_ONE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHARE,
+    Interval,
+    check_fields,
+)
 from ..errors import InputError
 from .attributes import SpringMode
 from .colors import BLUE, YELLOW, Color
@@ -89,24 +97,21 @@ class BagConfig:
     bead_color: Color = BLUE
 
     def __post_init__(self) -> None:
-        for name in ("radius", "mass", "shell_radius", "bead_radius", "visual_radius", "thickness",
-                     "structural_stiffness", "grasp_reach"):  # fmt: skip
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"BagConfig.{name} must be positive, got {getattr(self, name)}")
-        for name in ("bead_mass", "shear_stiffness", "bend_stiffness", "ring_stiffness",
-                     "exclusion", "friction"):  # fmt: skip
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"BagConfig.{name} must be 0 or more, got {getattr(self, name)}")
-        for name in ("longest", "longest_diagonal"):
-            if not getattr(self, name) > 1:
-                raise InputError(f"BagConfig.{name} must be more than 1, got {getattr(self, name)}")
-        for name in ("shortest", "shortest_diagonal"):
-            if not 0 <= getattr(self, name) < 1:
-                raise InputError(f"BagConfig.{name} must be in [0, 1), got {getattr(self, name)}")
-        if not -0.7 <= self.cut <= 0.9:
-            raise InputError(f"BagConfig.cut must be in [-0.7, 0.9], got {self.cut}")
-        if not 0 <= self.edge_contact <= 1:
-            raise InputError(f"BagConfig.edge_contact must be in [0, 1], got {self.edge_contact}")
+        stretch = Interval(low=1.0, above_low=True)
+        check_fields(
+            self,
+            dict.fromkeys(
+                ("radius", "mass", "shell_radius", "bead_radius", "visual_radius", "thickness",
+                 "structural_stiffness", "grasp_reach"), POSITIVE,
+            )
+            | dict.fromkeys(
+                ("bead_mass", "shear_stiffness", "bend_stiffness", "ring_stiffness", "exclusion",
+                 "friction"), NOT_NEGATIVE,
+            )
+            | dict.fromkeys(("longest", "longest_diagonal"), stretch)
+            | dict.fromkeys(("shortest", "shortest_diagonal"), BELOW_ONE)
+            | {"cut": Interval(low=-0.7, high=0.9), "edge_contact": SHARE},
+        )  # fmt: skip
 
     @property
     def rows(self) -> int:

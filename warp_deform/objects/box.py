@@ -6,12 +6,12 @@ placeholder inertia; here it is that of the solid boxes.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..checked import NOT_NEGATIVE, POSITIVE, check_fields, real_array
 from ..errors import InputError
 from .attributes import register_attributes
 from .colors import RED, Color
@@ -29,6 +29,11 @@ class BoxPart:
     size: tuple[float, float, float]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        real_array(self.offset, (3,), name="BoxPart.offset", finite=True)
+        if not (real_array(self.size, (3,), name="BoxPart.size", finite=True) > 0).all():
+            raise InputError(f"BoxPart.size: every side must be above 0, got {self.size}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class BoxConfig:
@@ -42,14 +47,12 @@ class BoxConfig:
     color: Color = RED
 
     def __post_init__(self) -> None:
-        if not self.parts or any(
-            not 0 < side < math.inf for part in self.parts for side in part.size
-        ):
-            raise InputError("a box needs at least one part, every side longer than 0 and finite")
-        if not 0 < self.mass < math.inf:
-            raise InputError(f"BoxConfig.mass must be positive, got {self.mass}")
-        if not 0 <= self.friction < math.inf:
-            raise InputError(f"BoxConfig.friction must be 0 or more, got {self.friction}")
+        if not isinstance(self.parts, tuple) or not self.parts:
+            raise InputError(f"BoxConfig.parts must be one BoxPart or more, got {self.parts!r}")
+        for part in self.parts:
+            if not isinstance(part, BoxPart):
+                raise InputError(f"BoxConfig.parts must be BoxPart, got {part!r}")
+        check_fields(self, {"mass": POSITIVE, "friction": NOT_NEGATIVE})
 
     @property
     def lowest(self) -> float:

@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import zip_longest
-from numbers import Integral
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..checked import NOT_NEGATIVE, POSITIVE, Interval, check_fields
 from ..errors import InputError
 from .attributes import SpringMode, attribute, next_object, register_attributes
 from .colors import BLUE, WHITE, YELLOW, Color
@@ -58,16 +58,17 @@ class CableConfig:
     last_color: Color = YELLOW
 
     def __post_init__(self) -> None:
-        if not isinstance(self.beads, Integral) or self.beads < 3:
-            raise InputError(f"a cable needs at least 3 beads, a whole number, got {self.beads}")
-        for name in ("spacing", "radius", "visual_radius", "mass", "link_stiffness"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"CableConfig.{name} must be positive, got {getattr(self, name)}")
-        for name in ("fold_stiffness", "bend_stiffness", "exclusion"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"CableConfig.{name} must be 0 or more, got {getattr(self, name)}")
-        if not 0 <= self.fold_limit < 2:
-            raise InputError(f"CableConfig.fold_limit must be in [0, 2), got {self.fold_limit}")
+        check_fields(
+            self,
+            dict.fromkeys(
+                ("spacing", "radius", "visual_radius", "mass", "link_stiffness"), POSITIVE
+            )
+            | dict.fromkeys(("fold_stiffness", "bend_stiffness", "exclusion"), NOT_NEGATIVE)
+            | {
+                "beads": Interval(low=3, whole=True),
+                "fold_limit": Interval(low=0.0, high=2.0, below_high=True),
+            },
+        )
 
     @property
     def length(self) -> float:
@@ -91,6 +92,10 @@ class RingConfig(CableConfig):
     ring_radius: float = 0.075
     """Radius of the circle of bead centres at rest [m]."""
     spacing: float = 2 * 0.075 * math.sin(math.pi / 32)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_fields(self, {"ring_radius": POSITIVE})
 
 
 @dataclass(frozen=True)

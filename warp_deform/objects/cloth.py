@@ -7,12 +7,19 @@ shorter than half its rest length so that triangles do not collapse in a fold.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..checked import (
+    BELOW_ONE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHARE,
+    Interval,
+    check_fields,
+)
 from ..errors import InputError
 from .attributes import SpringMode
 from .colors import YELLOW, Color
@@ -64,25 +71,19 @@ class ClothConfig:
     color: Color = YELLOW
 
     def __post_init__(self) -> None:
-        if self.rows < 2 or self.columns < 2:
-            raise InputError(
-                f"a cloth needs 2 rows and 2 columns or more, got {self.rows} x {self.columns}"
+        check_fields(
+            self,
+            dict.fromkeys(("rows", "columns"), Interval(low=2, whole=True))
+            | dict.fromkeys(
+                ("side", "mass", "radius", "structural_stiffness", "grasp_reach"), POSITIVE
             )
-        for name in ("side", "mass", "radius", "structural_stiffness", "grasp_reach"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"ClothConfig.{name} must be positive, got {getattr(self, name)}")
-        for name in ("shear_stiffness", "bend_stiffness", "exclusion", "friction"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"ClothConfig.{name} must be 0 or more, got {getattr(self, name)}")
-        for name in ("shortest", "shortest_diagonal"):
-            if not 0 <= getattr(self, name) < 1:
-                raise InputError(f"ClothConfig.{name} must be in [0, 1), got {getattr(self, name)}")
-        if not self.longest > 1:
-            raise InputError(f"ClothConfig.longest must be more than 1, got {self.longest}")
-        if not 0 <= self.edge_contact <= 1:
-            raise InputError(f"ClothConfig.edge_contact must be in [0, 1], got {self.edge_contact}")
-        if self.thickness is not None and not self.thickness > 0:
-            raise InputError(f"ClothConfig.thickness must be positive, got {self.thickness}")
+            | dict.fromkeys(
+                ("shear_stiffness", "bend_stiffness", "exclusion", "friction"), NOT_NEGATIVE
+            )
+            | dict.fromkeys(("shortest", "shortest_diagonal"), BELOW_ONE)
+            | {"longest": Interval(low=1.0, above_low=True), "edge_contact": SHARE}
+            | ({} if self.thickness is None else {"thickness": POSITIVE}),
+        )
 
     @property
     def spacing(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..checked import real_array
 from .colors import TARGET, Color
 
 __all__: list[str] = []  # `warp_deform.objects` is the import path of what is here
@@ -23,6 +24,10 @@ class Zone:
 
     corners: np.ndarray
     color: Color = TARGET
+
+    def __post_init__(self) -> None:
+        quads = len(self.corners) if np.ndim(self.corners) == 3 else 1
+        real_array(self.corners, (quads, 4, 3), name="Zone.corners", finite=True)
 
 
 def _bar(start: np.ndarray, end: np.ndarray, width: float, height: float) -> np.ndarray:

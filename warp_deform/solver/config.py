@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ..checked import NOT_NEGATIVE, POSITIVE, Interval, check_fields
 from ..errors import InputError
 from .guards import GuardLimits
 
@@ -48,12 +49,14 @@ class SolverConfig:
     limits: GuardLimits = field(default_factory=GuardLimits)
 
     def __post_init__(self) -> None:
-        for name in ("dt", "max_speed", "calm_speed", "margin", "rest_speed", "stiffness"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"SolverConfig.{name} must be positive, got {getattr(self, name)}")
-        for name in ("damping", "table_friction", "contact_friction", "recovery", "rest_seconds",
-                     "viscosity", "dry_friction", "sleep_speed", "sleep_ramp"):  # fmt: skip
-            if not getattr(self, name) >= 0:
-                raise InputError(
-                    f"SolverConfig.{name} must not be negative, got {getattr(self, name)}"
-                )
+        check_fields(
+            self,
+            dict.fromkeys(("dt", "calm_speed", "margin", "rest_speed", "stiffness"), POSITIVE)
+            | dict.fromkeys(
+                ("damping", "table_friction", "contact_friction", "recovery", "rest_seconds",
+                 "viscosity", "dry_friction", "sleep_speed", "sleep_ramp"), NOT_NEGATIVE,
+            )
+            | {"max_speed": Interval(low=0.0, above_low=True, infinite=True)},
+        )  # fmt: skip
+        if not isinstance(self.limits, GuardLimits):
+            raise InputError(f"SolverConfig.limits must be GuardLimits, got {self.limits!r}")

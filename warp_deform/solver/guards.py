@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
+from ..checked import Interval, check_fields
 from ..errors import WarpDeformError
 
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
@@ -45,6 +46,12 @@ class GuardLimits:
     """Deepest that a particle's centre may be under the table [m]."""
     clamped_steps: int = 120
     """Substeps of one launch in which the speed clamp may act (0.1 s at the default substep)."""
+
+    def __post_init__(self) -> None:
+        check_fields(
+            self,
+            dict.fromkeys(("stretch", "depth", "clamped_steps"), Interval(low=0.0, infinite=True)),
+        )
 
 
 @dataclass(frozen=True)

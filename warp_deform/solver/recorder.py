@@ -128,7 +128,7 @@ class Recorder:
         """A launch that is cheap to repeat."""
         return wp.launch(
             kernel, dim=self.solver.data.group_count, inputs=inputs,
-            device=self.solver.model.device, record_cmd=True,
+            device=self.solver.model.device, record_cmd=True, record_tape=False,
         )  # fmt: skip
 
     def _mirrored(self, count: int, dtype: Any, shape: tuple[int, ...]) -> Mirrored:

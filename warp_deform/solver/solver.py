@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
 
+from ..checked import NOT_NEGATIVE, POSITIVE, check_number
 from ..errors import InputError
 from ..objects.attributes import NAMESPACE, register_attributes
 from .config import SolverConfig
@@ -19,6 +20,9 @@ from .data import WATCHED, SolverData
 from .forward import forward_kernel
 from .guards import PhysicsError, Problem, WatchValues
 from .stepping import grip_from_control, substeps
+
+if TYPE_CHECKING:
+    from ..newton_tape import TapedStep
 
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
@@ -136,8 +140,7 @@ class SolverFusedXPBD(SolverBase):
         for name, value in parameters.items():
             if name not in ("damping", "table_friction", "contact_friction", "stiffness"):
                 raise InputError(f"a world has no parameter {name!r}")
-            if not value >= 0 or (name == "stiffness" and value == 0):
-                raise InputError(f"{name} must be positive, got {value}")
+            check_number(value, name, POSITIVE if name == "stiffness" else NOT_NEGATIVE)
             self.data.per_world(f"group.{name}", world)[:] = value
 
     def set_duration(
@@ -272,6 +275,7 @@ class SolverFusedXPBD(SolverBase):
                 inputs=[settings, *self.data.structs()],
                 device=self.model.device,
                 record_cmd=True,
+                record_tape=False,
             )
         elif settings is not self._launch_settings:
             self._launch.set_param_at_index(0, settings)
@@ -316,21 +320,46 @@ class SolverFusedXPBD(SolverBase):
         given per second are adapted to `dt`. The guard of the speed clamp counts through steps in a
         row: a fall that the clamp holds up is an error, not a slow fall.
 
+        While a `wp.Tape` records, and what is read has requires_grad, the step's adjoint is left on
+        the tape (see `warp_deform.newton_tape`); every such step writes a state of its own.
+
         Raises:
-            InputError: `dt` is no positive number, or no sensible multiple of `config.dt`.
+            InputError: `dt` is no positive number, or no sensible multiple of `config.dt`; a tape
+                records, and derivatives would be lost.
             PhysicsError: a guard fired.
         """
+        from ..newton_tape import TapedStep, recording, unrecorded
+
         steps, substep = substeps(dt, self.config.dt)
+        ours = getattr(control, NAMESPACE, None) if control is not None else None
+        tape, taped = recording(), None
+        if tape is not None:
+            taped = TapedStep(self, state_in, state_out, ours)
+            taped.check(tape)
+        with unrecorded():
+            values = self._stepped(
+                state_in, state_out, ours, steps, substep, taped if taped and taped.needed else None
+            )
+        if taped is not None and taped.needed:
+            taped.record(tape)
+        self.check(self._clamped_in_a_row(values, substep / self.config.dt))
+
+    def _stepped(
+        self, state_in: newton.State, state_out: newton.State, control: Any, steps: int,
+        substep: float, taped: TapedStep | None,
+    ) -> list[WatchValues]:  # fmt: skip
         self.read_state(state_in)
         self.data.clear_grips()
-        ours = getattr(control, NAMESPACE, None) if control is not None else None
-        if ours is not None and hasattr(ours, "grip_particle"):
-            grip_from_control(self.data, ours, steps * substep)
-        self.set_duration(_FOREVER, _FOREVER)
-        self.activate()
-        values = self.run(steps, dt=substep)
+        if control is not None and hasattr(control, "grip_particle"):
+            grip_from_control(self.data, control, steps * substep)
+        if taped is not None:
+            values = taped.run(steps, substep)
+        else:
+            self.set_duration(_FOREVER, _FOREVER)
+            self.activate()
+            values = self.run(steps, dt=substep)
         self.write_state(state_out)
-        self.check(self._clamped_in_a_row(values, substep / self.config.dt))
+        return values
 
     def _clamped_in_a_row(self, values: list[WatchValues], share: float) -> list[WatchValues]:
         """The values with the clamped substeps of the steps before, if all of them had some.
@@ -358,6 +387,9 @@ class SolverFusedXPBD(SolverBase):
 
     def write_state(self, state: newton.State) -> None:
         """Give positions and velocities of all worlds to a Newton state."""
+        from ..newton_tape import refuse_lost_derivatives
+
+        refuse_lost_derivatives(state)
         data = self.data
         if data.has_particles:
             q = np.empty((self.model.particle_count, 3), np.float32)
