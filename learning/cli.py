@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -23,7 +23,11 @@ _Folder = Annotated[Positional[Path], arg(metavar="RUN")]
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions(CommandOptions):
-    """Train an agent on demonstrations; the same command goes on where it was interrupted."""
+    """Train an agent on demonstrations; the same command goes on where it was interrupted.
+
+    With --preset fast every snapshot plays validation episodes, and training ends when one solves
+    them all. Off a terminal a line on stderr tells every 30 s how far it is.
+    """
 
     task: _Task
     """Name of the task, see `warp-deform list`."""
@@ -47,19 +51,22 @@ class TrainOptions(CommandOptions):
     lr: Annotated[float | None, arg(metavar="LR")] = None
     """Step size of Adam; the preset's when left out."""
     snapshots: Annotated[int | None, arg(metavar="N")] = None
-    """Snapshots, evenly spread; the preset's when left out."""
-    augment: bool = True
-    """Turn and shift what is seen at random, as the paper does."""
+    """Snapshots, evenly spread; when left out, the preset's: of `paper` 10, of `fast` after 1/16,
+    1/8, 1/4, 1/2 and all of the steps."""
+    no_augment: bool = False
+    """Do not turn, shift or mirror what is seen at random, as the paper does (but for mirrors)."""
     exact: bool = False
     """Compute by the original's operations, several times slower; see docs/learning.md."""
     bf16: bool = False
     """Convolve in bfloat16: quicker where the processor multiplies it natively."""
     hold_out: Annotated[int, arg(metavar="N")] = 0
     """Further demonstrations, not learnt from: the snapshot of the lowest loss on them is taken."""
-    validate: Annotated[int, arg(metavar="N")] = 0
-    """Validation episodes that every snapshot plays during training."""
+    validate: Annotated[int | None, arg(metavar="N")] = None
+    """Validation episodes that every snapshot plays; training ends when one solves them all, and
+    `eval` does not play them again. When left out, the preset's: 20 of `fast` (0 with --hold-out),
+    0 of `paper`."""
     patience: Annotated[int | None, arg(metavar="N")] = None
-    """Stop when so many snapshots in a row played no better; needs --validate."""
+    """Also stop when so many snapshots in a row played no better; needs validation."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the network computes; under `torchrun`, each process takes one GPU."""
     threads: Annotated[int, arg(metavar="N")] = 1
@@ -67,12 +74,13 @@ class TrainOptions(CommandOptions):
     untrained: bool = False
     """Also keep the untrained network, as the snapshot of step 0: learning curves begin there."""
     tensorboard: bool = False
-    """Write for TensorBoard too (needs the extra `train`)."""
+    """Write for TensorBoard too, which has to be installed."""
 
 
 def train(options: TrainOptions) -> Outcome:
     """Train an agent."""
     find_task(options.task)
+    from .outcome_text import trained
     from .processes import rank
     from .training import TrainConfig
     from .training import train as run_training
@@ -90,7 +98,7 @@ def train(options: TrainOptions) -> Outcome:
         batch=options.batch,
         lr=options.lr,
         snapshots=options.snapshots,
-        augment=options.augment,
+        augment=not options.no_augment,
         exact=options.exact,
         bf16=options.bf16,
         device=options.device,
@@ -104,21 +112,24 @@ def train(options: TrainOptions) -> Outcome:
     report = asdict(run_training(config))
     if rank():
         raise SystemExit(0)  # under torchrun the first process speaks for all
-    return Outcome(data=report, text=_lines(report))
+    return Outcome(data=report, text=trained(report, out=options.out))
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvalOptions(CommandOptions):
     """Choose a run's best snapshot on validation seeds and play the test seeds with it.
 
-    Goals are constructed from goal seeds unless given. Results are kept: what was played is not
-    played again.
+    Goals are constructed from goal seeds unless given. Results are kept: what was played, in
+    training too, is not played again.
     """
 
     run: _Folder
     """Folder of a training run."""
     episodes: Annotated[int, arg(metavar="N")] = 200
-    """Test episodes, seeds 10,000 and up."""
+    """Test episodes."""
+    first_seed: Annotated[int | None, arg(metavar="S")] = None
+    """Play test episodes of seeds S and up in place of 10,000 and up; their result is kept apart
+    from that of the test seeds."""
     validation_episodes: Annotated[int, arg(metavar="N")] = 20
     """Validation episodes a snapshot, seeds 50,000 and up."""
     paper: bool = False
@@ -126,9 +137,9 @@ class EvalOptions(CommandOptions):
     the best result counts, which is optimistic."""
     stage_rule: Literal["action", "privileged"] = "action"
     """Who chooses the lift: the policy, or the paper's rule, which reads the simulator."""
-    retry: bool = True
-    """Agents over pictures remember what they missed and what they just put down, and pick
-    elsewhere; the paper's do not."""
+    no_retry: bool = False
+    """Keep agents over pictures from remembering what they missed and what they just put down, to
+    pick elsewhere: so the paper's play."""
     goals: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of goals that the test episodes share in turn, see `warp-deform goals`."""
     video: Annotated[Path | None, arg(metavar="DIR")] = None
@@ -146,6 +157,7 @@ class EvalOptions(CommandOptions):
 
 def evaluate(options: EvalOptions) -> Outcome:
     """Evaluate a training run."""
+    from .outcome_text import evaluated
     from .report_run import evaluate_run
     from .share import share_run
 
@@ -162,7 +174,8 @@ def evaluate(options: EvalOptions) -> Outcome:
         validation_episodes=options.validation_episodes,
         paper=options.paper,
         stage_rule=options.stage_rule,
-        retry=options.retry,
+        retry=not options.no_retry,
+        first_seed=options.first_seed,
         robot=options.robot,
         goals=options.goals,
         video=options.video,
@@ -171,7 +184,7 @@ def evaluate(options: EvalOptions) -> Outcome:
     )
     if options.share is not None:
         report["shared"] = str(share_run(options.run, options.share))
-    return Outcome(data=report, text=_describe(report))
+    return Outcome(data=report, text=evaluated(report))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,40 +246,3 @@ def sweep(options: SweepOptions) -> Outcome:
     if found["report"] is not None:
         text += f"; tables and curves: {found['report']}"
     return Outcome(data=found, text=text, failure=failure)
-
-
-def _describe(report: dict[str, Any]) -> str:
-    """The report in a few lines."""
-    test = report["test"]
-    low, high = test["pc_success_ci95"]
-    lines = {
-        "task": report["task"],
-        "agent": f"{report['agent']}, {report['demos']} demonstrations, seed {report['seed']}",
-        "snapshot": f"step {report['selected']}, chosen on validation seeds",
-        "test": f"{test['n_success']} of {test['n_episodes']} episodes solved, "
-        f"{test['pc_success']:.1f} % (95 % Wilson interval {low:.1f} to {high:.1f})",
-        "mean score": f"{test['mean_score']:.4f}",
-        "mean actions": f"{test['mean_actions']:.2f}",
-        "paper's value": f"{test['paper_value']:.1f} %",
-    }
-    if test["n_success_enclosed"] is not None:
-        lines["enclosed"] = f"{test['n_success_enclosed']} of the solved kept all items in the bag"
-    if test["failures"]:
-        lines["failures"] = ", ".join(f"{name} {n}" for name, n in test["failures"].items())
-    if report["paper"] is not None:
-        paper = report["paper"]
-        lines["paper's way"] = (
-            f"{paper['paper_value']:.1f} %, best of {paper['n_snapshots']} snapshots on "
-            f"{paper['n_episodes']} test episodes themselves (optimistic), lift by the "
-            + ("policy" if paper["stage_rule"] == "action" else "paper's privileged rule")
-        )
-    if "videos" in report:
-        lines["videos"] = ", ".join(report["videos"])
-    if "shared" in report:
-        lines["shared"] = report["shared"]
-    return _lines(lines)
-
-
-def _lines(data: dict[str, Any]) -> str:
-    width = max(map(len, data))
-    return "\n".join(f"{key.replace('_', ' '):<{width}}  {value}" for key, value in data.items())

@@ -14,7 +14,7 @@ import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -51,9 +51,16 @@ class Evaluation:
 
 
 def evaluate_snapshot(
-    run: RunFolder, step: int, protocol: Protocol, *, workers: int = 1
+    run: RunFolder,
+    step: int,
+    protocol: Protocol,
+    *,
+    workers: int = 1,
+    heard: Callable[[Played], object] | None = None,
 ) -> Evaluation:
     """Play a protocol with a snapshot of a run, or read what was played before.
+
+    heard: called with every episode, those that were played before first
 
     An episode depends on snapshot, seed and protocol alone, so neither the number of workers nor an
     interruption changes a result.
@@ -63,6 +70,10 @@ def evaluate_snapshot(
     """
     kept = _Kept(run, step, protocol)
     missing = [seed for seed in protocol.seeds if seed not in kept.played]
+    if heard is not None:
+        for seed in protocol.seeds:
+            if seed in kept.played:
+                heard(kept.played[seed])
     if missing:
         goals = goals_for(run, kept.task, protocol)
         count = min(workers, len(missing))
@@ -76,6 +87,8 @@ def evaluate_snapshot(
         with Workers(count) as crew:
             for played in crew.run(_play_chunk, chunks):
                 kept.add(played)
+                if heard is not None:
+                    heard(played)
     episodes = tuple(kept.played[seed] for seed in protocol.seeds)
     return Evaluation(step, episodes, summarise(episodes, task=kept.task))
 
@@ -86,17 +99,17 @@ def known(run: RunFolder, step: int, protocol: Protocol) -> bool:
 
 
 def stopped_early(run: RunFolder) -> bool:
-    """Whether a run's validation brought nothing better for as long as its `patience` allows.
+    """Whether a run's validation ends its training: a snapshot solved every episode.
 
-    Or can bring nothing better: every episode was solved in full, and the earliest best is chosen.
-    By what is kept in the folder, for the versions that trained; nothing is played.
+    Or, where the run has a `patience`, none did better for so long. By what is kept in the folder,
+    for the versions that trained; nothing is played.
 
     Raises:
         InputError: this is no run's folder, or a file is damaged.
     """
     settings = run.read_settings()
     patience, episodes = settings.get("patience"), settings.get("validate", 0)
-    if patience is None or not episodes:
+    if not episodes:
         return False
     protocol = Protocol(split="validation", episodes=episodes)
     values = []
@@ -104,9 +117,11 @@ def stopped_early(run: RunFolder) -> bool:
         kept = _Kept(run, step, protocol, by=settings.get("versions"))
         if kept.whole:
             found = summarise([kept.played[seed] for seed in protocol.seeds], task=kept.task)
-            values.append(found[measure(kept.task)] / (1 if partial_credit(kept.task) else 100))
+            if found["n_success"] == episodes:
+                return True
+            values.append(found[measure(kept.task)])
     waited = len(values) - 1 - int(np.argmax(values or [0]))
-    return max(values, default=0.0) >= 1.0 or waited >= patience
+    return patience is not None and waited >= patience
 
 
 def trained_steps(run: RunFolder) -> int:
@@ -264,6 +279,9 @@ def _described(protocol: Protocol, task: str) -> dict[str, Any]:
     if not protocol.makes_goals(task):
         described["n_goals"] = None
     del described["episodes"], described["goal_folder"]
+    for name in ("first_seed", "motions_must_succeed"):  # of what was played before they were
+        if not described[name]:
+            del described[name]
     if (version := find_task(task).version) > 1:  # episodes by an older rule are others
         described["task_version"] = version
     if protocol.given is not None:

@@ -1,12 +1,13 @@
-"""Losses of a training run: lines of `log.jsonl`, and TensorBoard's file where it is asked for."""
+"""Losses and costs of a training run: lines of `log.jsonl`, and TensorBoard's file if wanted."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import torch
@@ -15,9 +16,10 @@ from torch import Tensor
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.extras import install_extra
 
-from .snapshots import RunFolder
+from .snapshots import TENSORBOARD, RunFolder, check_fields
 
-__all__ = ["LINE_STEPS", "TrainingLog", "load_tensorboard"]
+__all__ = ["LINE_STEPS", "TrainingLog", "cpu_seconds", "load_tensorboard",
+           "read_log"]  # fmt: skip
 
 LINE_STEPS = 50
 """Steps that a line of the log stands for."""
@@ -39,7 +41,10 @@ def load_tensorboard() -> Any:
 
 
 class TrainingLog:
-    """Mean losses [nat] of every `LINE_STEPS` steps.
+    """Mean losses [nat] of every `LINE_STEPS` steps, and what they cost.
+
+    seconds [s] and cpu_seconds [s], of all threads of this process, are those of the steps of a
+    line: what lies in `paused` does not count.
 
     As a context manager it writes what there is, however training ends.
 
@@ -50,17 +55,17 @@ class TrainingLog:
         enabled: whether this process writes files
 
     Raises:
-        InputError: the log is damaged, or TensorBoard is not installed.
+        InputError: the log is damaged.
     """
 
     def __init__(self, run: RunFolder, step: int, *, tensorboard: bool, enabled: bool) -> None:
         self._run, self._enabled = run, enabled
         self._sums: dict[str, Tensor] = {}
-        self._lines = [line for line in self._read() if line["step"] <= step]
-        self._count, self._since = 0, time.perf_counter()
+        self._lines = [line for line in read_log(run) if line["step"] <= step]
+        self._count, self._since = 0, _clocks()
         self._board: Any = None
         if tensorboard and enabled:
-            self._board = load_tensorboard()(str(run.path / "tensorboard"), purge_step=step + 1)
+            self._board = load_tensorboard()(str(run.path / TENSORBOARD), purge_step=step + 1)
 
     def __enter__(self) -> TrainingLog:
         return self
@@ -68,13 +73,13 @@ class TrainingLog:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _read(self) -> list[dict[str, Any]]:
-        if not self._run.log.exists():
-            return []
-        try:
-            return [json.loads(line) for line in self._run.log.read_text().splitlines()]
-        except ValueError as error:
-            raise InputError(f"{self._run.log} is damaged; train into another folder") from error
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """Do something meanwhile that is no step of training."""
+        before = _clocks()
+        yield
+        passed = (now - then for now, then in zip(_clocks(), before, strict=True))
+        self._since = tuple(since + each for since, each in zip(self._since, passed, strict=True))
 
     def add(self, step: int, losses: Mapping[str, Tensor], *, lr: float) -> None:
         """Count a step's losses in.
@@ -89,12 +94,13 @@ class TrainingLog:
             return
         self.check(step)
         means = {name: float(total) / self._count for name, total in self._sums.items()}
-        seconds = time.perf_counter() - self._since
-        self._lines.append({"step": step, **means, "lr": lr, "seconds": round(seconds, 3)})
+        seconds, cpu = (now - then for now, then in zip(_clocks(), self._since, strict=True))
+        costs = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu, 3)}
+        self._lines.append({"step": step, **means, "lr": lr, **costs})
         if self._board is not None:
             for name, value in means.items():
                 self._board.add_scalar(f"train/{name}", value, step)
-        self._sums, self._count, self._since = {}, 0, time.perf_counter()
+        self._sums, self._count, self._since = {}, 0, _clocks()
 
     def mark(self, step: int, values: Mapping[str, float]) -> None:
         """Hand what was measured of a snapshot to TensorBoard, where it is written for."""
@@ -143,3 +149,37 @@ class TrainingLog:
     def last_loss(self) -> float | None:
         """Mean loss of the last line [nat]; None where nothing was logged."""
         return float(self._lines[-1]["loss"]) if self._lines else None
+
+    def cpu_seconds(self) -> float:
+        """What the steps of all lines took this process and those before it [s]."""
+        return cpu_seconds(self._lines)
+
+
+def read_log(run: RunFolder) -> list[dict[str, Any]]:
+    """Lines of a run's log, none where nothing was logged.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    if not run.log.exists():
+        return []
+    what = f"{run.log} is damaged; train into another folder"
+    try:
+        lines = [json.loads(line) for line in run.log.read_text().splitlines()]
+    except ValueError as error:
+        raise InputError(what) from error
+    for line in lines:
+        check_fields({"line": line}, {"line": dict}, what=what)
+        check_fields(line, {"step": int, "loss": float}, what=what)
+        check_fields({"cpu_seconds": 0.0, **line}, {"cpu_seconds": float}, what=what)
+    return lines
+
+
+def cpu_seconds(lines: Iterable[Mapping[str, Any]]) -> float:
+    """CPU seconds of all lines; those of earlier versions have none, and count with nothing."""
+    return float(sum(line.get("cpu_seconds", 0.0) for line in lines))
+
+
+def _clocks() -> tuple[float, ...]:
+    """The wall's clock and that of this process's CPU time [s]."""
+    return time.perf_counter(), time.process_time()

@@ -10,6 +10,7 @@ import numpy as np
 
 from warp_deform.episode_loop import SOLVED, Run, play
 from warp_deform.episodes import Goal
+from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.task import Stage
 from warp_deform.worlds import Worlds
 from warp_deform.wrappers import stage_at
@@ -72,6 +73,9 @@ def play_policy(
         for slot, run in runs.items():
             if not run.actions:
                 players[slot] = _player(policy, protocol)
+            if _failed_motion(run, protocol):
+                chosen[slot] = None
+                continue
             seen = _observe(worlds, slot, state=isinstance(policy, StatePolicy))
             action = players[slot].act(seen, rng=run.rng)
             if protocol.stage_rule == "privileged":
@@ -91,7 +95,7 @@ def play_policy(
 
     goal = goals.__getitem__ if goals else None
     for slot, run in play(worlds, seeds, act=act, look=measure, goals=goal):
-        ended = run.ended or ""
+        ended = "a motion failed" if _failed_motion(run, protocol) else run.ended or ""
         # an episode that ends for its physics has one row fewer and counts with nothing
         trusted = bool(run.rows) and len(run.rows) == len(run.actions) + 1
         distances = tuple(row.goal_l2 for row in run.rows if row.goal_l2 is not None)
@@ -106,6 +110,12 @@ def play_policy(
             enclosed=worlds.enclosed(slot) if trusted else None,
         )
         yield slot, played, run
+
+
+def _failed_motion(run: Run[Measured], protocol: Protocol) -> bool:
+    """Whether an episode is over for an action that the arm could not carry out."""
+    unreachable = run.outcomes[-1:] == [Outcome.UNREACHABLE.value]
+    return protocol.motions_must_succeed and unreachable
 
 
 def goal_distance(color: np.ndarray, goal: np.ndarray) -> float:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from warp_deform.collect import most_attempts
+from warp_deform.collection import check_seeds
 from warp_deform.episodes import EpisodeReader, Goal
 from warp_deform.errors import InputError
 from warp_deform.goals import GOAL_SEED, load_goal, load_goals, make_goals
@@ -33,7 +34,8 @@ class Protocol:
     """What a snapshot plays.
 
     split: "validation" or "test", whose seeds are played
-    episodes: their number, from the split's first seed on
+    episodes: their number, from the split's first seed on; first_seed: of test episodes, in place
+        of the split's
     goals: "constructed": for validation from the episode's own seed, for test from goal seeds;
         "demonstrated": ends of demonstrations on goal seeds, the paper's
     n_goals: goals that the test episodes share in turn
@@ -42,6 +44,8 @@ class Protocol:
         rule, which reads the simulator)
     retry: whether agents over pictures remember what they missed and what they just put down, and
         pick elsewhere, see `policy.RetryingPolicy`; the paper's do not
+    motions_must_succeed: whether an action that the arm cannot carry out ends the episode,
+        unsolved, as in the original; else it costs an action
     """
 
     split: Literal["validation", "test"]
@@ -52,8 +56,12 @@ class Protocol:
     stage_rule: Literal["action", "privileged"] = "action"
     retry: bool = True
     robot: str = "ur5"
+    first_seed: int | None = None
+    motions_must_succeed: bool = False
 
     def __post_init__(self) -> None:
+        if self.first_seed is not None:
+            check_seeds(self.first_seed, self.episodes)
         if self.episodes < 1 or self.n_goals < 1:
             raise InputError(
                 f"episodes is {self.episodes} and n_goals {self.n_goals}; they must be 1 or more"
@@ -62,7 +70,7 @@ class Protocol:
     @property
     def seeds(self) -> range:
         """Seeds of the episodes."""
-        first = FIRST_SEED[self.split]
+        first = FIRST_SEED[self.split] if self.first_seed is None else self.first_seed
         return range(first, first + self.episodes)
 
     @property
@@ -180,5 +188,7 @@ def check_splits(trained: Iterable[int], protocols: Sequence[Protocol], *, task:
 
 
 def _goal_seed(protocol: Protocol) -> int:
-    """First seed of goals that are made."""
-    return GOAL_SEED if protocol.split == "test" else FIRST_SEED["validation"]
+    """First seed of goals that are made; other test seeds have goals of their own."""
+    if protocol.split == "validation":
+        return FIRST_SEED["validation"]
+    return GOAL_SEED + protocol.seeds.start - FIRST_SEED["test"]

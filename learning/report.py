@@ -34,6 +34,8 @@ __all__ = ["Cell", "Point", "Report", "RunResult", "pool", "read_runs", "version
 
 _ALIKE = ("agent", "schedule", "augment", "processes", "device", "patience")
 """Settings that runs of a cell have in common."""
+_SPREAD = ("snapshots", "doubling", "validate")
+"""Of a schedule: when snapshots are taken, and what they play, which is compared by itself."""
 _VERSIONS = ("warp-deform", "torch")
 
 
@@ -112,13 +114,15 @@ class Report:
 def write_report(paths: Sequence[Path], out: Path | None) -> Report:
     """Tables of the evaluated runs in folders; with `out`, files of them and of the curves too.
 
-    The object has `runs`, `cells` (the fields of `Cell`), `notes` and `files` (paths).
+    The object has `runs`, `cells` (the fields of `Cell`), `origins` (of each run, see
+    `report_origins.origin`), `notes` and `files` (paths).
 
     Raises:
         InputError: no evaluated run, runs that cannot be told apart, or a folder that cannot be
             made.
     """
     from .report_curves import draw_curves
+    from .report_origins import origin
     from .report_tables import csv_text, latex_text, markdown_text
 
     runs, notes = read_runs(paths)
@@ -126,7 +130,8 @@ def write_report(paths: Sequence[Path], out: Path | None) -> Report:
     cells = pool(runs, paper)
     notes += version_notes(runs)
     files: list[Path] = []
-    text = markdown_text(cells, paper, notes)
+    made = [origin(run) for run in runs]
+    text = markdown_text(cells, paper, notes, made=made)
     if out is not None:
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -134,7 +139,7 @@ def write_report(paths: Sequence[Path], out: Path | None) -> Report:
             raise InputError(f"--out {out} cannot be made: {error.strerror}") from error
         pictures = draw_curves(cells, paper, out)
         texts = {
-            "report.md": markdown_text(cells, paper, notes, pictures),
+            "report.md": markdown_text(cells, paper, notes, pictures, made=made),
             "report.csv": csv_text(cells),
             "report.tex": latex_text(cells, paper),
         }
@@ -143,6 +148,7 @@ def write_report(paths: Sequence[Path], out: Path | None) -> Report:
         files = [*(out / name for name in texts), *pictures]
     data = {
         "runs": len(runs),
+        "origins": made,
         "cells": [asdict(cell) for cell in cells],
         "notes": notes,
         "files": [str(path) for path in files],
@@ -168,12 +174,26 @@ def read_runs(paths: Sequence[Path]) -> tuple[list[RunResult], list[str]]:
     for folder in folders.values():
         run = RunFolder(folder)
         if run.report.is_file():
-            runs.append(_read(run))
-        else:
+            info = run.read_report()
+            notes += _other_seeds(folder, info)
+            if info["test"] is not None:
+                runs.append(_read(run))
+                continue
+        if not run.report.is_file() or info["test"] is None:
             notes.append(f"{folder} is not evaluated and left out; run `warp-deform eval {folder}`")
     if not runs:
         raise InputError(f"no run is evaluated yet; run `warp-deform eval {next(iter(folders))}`")
     return runs, notes
+
+
+def _other_seeds(folder: Path, info: Mapping[str, Any]) -> list[str]:
+    """A line for every set of other seeds that a run played."""
+    return [
+        f"{folder} also played seeds {other['first_seed']} and up: {other['test']['n_success']} of "
+        f"{other['test']['n_episodes']} solved, mean score {other['test']['mean_score']:.3f}; "
+        "tables and curves leave them out"
+        for other in info.get("other_seeds", {}).values()
+    ]
 
 
 def _inside(path: Path) -> Iterable[Path]:
@@ -229,6 +249,8 @@ def _steps(info: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     planned, trained = int(settings["schedule"]["steps"]), int(info["trained_steps"])
     if settings.get("patience") is not None:
         return [f"up to {planned} steps, patience {settings['patience']}"]
+    if settings.get("validate"):
+        return [f"up to {planned} steps"]
     if trained != planned:
         return [f"{trained} of {planned} steps"]
     usual = None
@@ -304,10 +326,10 @@ def _compared(run: RunResult) -> dict[str, Any]:
     settings, info, paper = run.settings, run.info, run.info["paper"]
     compared = {key: settings.get(key) for key in _ALIKE}
     schedule = settings["schedule"]
-    compared["schedule"] = {key: each for key, each in schedule.items() if key != "snapshots"}
+    compared["schedule"] = {key: each for key, each in schedule.items() if key not in _SPREAD}
     compared["test episodes"] = info["test"]["n_episodes"]
     compared["validation episodes"] = info["snapshots"][str(info["selected"])]["n_episodes"]
-    if settings.get("patience") is not None:
+    if settings.get("validate"):
         compared["validation episodes in training"] = settings.get("validate")
     if paper is not None:
         compared["who chooses the lift by the paper's protocol"] = paper["stage_rule"]

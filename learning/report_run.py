@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import joblib
 
 from warp_deform.episodes import EpisodeReader, combine_hashes
+from warp_deform.errors import InputError
 from warp_deform.progress import progress_bar
+from warp_deform.revision import running_revision
 from warp_deform.workers import worker_count
 
 from .evaluation import Evaluation, best, evaluate_snapshot, trained_steps
-from .protocol import Protocol, check_goals, check_splits
+from .log import cpu_seconds, read_log
+from .paper_results import PARTIAL_SCORE, SUCCESS, partial_credit, read_paper
+from .playing import Played
+from .policy import load_policy
+from .protocol import FIRST_SEED, Protocol, check_goals, check_splits
 from .snapshots import RunFolder, write_json
 
 __all__ = ["evaluate_run"]
@@ -34,6 +41,7 @@ def evaluate_run(
     retry: bool = True,
     robot: str = "ur5",
     goals: Path | None = None,
+    first_seed: int | None = None,
     video: Path | None = None,
     videos: int = 4,
     workers: int | None = None,
@@ -42,8 +50,9 @@ def evaluate_run(
     """Choose the best snapshot on validation seeds, and play the test seeds with it.
 
     goals: folder of goals for the test episodes; None: constructed from goal seeds
+    first_seed: of other test episodes; their results are kept apart
     video: folder for videos of the first `videos` test episodes
-    progress: show bars on a terminal
+    progress: tell of it on stderr, see `warp_deform.progress`
 
     Writes `eval_info.json` into the run's folder and returns what it says: task, agent, preset,
     steps (planned), trained_steps (fewer where training stopped early), demos, seed, stage_rule,
@@ -51,10 +60,17 @@ def evaluate_run(
     `selected`: the step chosen; `test`: its results on test seeds; `paper`: None, or the best of
     the snapshots' results by the paper's protocol, and in its `snapshots` all of them by step.
     Step 0, the untrained network, is played for the learning curve and never chosen; `videos`:
-    paths, where asked for. See `evaluation.summarise` for a result's keys.
+    paths, where asked for; `measure`: what the paper's table shows for the task, and `published`:
+    its number [%], None where it has none; `revision`: what evaluated; `training_cpu_seconds`.
+    See `evaluation.summarise` for a result's keys.
+
+    `other_seeds`: by first seed, what was played with `first_seed`: `first_seed`, `selected`,
+    `test`, `paper` and the settings that may differ from those above. Such a call changes nothing
+    else of an earlier evaluation (without one, `test` is None), and returns its own as `played`
+    too.
 
     By the paper's protocol its hidden rule chooses the lift where a task has several, which
-    `stage_rule` of `paper` says.
+    `stage_rule` of `paper` says, and an action that the arm cannot carry out ends an episode.
 
     Raises:
         InputError: this is no finished run, a seed of it is to be played, a file is damaged, or
@@ -67,16 +83,19 @@ def evaluate_run(
     if workers is not None:
         workers = worker_count(workers, episodes)
 
-    def play(step: int, protocol: Protocol) -> Evaluation:
+    def play(what: str, of: Sequence[int], protocol: Protocol) -> list[Evaluation]:
         count = workers or max(1, min(joblib.cpu_count(), protocol.episodes // _LEAST_EPISODES))
-        return evaluate_snapshot(run, step, protocol, workers=count)
+        total, found = len(of) * protocol.episodes, []
+        with progress_bar(f"eval {task}, {what}", total, shown=progress) as advance:
+            for step in of:
+                solved: list[bool] = []
 
-    def play_all(what: str, protocol: Protocol) -> list[Evaluation]:
-        found = []
-        with progress_bar(what, len(steps), shown=progress) as advance:
-            for step in steps:
-                found.append(play(step, protocol))
-                advance()
+                def heard(played: Played, step: int = step, solved: list[bool] = solved) -> None:
+                    solved.append(played.success)
+                    advance()
+                    advance.note = f"step {step}: {sum(solved)} of {len(solved)} solved"
+
+                found.append(evaluate_snapshot(run, step, protocol, workers=count, heard=heard))
         return found
 
     validation = Protocol(
@@ -86,7 +105,11 @@ def evaluate_run(
         retry=retry,
         robot=robot,
     )
-    test = replace(validation, split="test", episodes=episodes, goal_folder=goals)
+    if first_seed == FIRST_SEED["test"]:
+        first_seed = None
+    test = replace(
+        validation, split="test", episodes=episodes, goal_folder=goals, first_seed=first_seed
+    )
     if goals is not None:  # a wrong folder is told of before anything is played
         check_goals(goals, task)
     lifts = settings["agent"]["config"].get("lifts")
@@ -99,19 +122,27 @@ def evaluate_run(
         goal_folder=None,
         stage_rule="privileged" if several else stage_rule,
         retry=False,
+        motions_must_succeed=True,
     )
     planned = [validation, test, theirs] if paper else [validation, test]
     check_splits(map(int, settings["demonstrations"]), planned, task=task)
-    validated = play_all("validation", validation)
+    for step in steps:  # a damaged one is told of before anything is played
+        load_policy(run.snapshot(step))
+    if video is not None and video.exists() and not video.is_dir():
+        raise InputError(f"{video} is no folder; name one for the videos")
+    earlier = _earlier(run)
+    validated = play("validation", steps, validation)
     chosen = best([each for each in validated if each.step], task=task)
-    result = play(chosen.step, test)
+    (result,) = play("test", [chosen.step], test)
+    paper_table = read_paper()
+    demos, agent = len(settings["demonstrations"]), settings["agent"]["agent"]
     report: dict[str, Any] = {
         "task": task,
-        "agent": settings["agent"]["agent"],
+        "agent": agent,
         "preset": settings["preset"],
         "steps": settings["schedule"]["steps"],
         "trained_steps": trained,
-        "demos": len(settings["demonstrations"]),
+        "demos": demos,
         "seed": settings["seed"],
         "stage_rule": stage_rule,
         "retry": retry,
@@ -121,9 +152,14 @@ def evaluate_run(
         "selected": chosen.step,
         "test": result.summary,
         "paper": None,
+        "measure": PARTIAL_SCORE if partial_credit(task) else SUCCESS,
+        "published": paper_table.values.get((task, agent, demos)),
+        "revision": asdict(running_revision()),
+        "training_cpu_seconds": cpu_seconds(read_log(run)),
+        "other_seeds": earlier.get("other_seeds", {}),
     }
     if paper:
-        played = play_all("paper's protocol", theirs)
+        played = play("paper's protocol", steps, theirs)
         top = best([each for each in played if each.step], task=task)
         report["paper"] = {
             "protocol": "best of the snapshots on the test seeds themselves (optimistic)",
@@ -133,14 +169,39 @@ def evaluate_run(
             **top.summary,
             "snapshots": {str(e.step): {"split": "test", **e.summary} for e in played},
         }
+    report["seconds"] = time.perf_counter() - began
+    kept = report if first_seed is None else _beside(earlier, report, first_seed)
+    write_json(run.report, kept)  # before films, which may fail
     if video is not None:
         from .film import film_episodes
 
         count = min(videos, episodes)
-        report["videos"] = [str(p) for p in film_episodes(run, result, test, video, count=count)]
-    report["seconds"] = time.perf_counter() - began
-    write_json(run.report, report)
-    return report
+        paths = film_episodes(run, result, test, video, count=count)
+        kept = {**kept, "videos": [str(path) for path in paths]}
+        write_json(run.report, kept)
+    return kept if first_seed is None else {**kept, "played": kept["other_seeds"][str(first_seed)]}
+
+
+_OWN = ("stage_rule", "retry", "robot", "goals", "selected", "test", "paper", "revision", "seconds")
+"""What results on other seeds have of their own."""
+
+
+def _beside(
+    earlier: Mapping[str, Any], report: Mapping[str, Any], first_seed: int
+) -> dict[str, Any]:
+    """An earlier evaluation, or one without a test, with results on other seeds beside it."""
+    found = dict(earlier) or {**report, "test": None, "paper": None}
+    played = {"first_seed": first_seed, **{key: report[key] for key in _OWN}}
+    found["other_seeds"] = {**report["other_seeds"], str(first_seed): played}
+    return found
+
+
+def _earlier(run: RunFolder) -> dict[str, Any]:
+    """An earlier evaluation; nothing where there is none, or one that cannot be read any more."""
+    try:
+        return run.read_report() if run.report.is_file() else {}
+    except InputError:
+        return {}
 
 
 def _named(goals: Path | None) -> str:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from .failures import FAILURES
 from .paper_results import SUCCESS, PaperResults
 from .report import Cell
+from .report_origins import origins
 
 __all__ = ["Rows", "compared", "csv_text", "details", "failed", "latex_text",
            "markdown_text"]  # fmt: skip
@@ -30,16 +32,29 @@ _DETAILS = (
 )
 
 
+_MADE = (
+    "CPU time: of the steps alone, on the machine that trained. A dash stands where an earlier "
+    "version did not write it down."
+)
+
+
 def markdown_text(
-    cells: Sequence[Cell], paper: PaperResults, notes: Sequence[str], pictures: Sequence[Path] = ()
+    cells: Sequence[Cell],
+    paper: PaperResults,
+    notes: Sequence[str],
+    pictures: Sequence[Path] = (),
+    *,
+    made: Sequence[Mapping[str, Any]] = (),
 ) -> str:
-    """The whole report."""
+    """The whole report; made: what `report_origins.origin` says of every run."""
     parts = ["# Results"]
     for variant, rows in compared(cells, paper).items():
         parts += [f"## Beside the paper's: {variant}", _markdown(rows)]
     parts.append(_COMPARED.format(protocol=paper.protocol, source=paper.source))
     parts += ["## In detail", _markdown(details(cells)), _DETAILS]
     parts += ["## Failures", _markdown(failed(cells)), "Episodes by the first rule that holds."]
+    if made:
+        parts += ["## How the runs were made", _markdown(origins(made)), _MADE]
     if pictures:
         parts.append("## Learning curves")
         parts += [f"![{path.stem}]({path.name})" for path in pictures]

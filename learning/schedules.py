@@ -32,13 +32,20 @@ class Schedule:
     mirror: bool = False
     """Learn from mirror images, too, where the task has them."""
     snapshots: int = 10
-    """Snapshots, evenly spread, the last one at the end."""
+    """Snapshots, the last one at the end."""
+    doubling: bool = False
+    """Every snapshot comes after twice the steps of the one before (so there are fewer where the
+    first ones would fall together), so that what is learnt soon is seen soon; else they are evenly
+    spread."""
+    validate: int = 0
+    """Validation episodes that every snapshot plays; training ends when one solves them all."""
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("batch", 1), ("snapshots", 1), ("warmup", 0)):
+        for name, least in (("steps", 1), ("batch", 1), ("snapshots", 1), ("warmup", 0),
+                            ("validate", 0)):  # fmt: skip
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be {least} or more")
-        if self.snapshots > self.steps:
+        if self.snapshots > self.steps and not self.doubling:
             raise InputError(
                 f"snapshots is {self.snapshots}; with steps = {self.steps} it must be 1 to "
                 f"{self.steps}"
@@ -53,8 +60,13 @@ class Schedule:
 
         >>> Schedule(steps=10, batch=1, lr=1.0, snapshots=4).snapshot_steps()
         (2, 5, 8, 10)
+        >>> Schedule(steps=4000, batch=1, lr=1.0, snapshots=5, doubling=True).snapshot_steps()
+        (250, 500, 1000, 2000, 4000)
         """
         n = self.snapshots
+        if self.doubling:
+            halved = (round(self.steps / 2**k) for k in range(n))
+            return tuple(sorted({step for step in halved if step}))
         return tuple(round(k * self.steps / n) for k in range(1, n + 1))
 
     def lr_at(self, step: int) -> float:
@@ -74,14 +86,25 @@ class Schedule:
 SCHEDULES = {
     "paper": Schedule(steps=20_000, batch=1, lr=1e-4),
     "fast": Schedule(
-        steps=4000, batch=1, lr=1e-3, warmup=100, decay=True, ema=0.998, mirror=True, snapshots=4
+        steps=4000,
+        batch=1,
+        lr=1e-3,
+        warmup=100,
+        decay=True,
+        ema=0.998,
+        mirror=True,
+        snapshots=5,
+        doubling=True,
+        validate=20,
     ),
 }
 """By the names of the command line, for agents over pictures."""
 STATE_SCHEDULES = {
     "paper": Schedule(steps=20_000, batch=128, lr=2e-4),
     # The paper's step size: five times that has mixtures of cables collapse to one Gaussian.
-    "fast": Schedule(steps=2000, batch=128, lr=2e-4, decay=True, ema=0.99, snapshots=4),
+    "fast": Schedule(
+        steps=2000, batch=128, lr=2e-4, decay=True, ema=0.99, snapshots=4, validate=20
+    ),
 }
 """The same for the ground-truth baselines."""
 

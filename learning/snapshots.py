@@ -12,11 +12,13 @@ Weights are safetensors: loading runs no code.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +32,11 @@ from warp_deform.errors import InputError, WarpDeformError
 Fields = Mapping[str, type | tuple[type, ...]]
 """Names that a JSON object has to have, and the Python types that their values may be of."""
 
-__all__ = ["Fields", "RunFolder", "check_fields", "read_json", "read_record", "read_snapshot",
-           "write_json"]  # fmt: skip
+__all__ = ["TENSORBOARD", "Fields", "RunFolder", "check_fields", "read_json", "read_record",
+           "read_snapshot", "write_json"]  # fmt: skip
 
+TENSORBOARD = "tensorboard"
+"""Folder of TensorBoard's files in that of a run."""
 _FORMAT = 1
 _KINDS = {
     str: "a string", int: "a whole number", bool: "true or false", float: "a number",
@@ -44,7 +48,8 @@ _SETTINGS: Fields = {
 }  # fmt: skip
 _REPORT: Fields = {
     "task": str, "agent": str, "preset": str, "demos": int, "seed": int, "stage_rule": str,
-    "robot": str, "snapshots": dict, "selected": int, "test": dict, "paper": (dict, type(None)),
+    "robot": str, "snapshots": dict, "selected": int, "test": (dict, type(None)),
+    "paper": (dict, type(None)),
 }  # fmt: skip
 _NAME = re.compile(r"step_(\d{8})\.safetensors")
 
@@ -72,6 +77,26 @@ class RunFolder:
         except OSError as error:
             raise InputError(f"--out {self.path} cannot be made: {error.strerror}") from error
 
+    @contextlib.contextmanager
+    def nothing_by_halves(self) -> Iterator[None]:
+        """Where what is done fails before a new run has anything to go on from, none is left.
+
+        A report would list it. After an interruption it stays: the same command goes on.
+        """
+        new, parents = not self.settings.exists(), (self.path, *self.path.parents)
+        missing = [folder for folder in parents if not folder.exists()]
+        try:
+            yield
+        except Exception:
+            if new and not self.state.exists() and not self.steps():
+                for file in (self.settings, self.log):
+                    file.unlink(missing_ok=True)
+                shutil.rmtree(self.path / TENSORBOARD, ignore_errors=True)
+                for folder in (self._snapshots, *missing):
+                    with contextlib.suppress(OSError):  # missing, or holds something else
+                        folder.rmdir()
+            raise
+
     def read_settings(self) -> dict[str, Any]:
         """What `run.json` says: agent, preset, schedule, seed, demonstrations and more.
 
@@ -87,7 +112,7 @@ class RunFolder:
         check_fields(found["agent"], _AGENT, what=what)
         check_fields(found["schedule"], {"steps": int}, what=what)
         optional = {"validate": int, "trained_steps": int, "versions": dict, "demonstrators": list,
-                    "hold_out": int}  # fmt: skip
+                    "hold_out": int, "revisions": list}  # fmt: skip
         check_fields(found, {k: v for k, v in optional.items() if k in found}, what=what)
         check_fields({"patience": None, **found}, {"patience": (int, type(None))}, what=what)
         if not all(seed.isdecimal() for seed in found["demonstrations"]):

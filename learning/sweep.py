@@ -80,8 +80,8 @@ class Evaluating:
 class SweepConfig:
     """A grid. The fields are the keys of the file; those without a default have to be there.
 
-    steps, batch, lr, snapshots: None takes the preset's; untrained: evaluate step 0 too
-    bf16: of agents over pictures; device, validate, patience: see `training.TrainConfig`
+    steps, batch, lr, snapshots, validate: None takes the preset's; untrained: evaluate step 0 too
+    bf16: of agents over pictures; device, patience: see `training.TrainConfig`
     Agents are combined with the tasks that they fit: those that see a goal, with tasks that have
     one.
     """
@@ -99,7 +99,7 @@ class SweepConfig:
     bf16: bool = False
     untrained: bool = False
     device: str = "cpu"
-    validate: int = 0
+    validate: int | None = None
     patience: int | None = None
     demonstrations: Collecting = field(default_factory=Collecting)
     evaluation: Evaluating = field(default_factory=Evaluating)
@@ -212,7 +212,7 @@ def run_sweep(
     with _owned(config.out):
         for task in dict.fromkeys(cell.task for cell in todo):
             _collect(config, task, workers=workers, ray=ray)
-        bar = progress_bar("sweep", len(cells), done=len(cells) - len(todo))
+        bar = progress_bar("sweep", len(cells), done=len(cells) - len(todo), unit="runs")
         with crew, bar as advance:
             for name, said, error in crew.run(_run, [(cell, config) for cell in todo]):
                 print(f"{name}: {error or said}", file=sys.stderr, flush=True)
@@ -359,10 +359,15 @@ def _value(key: str, value: object, kind: str) -> Any:
 
 @contextlib.contextmanager
 def _owned(out: Path) -> Iterator[None]:
-    """Hold the folder against another sweep; the lock ends with the process, however it ends."""
+    """Hold the folder against another sweep; the lock ends with the process, however it ends.
+
+    A folder that was made for a sweep which then fails before there is anything in it, goes again.
+    """
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    path = out / "sweep.lock"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        lock = (out / "sweep.lock").open("a")
+        lock = path.open("a")
     except OSError as error:
         raise InputError(f"out {out} cannot be made: {error.strerror}") from error
     with lock:
@@ -370,4 +375,12 @@ def _owned(out: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(f"another sweep is at work in {out}; wait for it to end") from error
-        yield
+        try:
+            yield
+        except Exception:
+            if made and [each.name for each in out.iterdir()] == [path.name]:
+                path.unlink()
+                for folder in made:
+                    with contextlib.suppress(OSError):  # it holds something else
+                        folder.rmdir()
+            raise

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,10 +37,11 @@ from .log import TrainingLog, load_tensorboard
 from .models.gt_state import GtStateConfig
 from .models.transporter import PRESETS, Transporter, TransporterConfig
 from .policy import AGENTS, Agent, AgentDescription, make_agent
-from .processes import DEVICES, Process, join_processes
+from .processes import DEVICES, join_processes
 from .schedules import SCHEDULES, Schedule, preset_schedule
 from .snapshots import RunFolder
 from .training_state import Trained, claim, on_cpu, state_steps
+from .validation import Validation
 
 __all__ = ["TrainConfig", "TrainReport", "train"]
 
@@ -54,18 +54,20 @@ class TrainConfig:
     """What to train, and how.
 
     demos: demonstrations to learn from, drawn by `seed`; None takes all that `data` holds
-    schedule: None takes the preset's; steps, batch, lr, snapshots: changes to it
+    schedule: None takes the preset's; steps, batch, lr, snapshots: changes to it; snapshots whose
+        number is given are evenly spread
     network: None takes the preset's; rotations and lifts are the task's in any case
     augment: turn and shift what is seen at random
     exact: compute by the original's operations, several times slower
     bf16: convolve in bfloat16, agents over pictures alone
     threads: of torch, a process; another number may change the last bits
     hold_out: further demonstrations, not learnt from, on which every snapshot's loss is measured
-    validate: validation episodes that every snapshot plays; 0 plays none
-    patience: stop when so many snapshots in a row brought no better validation, or one solved all
-        in full; None never stops
+    validate: validation episodes that every snapshot plays: training ends when one solves them all,
+        as nothing is left to be gained; 0 plays none. None takes the schedule's, but 0 with
+        `hold_out`, which is for where nothing can be played
+    patience: stop as well when so many snapshots in a row brought no better validation
     untrained: also a snapshot of the initial weights, step 0, where a learning curve begins
-    progress: show a bar on a terminal
+    progress: tell of it on stderr, see `warp_deform.progress`
     """
 
     task: str
@@ -87,7 +89,7 @@ class TrainConfig:
     device: str = "cpu"
     threads: int = 1
     hold_out: int = 0
-    validate: int = 0
+    validate: int | None = None
     patience: int | None = None
     tensorboard: bool = False
     untrained: bool = False
@@ -101,13 +103,14 @@ class TrainConfig:
             raise InputError(f"preset is {self.preset!r}; it must be one of {sorted(SCHEDULES)}")
         if self.device not in DEVICES:
             raise InputError(f"device is {self.device!r}; it must be 'cpu' or 'cuda'")
-        for name, least in (("seed", 0), ("threads", 1), ("validate", 0), ("hold_out", 0)):
+        for name, least in (("seed", 0), ("threads", 1), ("hold_out", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be {least} or more")
+        plan = self.plan(self.demos or 0)  # refuses changes that do not go together
         if self.patience is not None:
             if self.patience < 1:
                 raise InputError(f"patience is {self.patience}; it must be 1 or more")
-            if not self.validate:
+            if not plan.validate:
                 raise InputError(
                     f"patience is {self.patience} and validate 0; stopping early needs validation "
                     "episodes, 1 or more"
@@ -117,15 +120,21 @@ class TrainConfig:
                 raise InputError(f"{name} is for agents over pictures; {self.agent} has its own")
         if self.bf16 and self.exact:
             raise InputError("bf16 and exact exclude each other: the original computes in float32")
-        self.plan(self.demos or 0)  # refuses changes that do not go together
 
     def plan(self, demos: int) -> Schedule:
         """The schedule in force with so many demonstrations."""
         plan = self.schedule or preset_schedule(
             self.preset, task=self.task, demos=demos, sees_state=self._sees_state
         )
-        wanted = {name: getattr(self, name) for name in ("steps", "batch", "lr", "snapshots")}
-        return replace(plan, **{k: v for k, v in wanted.items() if v is not None})
+        changed = ("steps", "batch", "lr", "snapshots", "validate")
+        wanted: dict[str, Any] = {
+            name: getattr(self, name) for name in changed if getattr(self, name) is not None
+        }
+        if self.snapshots is not None:
+            wanted["doubling"] = False
+        if self.validate is None and self.hold_out:
+            wanted["validate"] = 0
+        return replace(plan, **wanted)
 
     @property
     def _sees_state(self) -> bool:
@@ -137,9 +146,13 @@ class TrainReport:
     """What was trained.
 
     left_out: recordings of the folder that are no demonstrations, see `dataset.Demonstrations`
-    steps: taken in all; snapshots: the steps of which there are snapshots; loss: mean over the last
-    logged steps [nat]; held_out: that of snapshots on held-out demonstrations by step [nat];
-    seconds: of this call [s]; weights_hash: of the last snapshot's weights
+    steps: taken in all, of planned_steps; snapshots: the steps of which there are snapshots
+    validation: of snapshots on validation episodes, `n_success`, `n_episodes`, `mean_score` by step
+    loss: mean over the last logged steps [nat]
+    held_out: that of snapshots on held-out demonstrations by step [nat]
+    seconds: of this call [s]
+    cpu_seconds: that the steps of all calls took the process, without validation [s]
+    weights_hash: of the last snapshot's weights
     """
 
     task: str
@@ -149,10 +162,14 @@ class TrainReport:
     left_out: int
     seed: int
     steps: int
+    planned_steps: int
+    patience: int | None
     snapshots: tuple[int, ...]
+    validation: dict[int, dict[str, Any]]
     loss: float | None
     held_out: dict[int, float]
     seconds: float
+    cpu_seconds: float
     stopped_early: bool
     weights_hash: str
 
@@ -166,7 +183,8 @@ def train(config: TrainConfig) -> TrainReport:
     """
     began = time.perf_counter()
     run = RunFolder(config.out)
-    with join_processes(config.device, threads=config.threads) as here:
+    joined = join_processes(config.device, threads=config.threads)
+    with joined as here, run.nothing_by_halves():
         rank, world, device = here
         if config.exact:
             torch.backends.cudnn.allow_tf32 = False  # on by default, with 10 bits of mantissa
@@ -180,6 +198,9 @@ def train(config: TrainConfig) -> TrainReport:
         description = _describe(config, data)
         agent = make_agent(description, seed=config.seed).to(device)
         held_out = HeldOut(agent, data.spared(config.hold_out)) if config.hold_out else None
+        validation = Validation(
+            run, episodes=plan.validate, here=here, trained=data.seeds, task=config.task
+        )
         _rehearse(config, data, agent, plan, device)
         key = claim(run, config, plan, description, data, processes=world, write=rank == 0)
         here.wait()
@@ -187,12 +208,14 @@ def train(config: TrainConfig) -> TrainReport:
         # Go on where a run was interrupted, perhaps while its last snapshot was validated
         trained = Trained(agent, plan, run, key)
         first = trained.restore()
-        stopped = _validate(run, config, [k for k in run.steps() if 0 < k <= first], here)
+        stopped = validation.play([k for k in run.steps() if 0 < k <= first])
         network: nn.Module = DistributedDataParallel(agent) if world > 1 else agent
         kept, store = set(plan.snapshot_steps()), state_steps(plan)
 
-        shown = config.progress and rank == 0
-        bar = progress_bar(f"train {config.task}", plan.steps, done=first, shown=shown)
+        bar = progress_bar(
+            f"train {config.task}", plan.steps, done=first, unit="steps",
+            shown=config.progress and rank == 0,
+        )  # fmt: skip
         log = TrainingLog(run, first, tensorboard=config.tensorboard, enabled=rank == 0)
         with log, bar as advance:
             for step in range(first + 1, plan.steps + 1):
@@ -226,8 +249,19 @@ def train(config: TrainConfig) -> TrainReport:
                         log.flush()
                         trained.store(step)
                 if due:
-                    stopped = _validate(run, config, [step], here)
+                    with log.paused():
+                        stopped = validation.play([step])
+                    if rank == 0 and stopped and step % store:
+                        log.flush()
+                        trained.store(step)
+
+                # What is told meanwhile
                 advance()
+                loss_so_far = log.last_loss()
+                parts = ["" if loss_so_far is None else f"loss {loss_so_far:.3g}", validation.told]
+                advance.note = ", ".join(filter(None, parts))
+                if due:
+                    advance.milestone()
         if config.untrained and rank == 0:
             initial = dict(make_agent(description, seed=config.seed).named_parameters())
             run.write_snapshot(0, on_cpu(initial), {"agent": asdict(description)})
@@ -241,10 +275,14 @@ def train(config: TrainConfig) -> TrainReport:
             left_out=data.left_out,
             seed=config.seed,
             steps=steps[-1],
+            planned_steps=plan.steps,
+            patience=config.patience,
             snapshots=tuple(steps),
+            validation=validation.found,
             loss=log.last_loss(),
             held_out=run.held_out(),
             seconds=time.perf_counter() - began,
+            cpu_seconds=log.cpu_seconds(),
             stopped_early=steps[-1] < plan.steps,
             weights_hash=_hash(run.snapshot(steps[-1])),
         )
@@ -312,21 +350,6 @@ def _batch(
         return (batch._replace(image=batch.image.to(device)),)
     tensors = state_batch(data, agent.config.lifts, moments=moments, rng=rng, augment=augment)
     return tuple(each.to(device) for each in tensors)
-
-
-def _validate(run: RunFolder, config: TrainConfig, steps: Sequence[int], here: Process) -> bool:
-    """Validate snapshots, where that is asked for, and say whether training ends with the last."""
-    if not config.validate:
-        return False
-    from .evaluation import evaluate_snapshot, known, stopped_early  # loads the simulator
-    from .protocol import Protocol
-
-    protocol = Protocol(split="validation", episodes=config.validate)
-    for step in steps if here.rank == 0 else ():
-        if not known(run, step, protocol):
-            evaluate_snapshot(run, step, protocol)
-    here.wait()
-    return stopped_early(run)
 
 
 def _hash(path: Path) -> str:

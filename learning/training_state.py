@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from warp_deform.episodes import EpisodeReader, versions
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.revision import running_revision
 
 from .dataset import Demonstrations
 from .log import LINE_STEPS
@@ -146,7 +147,7 @@ def claim(
         "augment": config.augment,
         "hold_out": config.hold_out,
         "patience": config.patience,
-        "validate": config.validate,
+        "validate": plan.validate,
         "processes": processes,
         "threads": config.threads,
         "device": config.device,
@@ -158,7 +159,11 @@ def claim(
     if not write:
         return key
     if run.settings.exists():
-        _compare(run, json.loads(json.dumps(deciding)), read_json(run.settings))
+        found = read_json(run.settings)
+        _compare(run, json.loads(json.dumps(deciding)), found)
+        here, known = asdict(running_revision()), found.get("revisions", [])
+        if here not in known:
+            write_json(run.settings, {**found, "revisions": [*known, here]})
         return key
     if run.state.exists() or run.log.exists() or run.steps():
         raise InputError(
@@ -167,7 +172,12 @@ def claim(
     run.create()
     reader = EpisodeReader(config.data)
     names = sorted({reader.info(seed).demonstrator for seed in data.seeds})
-    told = {"data": str(config.data), "left_out": data.left_out, "demonstrators": names}
+    told = {
+        "data": str(config.data),
+        "left_out": data.left_out,
+        "demonstrators": names,
+        "revisions": [asdict(running_revision())],
+    }
     write_json(run.settings, {**deciding, **told})
     return key
 

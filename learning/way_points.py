@@ -108,7 +108,8 @@ def bend(config: BendConfig) -> BendReport:
         for i in range(0, len(seeds), _CHUNK)
     ]
     count = worker_count(config.workers, _COLLECTED * len(infos))
-    bar = progress_bar("way-points", len(infos), done=len(infos) - sum(map(len, todo.values())))
+    left = sum(map(len, todo.values()))
+    bar = progress_bar("refine, way-points", len(infos), done=len(infos) - left)
     with Workers(min(count, max(1, len(chunks)))) as crew, bar as advance:
         for _ in crew.run(_bend_chunk, chunks):
             advance()

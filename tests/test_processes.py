@@ -45,7 +45,7 @@ def test_two_processes_train_as_one_with_both_batches(
 ) -> None:
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2",
                "-m", "warp_deform", "train", TASK, "--agent", "gt-mlp", "--data", str(folder),
-               "--preset", "fast", "--steps", str(STEPS), "--snapshots", "1",
+               "--preset", "fast", "--steps", str(STEPS), "--snapshots", "1", "--validate", "0",
                "--batch", str(BATCH), "--out", str(tmp_path / "two"), "--json"]  # fmt: skip
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, check=True, capture_output=True, env=env, text=True)
@@ -53,7 +53,7 @@ def test_two_processes_train_as_one_with_both_batches(
     settings = json.loads((tmp_path / "two" / "run.json").read_text())
     assert settings["processes"] == 2
 
-    plan = replace(STATE_SCHEDULES["fast"], steps=STEPS, snapshots=1, batch=BATCH)
+    plan = replace(STATE_SCHEDULES["fast"], steps=STEPS, snapshots=1, batch=BATCH, validate=0)
     alone = TrainConfig(
         task=TASK, agent="gt-mlp", data=folder, out=tmp_path / "one", preset="fast", schedule=plan
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ def test_presets_are_the_papers_and_ours() -> None:
     paper = SCHEDULES["paper"]
     assert (paper.steps, paper.batch, paper.lr, paper.snapshots) == (20_000, 1, 1e-4, 10)
     assert (paper.ema, paper.decay, paper.warmup) == (0.0, False, 0)
-    assert SCHEDULES["fast"].snapshot_steps() == (1000, 2000, 3000, 4000)
+    assert SCHEDULES["fast"].snapshot_steps() == (250, 500, 1000, 2000, 4000)
 
 
 @pytest.mark.parametrize(
@@ -64,6 +65,31 @@ def test_snapshots_are_as_many_as_asked_for_and_evenly_spread(numbers: tuple[int
     found = Schedule(steps=steps, batch=1, lr=1.0, snapshots=n).snapshot_steps()
     assert len(set(found)) == n and found[-1] == steps and found[0] >= 1
     assert all(abs(step - k * steps / n) <= 0.5 for k, step in enumerate(found, start=1))
+
+
+@settings(derandomize=True, deadline=None, max_examples=200)
+@given(st.integers(1, 12), st.integers(1, 5000))
+def test_doubling_snapshots_come_after_twice_the_steps(n: int, steps: int) -> None:
+    found = Schedule(
+        steps=steps, batch=1, lr=1.0, snapshots=n, doubling=True
+    ).snapshot_steps()  # fmt: skip
+    assert found[-1] == steps and found[0] >= 1 and list(found) == sorted(set(found))
+    assert len(found) <= n and (len(found) == n or steps < 2**n)
+    assert all(abs(2 * a - b) <= 1 for a, b in pairwise(found))
+
+
+def test_validation_is_the_presets_unless_nothing_can_be_played(tmp_path: Path) -> None:
+    def plan(**changes: Any) -> Schedule:
+        settings = {"task": "cable-ring", "agent": "transporter", "preset": "fast"} | changes
+        return TrainConfig(data=tmp_path, out=tmp_path, **settings).plan(10)
+
+    assert plan().validate == 20 and plan(agent="gt-mlp").validate == 20
+    assert plan(preset="paper").validate == 0
+    assert plan(validate=0).validate == 0 and plan(validate=7).validate == 7
+    assert plan(hold_out=6).validate == 0 and plan(hold_out=6, validate=7).validate == 7
+    assert plan(snapshots=4).snapshot_steps() == (1000, 2000, 3000, 4000), "as asked for"
+    assert plan(steps=10).snapshot_steps() == (1, 2, 5, 10)
+    assert plan(steps=2).snapshot_steps() == (1, 2)
 
 
 @pytest.mark.parametrize(

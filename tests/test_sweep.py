@@ -27,6 +27,7 @@ seeds = [0, 1]
 steps = 2
 batch = 4
 snapshots = 1
+validate = 0
 untrained = true
 {more}
 [demonstrations]
@@ -156,7 +157,11 @@ def test_what_files_are_there_does_not_tell_that_a_collection_is_done(
 
 def test_device_and_validation_reach_the_runs(tmp_path: Path) -> None:
     path = tmp_path / "grid.toml"
-    path.write_text(GRID.format(root=tmp_path, more='device = "cuda"\nvalidate = 3\npatience = 2'))
+    path.write_text(
+        GRID.format(root=tmp_path, more='device = "cuda"\npatience = 2').replace(
+            "validate = 0", "validate = 3"
+        )
+    )
     cells = read_sweep(path).cells()
     assert {(cell.device, cell.validate, cell.patience) for cell in cells} == {("cuda", 3, 2)}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ from torch import nn
 from training_samples import write_demonstrations
 
 from learning import evaluation, log, training
-from learning.log import TrainingLog
+from learning.log import TrainingLog, read_log
 from learning.schedules import Schedule
 from learning.snapshots import RunFolder, read_json, write_json
 from learning.training import TrainConfig, train
@@ -52,7 +53,9 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> list[int
 
 def lines(run: Path) -> list[dict[str, float]]:
     found = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-    return [{name: value for name, value in line.items() if name != "seconds"} for line in found]
+    return [
+        {name: value for name, value in line.items() if "seconds" not in name} for line in found
+    ]
 
 
 @pytest.mark.parametrize(
@@ -136,15 +139,13 @@ class Validation:
         self.values, self.killed = values, killed
         self.played: set[int] = set()
 
-    def evaluate(self, run: RunFolder, step: int, protocol: Any) -> None:
+    def evaluate(self, run: RunFolder, step: int, protocol: Any) -> Any:
         if step == self.killed:
             self.killed = None
             raise KeyboardInterrupt
-        assert step not in self.played
         self.played.add(step)
-
-    def known(self, run: RunFolder, step: int, protocol: Any) -> bool:
-        return step in self.played
+        summary = {"n_success": 0, "n_episodes": 1, "mean_score": self.values[step]}
+        return SimpleNamespace(summary=summary)
 
     def stopped(self, run: RunFolder) -> bool:
         values = [self.values[step] for step in sorted(self.played)]
@@ -152,7 +153,6 @@ class Validation:
 
     def install(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(evaluation, "evaluate_snapshot", self.evaluate)
-        monkeypatch.setattr(evaluation, "known", self.known)
         monkeypatch.setattr(evaluation, "stopped_early", self.stopped)
 
 
@@ -173,6 +173,41 @@ def test_a_kill_during_validation_changes_nothing(
     resumed = train(config(folder, tmp_path / "cut", **settings))
     assert resumed.snapshots == whole.snapshots and resumed.weights_hash == whole.weights_hash
     assert validation.played == {100, 200}
+
+
+def test_a_run_that_stopped_stays_as_it_is(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same command again changes neither log nor loss, though no state is due at the stop."""
+    plan = Schedule(steps=300, batch=4, lr=3e-3, snapshots=4)  # 75, 150, 225, 300
+    validation = Validation({75: 0.5, 150: 0.4})
+    validation.install(monkeypatch)
+    settings: dict[str, Any] = {"schedule": plan, "validate": 1}
+    first = train(config(folder, tmp_path, **settings))
+    log = (tmp_path / "log.jsonl").read_text()
+    assert first.snapshots == (75, 150) and len(log.splitlines()) == 3
+    again = train(config(folder, tmp_path, **settings))
+    assert (tmp_path / "log.jsonl").read_text() == log
+    assert (again.loss, again.weights_hash) == (first.loss, first.weights_hash)
+    assert again.cpu_seconds == first.cpu_seconds > 0
+
+
+def test_validation_is_no_part_of_what_steps_cost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0, 7.0]  # the wall's clock and the process's
+    monkeypatch.setattr(log, "_clocks", lambda: tuple(now))
+    made = TrainingLog(RunFolder(tmp_path), 0, tensorboard=False, enabled=True)
+    for step in range(1, 101):
+        now[:] = now[0] + 0.5, now[1] + 0.25
+        made.add(step, {"loss": torch.zeros(())}, lr=0.1)
+        if step == 30:
+            with made.paused():
+                now[:] = now[0] + 1000.0, now[1] + 400.0
+    made.close()
+    lines = read_log(RunFolder(tmp_path))
+    assert [(line["seconds"], line["cpu_seconds"]) for line in lines] == [(25.0, 12.5)] * 2
+    assert made.cpu_seconds() == 25.0
 
 
 def test_without_patience_a_snapshot_is_validated_too(

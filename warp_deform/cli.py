@@ -35,31 +35,58 @@ __all__ = ["VERBS", "CommandOptions", "Outcome", "Verb", "main"]
 
 
 class Verb(NamedTuple):
-    """Where a verb's function stands, "module:function", and what it does in a few words."""
+    """Where a verb's function stands, "module:function", and what it does in a few words.
+
+    kept: what an interruption leaves, and what to do then; empty where there is nothing to say
+    """
 
     target: str
     summary: str
+    kept: str = ""
 
+
+_GOES_ON = "the same command goes on"
 
 VERBS: dict[str, Verb] = {
     "list": Verb("warp_deform.commands:list_tasks", "the tasks and their Gymnasium ids"),
-    "demo": Verb("warp_deform.commands:demo", "collect demonstrations of a task"),
-    "goals": Verb("warp_deform.commands:goals", "make a task's set of goals"),
+    "demo": Verb(
+        "warp_deform.commands:demo", "collect demonstrations of a task",
+        kept=f"episodes already written are complete, {_GOES_ON}",
+    ),
+    "goals": Verb(
+        "warp_deform.commands:goals", "make a task's set of goals",
+        kept=f"goals already written are complete, {_GOES_ON}",
+    ),
     "replay": Verb("warp_deform.commands:replay", "simulate recorded episodes again and compare"),
     "inspect": Verb("warp_deform.commands:inspect", "statistics and contact sheets of a dataset"),
     "convert": Verb("learning.convert_cli:convert", "datasets to and from other formats"),
-    "train": Verb("learning.cli:train", "train an agent on demonstrations"),
-    "eval": Verb("learning.cli:evaluate", "choose a run's best snapshot and test it"),
+    "train": Verb(
+        "learning.cli:train", "train an agent on demonstrations",
+        kept=f"all but the last steps is kept, {_GOES_ON} and ends with the same bits",
+    ),
+    "eval": Verb(
+        "learning.cli:evaluate", "choose a run's best snapshot and test it",
+        kept=f"what was played is kept, {_GOES_ON}",
+    ),
     "report": Verb("learning.cli:report", "tables and learning curves beside the paper's"),
-    "sweep": Verb("learning.cli:sweep", "train and evaluate a grid, as long as it takes"),
-    "refine": Verb("learning.refine_cli:refine", "improve demonstrations by search"),
+    "sweep": Verb(
+        "learning.cli:sweep", "train and evaluate a grid, as long as it takes",
+        kept=f"what is done is kept, {_GOES_ON}",
+    ),
+    "refine": Verb(
+        "learning.refine_cli:refine", "improve demonstrations by search",
+        kept=f"episodes already written are complete, {_GOES_ON}",
+    ),
     "bench": Verb("warp_deform.commands:bench", "time the simulator, alone or beside a peer"),
     "gradcheck": Verb(
         "warp_deform.commands:gradcheck", "compare derivatives with finite differences"
     ),
-    "franka": Verb("hardware.cli:franka", "the cable task on a Franka arm or its twin"),
+    "franka": Verb(
+        "hardware.cli:franka", "the cable task on a Franka arm or its twin",
+        kept="episodes already written are complete",
+    ),
     "doctor": Verb("warp_deform.commands:doctor", "versions, devices, caches and what is missing"),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +124,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except WarpDeformError as error:
         return _complain(error, code=1)
     except KeyboardInterrupt:
-        return _complain("interrupted; episodes already written are complete", code=130)
+        kept = VERBS[arguments[0]].kept if arguments and arguments[0] in VERBS else ""
+        return _complain("; ".join(filter(None, ["interrupted", kept])), code=130)
     except BrokenPipeError:
         _discard_stdout()  # the reader went away (`| head`)
         return 1

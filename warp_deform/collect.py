@@ -134,7 +134,7 @@ def _attempt_all(config: CollectConfig, attempts: dict[int, Attempt], workers: W
     """Attempt seeds, round after round, until there are successes enough or no hope of them."""
     here = Workers(1)
     done = sum(attempt.success for attempt in attempts.values())
-    with progress_bar(config.task, config.episodes, done=done) as advance:
+    with progress_bar(f"demo {config.task}", config.episodes, done=done) as advance:
         crew = here
         while todo := _plan(config, attempts):
             # The first few run here, while the workers start: kernels are compiled once.
@@ -143,6 +143,7 @@ def _attempt_all(config: CollectConfig, attempts: dict[int, Attempt], workers: W
             for attempt in crew.run(attempt_chunk, chunks):
                 attempts[attempt.seed] = attempt
                 advance(attempt.success)
+                advance.note = f"{len(attempts)} attempts"
             crew = workers
 
 

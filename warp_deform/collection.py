@@ -68,13 +68,18 @@ class Collection:
 
     def __init__(self, folder: Path, description: Mapping[str, Any]) -> None:
         self.folder = Path(folder)
+        self._made = [each for each in (self.folder, *self.folder.parents) if not each.exists()]
         EpisodeWriter(self.folder)  # makes the folder and clears what killed writers left
         self._describe({"format": _FORMAT, **description, "versions": _deciding_versions()})
         self.attempts: dict[int, Attempt] = {}
 
     @contextlib.contextmanager
     def owned(self) -> Iterator[Collection]:
-        """Hold the folder, with everything that earlier runs left in it."""
+        """Hold the folder, with everything that earlier runs left in it.
+
+        Where what is done with it fails before anything has been attempted in a folder that was
+        made for it, none is left.
+        """
         with (self.folder / _LEDGER).open("a+b") as ledger:
             try:
                 fcntl.flock(ledger, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -90,7 +95,21 @@ class Collection:
                 ledger.flush()
             self._restore_surplus()
             self.attempts = self._known(text)
-            yield self
+            try:
+                yield self
+            except Exception:
+                self._withdraw()
+                raise
+
+    def _withdraw(self) -> None:
+        """Remove the folder that was made for this, unless it holds what was worked for."""
+        if not self._made or (self.folder / _LEDGER).stat().st_size or self._has_episodes():
+            return
+        for name in (_LEDGER, _DESCRIPTION):
+            (self.folder / name).unlink(missing_ok=True)
+        for folder in self._made:
+            with contextlib.suppress(OSError):  # it holds something else
+                folder.rmdir()
 
     def _known(self, ledger: bytes) -> dict[int, Attempt]:
         """Attempts that need not be repeated: failures of the ledger, and files that are there."""

@@ -27,6 +27,7 @@ from .episodes import (
     rebuild_index,
 )
 from .errors import InputError, WarpDeformError
+from .progress import progress_bar
 from .recording import GOAL_TARGETS, observe, origin, record, recorded_task, task_config
 from .tasks.free_space import FreeSpace
 from .tasks.registry import task as find_task
@@ -157,15 +158,19 @@ def _construct(name: str, out: Path, seeds: range, robot: str) -> None:
         single_threaded(),
     ):
         missing = [seed for seed in seeds if seed not in collection.attempts]
+        done = len(seeds) - len(missing)
         worlds = Worlds(at_goal(task), SLOTS, robot=robot, lanes=SLOTS)
         writer = EpisodeWriter(out, overwrite=True)
-        for slot, run in play(worlds, missing, act=_rest, look=observe, until_solved=False):
-            if not run.rows:
-                raise WarpDeformError(f"{name}: no goal of seed {run.seed}: {run.ended}")
-            writer.write(_goal_episode(worlds, slot, run, task))
-            attempt = Attempt(run.seed, True, 0, run.rows[0].score, CONSTRUCTED)
-            append_attempt(out, attempt)
-            collection.attempts[run.seed] = attempt
+        runs = play(worlds, missing, act=_rest, look=observe, until_solved=False)
+        with progress_bar(f"goals {name}", len(seeds), done=done, unit="goals") as advance:
+            for slot, run in runs:
+                if not run.rows:
+                    raise WarpDeformError(f"{name}: no goal of seed {run.seed}: {run.ended}")
+                writer.write(_goal_episode(worlds, slot, run, task))
+                attempt = Attempt(run.seed, True, 0, run.rows[0].score, CONSTRUCTED)
+                append_attempt(out, attempt)
+                collection.attempts[run.seed] = attempt
+                advance()
         collection.keep(set(seeds))
     rebuild_index(out)
 

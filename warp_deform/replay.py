@@ -14,6 +14,7 @@ from .episode_loop import SLOTS, Run, play, worlds_for
 from .episodes import Episode, EpisodeReader, Goal, Step, cpu_fingerprint, versions
 from .errors import InputError
 from .goals import CONSTRUCTED, at_goal
+from .progress import progress_bar
 from .recording import recorded_task
 from .tasks.registry import task as find_task
 from .workers import Workers, worker_count
@@ -61,8 +62,11 @@ def verify(
         for kind, seeds in groups.items()
         for i in range(0, len(seeds), size)
     ]
-    with Workers(count) as crew:
-        found = list(crew.run(_compare_chunk, chunks))
+    found = []
+    with Workers(count) as crew, progress_bar("replay", len(reader)) as advance:
+        for compared in crew.run(_compare_chunk, chunks):
+            found.append(compared)
+            advance()
     return {
         "episodes": len(found),
         "steps": sum(rows for rows, _, _ in found),

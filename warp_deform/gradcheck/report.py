@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from ..differentiable import DifferentiableRollout
 from ..errors import InputError, WarpDeformError
+from ..progress import progress_bar
 from ..solver.tape import Kind
 from ..tasks.registry import TASKS
 from ..tasks.registry import task as find_task
@@ -31,8 +31,6 @@ ENOUGH = 20
 """States in which a kind of constraint acted that a figure rests on."""
 MOST_SEARCHED = 2
 """States searched for rare kinds, as a multiple of those that are compared anyway."""
-PROGRESS = 5.0
-"""Between lines of progress [s]."""
 _DTYPE = "float64"
 _MEMORY = 3 * 2**29  # bytes
 
@@ -146,13 +144,11 @@ def _compare_states(worlds: Worlds, level: str, count: int, seed: int) -> list[l
 
 
 def _shown(draws: Iterator[Draw], label: str, count: int) -> Iterator[Draw]:
-    """The next `count` draws, with their number on stderr now and then."""
-    shown = time.monotonic()
-    for number, draw in zip(range(count), draws, strict=False):
-        if time.monotonic() - shown > PROGRESS or number == 0:
-            print(f"{label}: {number} of {count} states", file=sys.stderr, flush=True)
-            shown = time.monotonic()
-        yield draw
+    """The next `count` draws, with their number on stderr."""
+    with progress_bar(label, count, unit="states") as advance:
+        for _, draw in zip(range(count), draws, strict=False):
+            yield draw
+            advance()
 
 
 def _rows(task: str, level: str, states: Sequence[Sequence[Sample]], notes: list[str]) -> list[Row]:

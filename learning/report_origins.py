@@ -1,0 +1,59 @@
+"""Who made the runs of a report: steps, CPU time, versions and revisions of the code."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from warp_deform.progress import duration
+from warp_deform.revision import Revision
+
+from .report import RunResult
+
+__all__ = ["origin", "origins"]
+
+_HEAD = ["task", "agent", "demos", "variant", "seed", "steps", "training, CPU", "trained by",
+         "evaluated by"]  # fmt: skip
+
+
+def origin(run: RunResult) -> dict[str, Any]:
+    """One run, as JSON; None where an earlier version did not say.
+
+    trained_by holds every revision of the code that training went on with.
+    """
+    info, settings = run.info, run.settings
+    return {
+        "run": str(run.path),
+        "task": run.task,
+        "agent": run.agent,
+        "demos": run.demos,
+        "variant": run.variant,
+        "seed": run.seed,
+        "steps": info["trained_steps"],
+        "training_cpu_seconds": info.get("training_cpu_seconds") or None,
+        "trained_by": settings.get("revisions"),
+        "evaluated_by": info.get("revision"),
+    }
+
+
+def origins(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """The rows of a table, its head first, of what `origin` says."""
+    rows = [_HEAD]
+    for each in found:
+        seconds, trained, evaluated = (
+            each[key] for key in ("training_cpu_seconds", "trained_by", "evaluated_by")
+        )
+        keys = ("task", "agent", "demos", "variant", "seed", "steps")
+        rows.append(
+            [
+                *(str(each[key]) for key in keys),
+                "-" if seconds is None else duration(seconds),
+                "; ".join(map(_said, trained)) if trained else "-",
+                _said(evaluated) if evaluated else "-",
+            ]
+        )
+    return rows
+
+
+def _said(revision: Mapping[str, Any]) -> str:
+    return str(Revision(**revision))
