@@ -95,7 +95,7 @@ class VideoWriter:
         if frame.shape[:2] != self._size:
             raise InputError(f"a frame is {frame.shape[:2]}, the first one was {self._size}")
         assert self._encoder is not None and self._encoder.stdin is not None
-        # ffmpeg converts, too, for four times the time
+        # half of ffmpeg's time for it; chroma is one pixel's of four, not their mean (53 dB apart)
         planes = cv2.cvtColor(_even(frame), cv2.COLOR_RGB2YUV_I420)
         try:
             self._encoder.stdin.write(planes)
@@ -108,7 +108,8 @@ class VideoWriter:
         import imageio_ffmpeg
 
         self._log = tempfile.TemporaryFile()
-        # superfast at 22 is a third of the time of the default preset at 20, and no worse (PSNR)
+        # superfast at 22: a third of the CPU time of the default preset at 20, and as near to the
+        # planes it is given (53.3 and 52.9 dB over a film of cable-shape), in twice the bytes
         command = (
             f"-y -loglevel error -f rawvideo -pix_fmt yuv420p -s {size[1]}x{size[0]} "
             f"-r {self._fps} -i - -an -c:v libx264 -preset superfast -crf 22 -threads 1 "
