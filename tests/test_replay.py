@@ -131,4 +131,6 @@ def test_a_video_shows_the_recording_or_nothing(demos: Path, tmp_path: Path) -> 
         film(folder, tmp_path / "film.mp4", size=(90, 160))
     with pytest.raises(InputError, match="must end with"):
         film(demos, tmp_path / "film.gif")
+    with pytest.raises(InputError, match="no episode"):
+        film(demos, tmp_path / "film.mp4", seeds=[])
     assert not list(tmp_path.glob("*film*"))
