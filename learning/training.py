@@ -201,7 +201,8 @@ def train(config: TrainConfig) -> TrainReport:
         validation = Validation(
             run, episodes=plan.validate, here=here, trained=data.seeds, task=config.task
         )
-        _rehearse(config, data, agent, plan, device)
+        if not run.settings.exists():
+            _rehearse(config, data, agent, plan, device)
         key = claim(run, config, plan, description, data, processes=world, write=rank == 0)
         here.wait()
 

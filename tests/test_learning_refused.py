@@ -108,7 +108,7 @@ def test_an_interrupted_training_stays(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(training, "state_batch", interrupted)
+        patch.setattr(training.TrainingLog, "add", interrupted)
         with pytest.raises(KeyboardInterrupt):
             train(config(data, tmp_path / "run"))
     assert RunFolder(tmp_path / "run").settings.exists()
