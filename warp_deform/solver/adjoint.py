@@ -53,6 +53,7 @@ def adjoint_kernel(
     sweep_contact = sphere_contact_adjoint(scalar, lanes).sweep_contact
     table_ = table_contact_adjoint(scalar, lanes, with_sheets)
     sweep_finish, sweep_predict = table_.sweep_finish, table_.sweep_predict
+    stepped = table_.stepped
     sweep_tether = tether_adjoint(scalar, lanes).sweep_tether
     sweep_triangle = triangle_contact_adjoint(scalar, lanes).sweep_triangle
     sweep_edge = edge_contact_adjoint(scalar, lanes).sweep_edge
@@ -189,7 +190,10 @@ def adjoint_kernel(
                 if wp.static(with_sheets):
                     fetch_ahead(tape.x, tx + 3 * i - ahead, wp.static(3 * BYTES))
                     x = tape.x[tx + 3 * i]
-                    d = x - tape.x[tx + 3 * i + 1]
+                    d = stepped(
+                        x, tape.x[tx + 3 * i + 1], adj.w[p0 + i], tape.x[tx + 3 * i + 2], kept * dt,
+                        fall,
+                    )  # fmt: skip
                     z = x.z
                     sleep = tape.v[tv + 3]
                 else:

@@ -113,6 +113,7 @@ def forward_kernel(
         kept = wp.max(zero, one - group.damping[g] * dt)
         gravity = group.gravity[g]
         fall = gravity * dt
+        share = kept * dt
         inverse_dt2 = one * (inverse_dt * inverse_dt) / group.stiffness[g]
         table_mu = group.table_friction[g]
         contact_mu = group.contact_friction[g]
@@ -180,7 +181,7 @@ def forward_kernel(
                 frame += 1
             # predict
             for i in range(p0, p0 + n):
-                predict(i, dt, kept, fall, q)
+                predict(i, share, fall, q)
             if wp.static(with_bodies):
                 for lane in range(wp.static(L)):
                     if on[lane] > S(0.0):
@@ -301,18 +302,9 @@ def forward_kernel(
                 ended2 = zero
                 if wp.static(taped):
                     ended2 = record_finish(
-                        p0 + i,
-                        tops[0],
-                        tops[1],
-                        radius,
-                        inverse_dt,
-                        table_mu,
-                        fastest,
-                        all_on,
-                        on,
-                        q,
-                        tape,
-                    )
+                        p0 + i, tops[0], tops[1], radius, inverse_dt, share, fall, table_mu,
+                        fastest, all_on, on, q, tape,
+                    )  # fmt: skip
                     if wp.static(with_sheets):
                         tops[0] += 3
                     else:
@@ -320,7 +312,7 @@ def forward_kernel(
                         tops[1] += 1
                 else:
                     ended2 = finish(
-                        p0 + i, radius, inverse_dt, table_mu, fastest, all_on, on, q
+                        p0 + i, radius, inverse_dt, share, fall, table_mu, fastest, all_on, on, q
                     )  # fmt: skip
                 moved2 = wp.max(moved2, ended2)
             unrest2 = moved2
@@ -347,15 +339,18 @@ def forward_kernel(
             if wp.static(with_bodies):
                 for lane in range(wp.static(L)):
                     if on[lane] > S(0.0):
+                        pull = R3(gravity.x[lane], gravity.y[lane], gravity.z[lane])
                         for b in range(body_count):
                             at = b0 + lane * body_count + b
                             if wp.static(taped):
                                 tape.k[tops[2]] = record_body(
-                                    tops[3], at, dt, drowsy[lane], bodies, tape
+                                    tops[3], at, dt, kept[lane], pull, drowsy[lane], bodies, tape
                                 )  # fmt: skip
                                 tops[2] += 1
                                 tops[3] += wp.static(BODY_SCALARS - 7)
-                            m = finish_body(at, dt, fastest[lane], drowsy[lane], bodies)
+                            m = finish_body(
+                                at, dt, kept[lane], pull, fastest[lane], drowsy[lane], bodies
+                            )  # fmt: skip
                             moved2[lane] = wp.max(moved2[lane], m)
                             unrest2[lane] = wp.max(unrest2[lane], m)
             if wp.static(taped):

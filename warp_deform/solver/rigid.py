@@ -83,14 +83,24 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
             bodies.q[b] = turned(q, wp.quat_rotate(q, omega) * (dt * kept))
 
     @wp.func
-    def finish_body(b: int, dt: S, fastest: S, drowsy: S, bodies: Bodies):
+    def stepped_body(b: int, dt: S, kept: S, gravity: R3, bodies: Bodies):
+        """Step of the centre of mass, exact far from the origin (see `table_contact`) [m]."""
+        step = R3()
+        if bodies.w[b] > S(0.0):
+            step = (bodies.v[b] + gravity * dt) * (dt * kept)
+        return step + (bodies.x[b] - (bodies.xp[b] + step))
+
+    @wp.func
+    def finish_body(
+        b: int, dt: S, kept: S, gravity: R3, fastest: S, drowsy: S, bodies: Bodies
+    ):  # fmt: skip
         """Velocities from the substep; returns the squared step of the centre of mass [m^2], with
         the turning counted at 2 cm from it.
 
         drowsy: factor on the speeds of sleep; above 1 (late in a world of fabrics, where light
         layers under a box give way for ever) a sleeper loses its velocity as well.
         """
-        d = bodies.x[b] - bodies.xp[b]
+        d = stepped_body(b, dt, kept, gravity, bodies)
         # the inverse of `turned`, which turns by twice the arc tangent of half the vector's length
         turn = bodies.q[b] * wp.quat_inverse(bodies.qp[b])
         rotation = R3(turn[0], turn[1], turn[2]) * (S(2.0) / turn[3])
@@ -110,5 +120,5 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
 
     return SimpleNamespace(
         turned=turned, response=response, push_body=push_body, moved=moved,
-        predict_body=predict_body, finish_body=finish_body,
+        predict_body=predict_body, stepped_body=stepped_body, finish_body=finish_body,
     )  # fmt: skip

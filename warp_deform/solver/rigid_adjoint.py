@@ -33,7 +33,7 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
     Bodies, Tape, Adjoint, BodyAdjoint = t.Bodies, t.Tape, t.Adjoint, t.BodyAdjoint
     count_one = lane_access(scalar, lanes).count_one
-    turned = rigid(scalar, lanes).turned
+    turned, stepped_body = rigid(scalar, lanes).turned, rigid(scalar, lanes).stepped_body
 
     @wp.func
     def push_pose(at: int, x: R3, q: Q, tape: Tape):
@@ -51,7 +51,9 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return Q(tape.s[at], tape.s[at + 1], tape.s[at + 2], tape.s[at + 3])
 
     @wp.func
-    def record_body(at: int, b: int, dt: S, drowsy: S, bodies: Bodies, tape: Tape):
+    def record_body(
+        at: int, b: int, dt: S, kept: S, gravity: R3, drowsy: S, bodies: Bodies, tape: Tape
+    ):  # fmt: skip
         push_pose(at, bodies.x[b], bodies.q[b], tape)
         push_pose(at + 7, bodies.xp[b], bodies.qp[b], tape)
         v = bodies.v[b]
@@ -61,7 +63,7 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             tape.s[at + 17 + k] = omega[k]
         tape.s[at + 20] = bodies.w[b]
         state = int(AWAKE)
-        d = bodies.x[b] - bodies.xp[b]
+        d = stepped_body(b, dt, kept, gravity, bodies)
         turn = bodies.q[b] * wp.quat_inverse(bodies.qp[b])
         rotation = R3(turn[0], turn[1], turn[2]) * (S(2.0) / turn[3])
         if bodies.w[b] > S(0.0) and bodies.support[b] >= 3:
