@@ -58,7 +58,7 @@ def test_a_ring_with_bending_springs_is_at_rest_when_round() -> None:
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"beads": 2}, "3 beads"),
+        ({"beads": 2}, "CableConfig.beads must be a whole number of at least 3"),
         ({"beads": 24.5}, "whole number"),
         ({"mass": math.inf}, "mass"),
         ({"radius": math.nan}, "radius"),

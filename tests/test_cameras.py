@@ -176,7 +176,7 @@ def test_no_video_device() -> None:
 @pytest.mark.parametrize(
     ("module", "kind", "advice"),
     [
-        ("pyrealsense2", RealSenseCamera, r"warp-deform\[realsense\]"),
+        ("pyrealsense2", RealSenseCamera, r"\.\[realsense\]"),
         ("pyk4a", AzureKinectCamera, "UVCCamera"),
     ],
 )

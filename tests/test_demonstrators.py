@@ -182,7 +182,7 @@ def test_mpc_takes_the_best_outcome_and_the_first_of_equals(
     def choose(ranks: list[tuple[int, float]]) -> int:
         class Told:
             def try_each(self, jobs: list[Any]) -> list[Outlook]:
-                pairs = zip(jobs, ranks, strict=True)
+                pairs = zip(jobs, ranks if jobs else [], strict=True)
                 return [Outlook(action, *rank, 0.0, None) for (_, action), rank in pairs]
 
         monkeypatch.setattr(demonstrating, "_lookahead", lambda worlds: Told())
@@ -193,6 +193,7 @@ def test_mpc_takes_the_best_outcome_and_the_first_of_equals(
     assert choose([worst] * 7 + [(1, -9.0)]) == 7
     assert choose([(1, 9.0), (2, 0.1), (2, 0.3), (2, 0.3), *[worst] * 4]) == 2
     assert choose([(2, 9.0), (3, 0.1), *[worst] * 6]) == 1
+    assert choose([(3, 9.0), (4, 0.1), *[worst] * 6]) == 1
     assert choose([worst] * 8) == 0
 
 
@@ -206,7 +207,7 @@ def test_candidates_are_different_allowed_and_at_most_eight(
     many = [np.add(inside, [0, 0.01 * i, 0, 0, 0, 0, 0]) for i in range(20)]
     for proposed, kept in (([inside, outside, inside.copy()], 1), (many, CANDIDATES), ([], 0)):
         monkeypatch.setattr(side.task, "candidates", lambda *_, p=proposed: p, raising=False)
-        assert len(demonstrating._candidates(side, 0, runs[0])) == kept
+        assert len(demonstrating._candidates(side, 0, runs[0], CANDIDATES)) == kept
     assert demonstrator("mpc")(side, runs) == {0: None}
 
 

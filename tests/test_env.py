@@ -225,7 +225,7 @@ def test_own_task_needs_no_registry() -> None:
     module = runpy.run_path(str(EXAMPLES / "own_task.py"))
     env = PickPlaceEnv(module["CableGather"]())
     _, info = env.reset(seed=1)
-    assert 0 < info["score"] < 0.9 and info["ground_truth"].shape == (50,)
+    assert 0 < info["score"] < 0.9 and info["ground_truth"].shape == (75,)
     action = env.demonstrate()
     assert action is not None
     *_, info = env.step(action)

@@ -147,7 +147,7 @@ def test_an_installed_task_goes_the_whole_way(
     assert reported(capfd, "train", "box-away", *how, "--data", demos, "--out", run)["steps"] == 2
     test = ("--episodes", 2, "--validation-episodes", 1, "--videos", 1)
     found = reported(capfd, "eval", run, *test, "--video", tmp_path / "films")
-    assert found["test"]["n_episodes"] == 2 and len(found["videos"]) == 1
+    assert found["test"]["n_episodes"] == 2 and len(found["videos"]) == 2
     (cell,) = reported(capfd, "report", run)["cells"]
     assert (cell["task"], cell["paper"]) == ("box-away", None)
 

@@ -69,6 +69,7 @@ def test_two_processes_train_as_one_with_both_batches(
         return tuple(torch.cat(parts) for parts in zip(*batches, strict=True))
 
     train(replace(alone, out=tmp_path / "single"))
+    monkeypatch.setattr(training, "_rehearse", lambda *_: None)  # it draws a batch, too
     monkeypatch.setattr(training, "state_batch", of_both)
     train(alone)
     two, one, single = (weights(tmp_path / name) for name in ("two", "one", "single"))

@@ -148,7 +148,8 @@ class WorldsView:
 
 def ending(worlds: Worlds, slot: int, info: Mapping[str, Any]) -> tuple[bool, bool]:
     """Whether an episode has terminated (by its task's rules) and whether it is truncated."""
-    terminated = bool(worlds.episodes[slot].ended)
+    # what a guard has found wrong has no end
+    terminated = bool(info["physics_ok"] and worlds.episodes[slot].ended)
     over = info["actions"] >= worlds.task.max_actions or not info["physics_ok"]
     return terminated, bool(over and not terminated)
 

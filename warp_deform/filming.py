@@ -150,15 +150,16 @@ def _shots(worlds: Worlds, take: Take, speed: float) -> Iterator[_Shot]:
         _check(worlds, take, t + 1)
         arm = _ArmPath(report, waiting)
         waiting = arm.at(arm.seconds)
-        if t == 0:
+        if t == 0 or report.frames is None:
             yield from [_Shot(start.particle_q, start.body_q, arm.at(0.0), t)] * still
-        assert report.frames is not None
+        end = worlds.episodes[0].snapshot
         frames = report.frames
+        if frames is None:  # what a policy asks for may be out of the robot's reach
+            continue
         for time, particle_q, body_q in zip(
             frames.times, frames.particle_q, frames.body_q, strict=True
         ):
             yield _Shot(particle_q, body_q, arm.at(time), t)
-        end = worlds.episodes[0].snapshot
         for time in np.arange(frames.times[-1] + interval, arm.seconds, interval):
             yield _Shot(end.particle_q, end.body_q, arm.at(time), t)
     yield from [_Shot(end.particle_q, end.body_q, arm.at(arm.seconds), t + 1)] * still
