@@ -284,6 +284,8 @@ def _worst(values: list[WatchValues]) -> WatchValues:
         nonfinite=any(v.nonfinite for v in values),
         stretch=max(v.stretch for v in values),
         depth=max(v.depth for v in values),
+        box_depth=max(v.box_depth for v in values),
+        box_overlap=max(v.box_overlap for v in values),
         clamped=sum(v.clamped for v in values),
         overflow=max(v.overflow for v in values),
     )

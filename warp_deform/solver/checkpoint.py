@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .data import WATCHED
+
 if TYPE_CHECKING:
     from .data import SolverData
     from .mirrored import Mirrored
@@ -17,8 +19,7 @@ _STATE = (
     "particles.x", "particles.v", "particles.xp", "particles.xr", "particles.w", "near.pair",
     "near.mask", "grips.particle", "grips.body", "grips.tick", "grips.knot", "grips.shift",
     "bodies.x", "bodies.q", "bodies.v", "bodies.omega", "bodies.xp", "bodies.qp", "bodies.w",
-    "bodies.touching", "bodies.support", "watch.steps", "watch.nonfinite", "watch.stretch",
-    "watch.depth", "watch.clamped", "watch.overflow",
+    "bodies.touching", "bodies.support", *(f"watch.{name}" for name in WATCHED),
 )  # fmt: skip
 """What a launch changes and a later one needs; the lists of fabrics are trimmed to their length."""
 _INPUTS = (

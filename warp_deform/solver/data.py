@@ -22,7 +22,8 @@ KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particle
                     "bodies", "contacts", "grips", "watch", "sheets", "cells", "tape")  # fmt: skip
 """The kernel's structs, after the settings, in the order of its arguments."""
 
-WATCHED = ("steps", "nonfinite", "stretch", "depth", "clamped", "overflow")
+WATCHED = ("steps", "nonfinite", "stretch", "depth", "box_depth", "box_overlap", "clamped",
+           "overflow")  # fmt: skip
 """What a launch notes of every world, in the order of the fields of `WatchValues`."""
 
 _NUMPY = {wp.float32: np.float32, wp.float64: np.float64}

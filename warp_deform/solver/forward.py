@@ -148,7 +148,7 @@ def forward_kernel(
                     if grips.push[at_push] >= 0:
                         longest_push = wp.max(longest_push, grips.push_steps[at_push])
         # the table hides at once that a particle started under it
-        watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
+        watch_group(g, k, top, springs, shapes, group, q, bodies, watch)
         substep = int(0)
         tops = wp.vec4i()
         if wp.static(taped):
@@ -373,9 +373,9 @@ def forward_kernel(
             done = wp.max(rested * (one - holding), less(most, steps + V(S(0.5))))
             substep += 1
             if substep % st.check_every == 0:
-                watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
+                watch_group(g, k, top, springs, shapes, group, q, bodies, watch)
             on = on * (one - done)
-        watch_group(g, p0, n, s0, s1, b0, body_count, springs, q, bodies, watch)
+        watch_group(g, k, top, springs, shapes, group, q, bodies, watch)
         watch.steps[g] = steps
         watch.clamped[g] = clamped
         ends = bool(True)

@@ -290,10 +290,9 @@ class SolverFusedXPBD(SolverBase):
         columns = [self.data.views[f"watch.{name}"].ravel().tolist() for name in WATCHED]
         out = []
         for slot in self.data.slot:
-            steps, nonfinite, stretch, depth, clamped, overflow = (c[slot] for c in columns)
-            out.append(
-                WatchValues(int(steps), nonfinite > 0, stretch, depth, int(clamped), int(overflow))
-            )
+            seen = dict(zip(WATCHED, (c[slot] for c in columns), strict=True))
+            whole = {name: int(seen.pop(name)) for name in ("steps", "clamped", "overflow")}
+            out.append(WatchValues(**whole, nonfinite=seen.pop("nonfinite") > 0, **seen))
         return out
 
     def check(self, values: list[WatchValues]) -> None:

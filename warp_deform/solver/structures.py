@@ -260,6 +260,10 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         nonfinite: wp.array(dtype=V)  # 1 when a coordinate was not a number
         stretch: wp.array(dtype=V)  # longest watched spring / its rest length
         depth: wp.array(dtype=V)  # deepest a particle's centre was under the table [m]
+        box_depth: wp.array(dtype=V)  # the same of the lowest corner of a box [m]
+        box_overlap: wp.array(
+            dtype=V
+        )  # deepest that two boxes lay in each other, see `box_overlap`
         clamped: wp.array(dtype=V)  # substeps in which the speed clamp acted
         overflow: wp.array(dtype=V)  # pairs of the world that found no room in the list
         frame_x: wp.array(dtype=V3)  # recorded particle positions
