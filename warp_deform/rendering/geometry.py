@@ -40,6 +40,7 @@ class Scene:
     points: wp.array(dtype=wp.vec3)
     triangles: wp.array(dtype=wp.vec3i)
     triangle_material: wp.array(dtype=int)
+    triangle_closed: wp.array(dtype=int)  # 1 on closed surfaces, whose inside nobody sees
     triangle_normals: wp.array2d(dtype=wp.vec3)  # (triangles, 3), per corner; scenes only
     sphere_particle: wp.array(dtype=int)
     sphere_radius: wp.array(dtype=float)
@@ -190,6 +191,18 @@ class Mesh:
         """Shading normals (F, 3, 3)."""
         return crease_normals(self.vertices, self.faces)
 
+    @cached_property
+    def closed(self) -> bool:
+        """Whether the faces enclose a volume and look outwards: no back of one can be seen."""
+        _, names = np.unique(self.vertices, axis=0, return_inverse=True)
+        corners = names.reshape(-1)[self.faces]
+        edges = np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)])
+        there = np.unique(edges, axis=0, return_counts=True)
+        back = np.unique(edges[:, ::-1], axis=0, return_counts=True)
+        a, b, c = np.moveaxis(np.asarray(self.vertices, float)[self.faces], 1, 0)
+        volume = np.einsum("ij,ij", a, np.cross(b, c))
+        return all(map(np.array_equal, there, back)) and bool(volume > 0)
+
 
 def box_mesh(size: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (8, 3) [m] and faces (12, 3) of a box around the origin."""
@@ -243,6 +256,10 @@ class Geometry:
                 MESH_MATERIAL + mesh_of,
             ]
         )
+        closed = np.zeros(len(triangles), int)
+        first = len(d.triangle_particle)
+        closed[first : first + 12 * boxes] = 1
+        closed[len(triangles) - len(mesh_of) :] = np.array([m.closed for m in meshes], int)[mesh_of]
         palette = np.concatenate([d.palette, np.array([m.rgb for m in meshes]).reshape(-1, 3)])
 
         self._points = HostArray(int(starts[-1]), wp.vec3, device)
@@ -257,6 +274,7 @@ class Geometry:
         scene.points = self._points.array
         scene.triangles = self._constant(triangles, wp.vec3i)
         scene.triangle_material = self._constant(material, wp.int32)
+        scene.triangle_closed = self._constant(closed, wp.int32)
         scene.triangle_normals = wp.zeros((0, 3), dtype=wp.vec3, device=device)
         scene.sphere_particle = self._constant(d.sphere_particle, wp.int32)
         scene.sphere_radius = self._constant(d.sphere_radius, wp.float32)

@@ -132,9 +132,16 @@ def window_in_tile(window: wp.vec4i, row: int, column: int, side: int):
 
 @wp.func
 def triangle_window(
-    points: wp.array(dtype=wp.vec3), triangles: wp.array(dtype=wp.vec3i), view: View, f: int
+    points: wp.array(dtype=wp.vec3),
+    triangles: wp.array(dtype=wp.vec3i),
+    closed: int,
+    view: View,
+    f: int,
 ):
-    """Window of a triangle, seen from either side; the whole picture where it comes too near."""
+    """Window of a triangle; the whole picture where it comes too near.
+
+    Empty for one that belongs to a closed surface and is seen from its inside: another hides it.
+    """
     tri = triangles[f]
     a = to_camera(view, points[tri[0]])
     b = to_camera(view, points[tri[1]])
@@ -143,6 +150,8 @@ def triangle_window(
         return wp.vec4i(0, -1, 0, -1)
     if wp.min(a[2], wp.min(b[2], c[2])) <= NEAR:
         return wp.vec4i(0, view.rows - 1, 0, view.columns - 1)
+    if closed == 1 and wp.dot(wp.cross(b - a, c - a), a) > 0.0:
+        return wp.vec4i(0, -1, 0, -1)
     ax = a[0] / a[2]
     bx = b[0] / b[2]
     cx = c[0] / c[2]
