@@ -183,7 +183,7 @@ class _Picture:
         self._list.write(self._list.mirror)
         wp.launch(
             shade,
-            (len(stale), PATCH * PATCH),
+            (len(stale), PATCH),
             inputs=[
                 geometry.scene,
                 buffer.view,

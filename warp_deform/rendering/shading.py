@@ -316,54 +316,55 @@ def shade(
     out_depth: wp.array2d(dtype=float),
     out_segmentation: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread a pixel of the listed patches: the mean of its samples.
+    """One thread a row of the listed patches: the mean of each pixel's samples.
 
     A pixel whose samples all see one primitive is shaded once. Depth and segmentation are whole
     only with one sample a pixel.
     """
     n, k = wp.tid()
     patch = patches[n]
-    i = patch / patch_columns * PATCH_SIDE + k / PATCH_SIDE
-    j = patch % patch_columns * PATCH_SIDE + k % PATCH_SIDE
-    if i >= out_color.shape[0] or j >= out_color.shape[1]:
+    i = patch / patch_columns * PATCH_SIDE + k
+    if i >= out_color.shape[0]:
         return
-    r0 = i * supersample
-    c0 = j * supersample
-    key = buffer[r0, c0]
-    same = bool(True)
-    for r in range(supersample):
-        for c in range(supersample):
-            if primitive_of(buffer[r0 + r, c0 + c]) != primitive_of(key):
-                same = False
-    middle = 0.5 * float(supersample - 1)
-    total = wp.vec3(0.0, 0.0, 0.0)
-    if same and (key != wp.int64(0) or supersample == 1 or lighting.table == 0):
-        row = float(r0) + middle
-        column = float(c0) + middle
-        # apart from each other, as handing over the whole scene costs more than the floor does
-        s = Surface()
-        if key == wp.int64(0):
-            s = ground(lighting, view, row, column)
-        else:
-            s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-        total = radiance(s, view, lighting, lamp, above, patch, looks)
-        out_depth[i, j] = wp.where(s.segment == NOTHING or s.depth > far, far, s.depth)
-        out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
-    else:
+    first = patch % patch_columns * PATCH_SIDE
+    for j in range(first, wp.min(first + PATCH_SIDE, out_color.shape[1])):
+        r0 = i * supersample
+        c0 = j * supersample
+        key = buffer[r0, c0]
+        same = bool(True)
         for r in range(supersample):
             for c in range(supersample):
-                key = buffer[r0 + r, c0 + c]
-                row = float(r0 + r)
-                column = float(c0 + c)
-                s = Surface()
-                if key == wp.int64(0):
-                    s = ground(lighting, view, row, column)
-                else:
-                    s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-                total += radiance(s, view, lighting, lamp, above, patch, looks)
-        total = total / float(supersample * supersample)
-    out_color[i, j] = wp.vec3ub(
-        wp.uint8(wp.sqrt(wp.min(total[0], 1.0)) * 255.0 + 0.5),
-        wp.uint8(wp.sqrt(wp.min(total[1], 1.0)) * 255.0 + 0.5),
-        wp.uint8(wp.sqrt(wp.min(total[2], 1.0)) * 255.0 + 0.5),
-    )
+                if primitive_of(buffer[r0 + r, c0 + c]) != primitive_of(key):
+                    same = False
+        middle = 0.5 * float(supersample - 1)
+        total = wp.vec3(0.0, 0.0, 0.0)
+        if same and (key != wp.int64(0) or supersample == 1 or lighting.table == 0):
+            row = float(r0) + middle
+            column = float(c0) + middle
+            # apart from each other, as handing over the whole scene costs more than the floor does
+            s = Surface()
+            if key == wp.int64(0):
+                s = ground(lighting, view, row, column)
+            else:
+                s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
+            total = radiance(s, view, lighting, lamp, above, patch, looks)
+            out_depth[i, j] = wp.where(s.segment == NOTHING or s.depth > far, far, s.depth)
+            out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
+        else:
+            for r in range(supersample):
+                for c in range(supersample):
+                    key = buffer[r0 + r, c0 + c]
+                    row = float(r0 + r)
+                    column = float(c0 + c)
+                    s = Surface()
+                    if key == wp.int64(0):
+                        s = ground(lighting, view, row, column)
+                    else:
+                        s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
+                    total += radiance(s, view, lighting, lamp, above, patch, looks)
+            total = total / float(supersample * supersample)
+        out_color[i, j] = wp.vec3ub(
+            wp.uint8(wp.sqrt(wp.min(total[0], 1.0)) * 255.0 + 0.5),
+            wp.uint8(wp.sqrt(wp.min(total[1], 1.0)) * 255.0 + 0.5),
+            wp.uint8(wp.sqrt(wp.min(total[2], 1.0)) * 255.0 + 0.5),
+        )

@@ -57,9 +57,7 @@ def mark_changes(
         mark(windows[i], side, tiles)
     window = wp.vec4i(0, -1, 0, -1)
     if i < spheres:
-        window = triangle_window(
-            scene.points, scene.triangles, scene.triangle_closed[i], view, i
-        )
+        window = triangle_window(scene.points, scene.triangles, scene.triangle_closed[i], view, i)
     elif i < links:
         s = i - spheres
         centre = scene.points[scene.sphere_particle[s]]
