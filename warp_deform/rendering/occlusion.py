@@ -17,11 +17,13 @@ from .pinhole import View, inverse_depth, ray, to_camera, view_of
 from .zbuffer import ZBuffer
 
 __all__ = ["OccluderBuffer", "Occluders", "above_sample", "lamp_sample", "lit_share", "open_share",
-           "tap_reach"]  # fmt: skip
+           "shadow_limit", "tap_reach"]  # fmt: skip
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 TILE = wp.constant(16)  # samples along a side
+CELL = wp.constant(4)  # the same of the squares in which changes are told apart
+MOST = wp.constant(0x7FFFFFFF)
 SOFT = wp.constant(3)  # half width of the shadow's filter in samples
 NOWHERE = wp.constant(-1.0e6)  # height of the highest thing where there is nothing [m]
 # A point starts this far off its surface [m], so that no surface hides itself.
@@ -37,7 +39,12 @@ class Occluders:
     keys: wp.array2d(dtype=wp.int64)
     tops: wp.array2d(dtype=float)  # highest world z in each tile [m]
     tops_near: wp.array2d(dtype=float)  # the same over a tile and its eight neighbours
-    changed_near: wp.array2d(dtype=int)  # 1 where one of these nine changed
+    lowest_top: wp.array2d(dtype=float)  # the lower of that and of what it was before
+    highest_top: wp.array2d(dtype=float)  # the higher
+    # bits of the least and the greatest inverse depth that a sample of each cell changed from or
+    # to; the greatest is -1 where none changed
+    least: wp.array2d(dtype=int)
+    greatest: wp.array2d(dtype=int)
 
 
 @wp.kernel
@@ -63,22 +70,49 @@ def find_tops(
 
 
 @wp.kernel
-def spread_tops(
+def find_changes(
+    everything: int,
     tiles: wp.array2d(dtype=int),
+    before: wp.array2d(dtype=wp.int64),
+    keys: wp.array2d(dtype=wp.int64),
+    least: wp.array2d(dtype=int),
+    greatest: wp.array2d(dtype=int),
+):
+    """One thread a cell: between which inverse depths its samples changed."""
+    i, j = wp.tid()
+    low = int(MOST)
+    high = int(-1)
+    if everything == 1:
+        low = 0
+        high = MOST
+    elif tiles[i * CELL / TILE, j * CELL / TILE] != 0:
+        for r in range(i * CELL, (i + 1) * CELL):
+            for c in range(j * CELL, (j + 1) * CELL):
+                old = int(before[r, c] >> wp.int64(32))
+                new = int(keys[r, c] >> wp.int64(32))
+                if old != new:
+                    low = wp.min(low, wp.min(old, new))
+                    high = wp.max(high, wp.max(old, new))
+    least[i, j] = low
+    greatest[i, j] = high
+
+
+@wp.kernel
+def spread_tops(
     tops: wp.array2d(dtype=float),
     tops_near: wp.array2d(dtype=float),
-    changed_near: wp.array2d(dtype=int),
+    lowest_top: wp.array2d(dtype=float),
+    highest_top: wp.array2d(dtype=float),
 ):
-    """One thread a tile: the highest point of it and its neighbours, and whether one changed."""
+    """One thread a tile: the highest point of it and its neighbours, now and as it was."""
     i, j = wp.tid()
     top = float(NOWHERE)
-    changed = int(0)
     for r in range(wp.max(i - 1, 0), wp.min(i + 2, tops.shape[0])):
         for c in range(wp.max(j - 1, 0), wp.min(j + 2, tops.shape[1])):
             top = wp.max(top, tops[r, c])
-            changed = changed | tiles[r, c]
+    lowest_top[i, j] = wp.min(top, tops_near[i, j])
+    highest_top[i, j] = wp.max(top, tops_near[i, j])
     tops_near[i, j] = top
-    changed_near[i, j] = changed
 
 
 class OccluderBuffer:
@@ -89,23 +123,32 @@ class OccluderBuffer:
 
     def __init__(self, camera: Camera, *, links: bool, device: wp.Device) -> None:
         self._device = device
-        self._buffer = ZBuffer(view_of(camera), side=TILE, links=links, device=device)
+        self._buffer = ZBuffer(
+            view_of(camera), side=TILE, links=links, remember=True, device=device
+        )
         tiles = self._buffer.shape
         self.seen = Occluders()
         self.seen.view, self.seen.keys = self._buffer.view, self._buffer.keys
         self.seen.tops = wp.full(tiles, NOWHERE, dtype=float, device=device)
         self.seen.tops_near = wp.full(tiles, NOWHERE, dtype=float, device=device)
-        self.seen.changed_near = wp.zeros(tiles, dtype=int, device=device)
+        self.seen.lowest_top = wp.full(tiles, NOWHERE, dtype=float, device=device)
+        self.seen.highest_top = wp.full(tiles, NOWHERE, dtype=float, device=device)
+        cells = tuple(TILE // CELL * count for count in tiles)
+        self.seen.least = wp.zeros(cells, dtype=int, device=device)
+        self.seen.greatest = wp.zeros(cells, dtype=int, device=device)
 
     def draw(self, geometry: Geometry) -> None:
         """Bring it up to date."""
         self._buffer.draw(geometry)
         seen, tiles = self.seen, self._buffer.tiles
-        for kernel, inputs in (
-            (find_tops, [seen.view, tiles, seen.keys, seen.tops]),
-            (spread_tops, [tiles, seen.tops, seen.tops_near, seen.changed_near]),
+        changes = [int(self._buffer.everything), tiles, self._buffer.before, seen.keys]
+        tops = [seen.tops, seen.tops_near, seen.lowest_top, seen.highest_top]
+        for kernel, shape, inputs in (
+            (find_changes, seen.least.shape, [*changes, seen.least, seen.greatest]),
+            (find_tops, tiles.shape, [seen.view, tiles, seen.keys, seen.tops]),
+            (spread_tops, tiles.shape, tops),
         ):
-            wp.launch(kernel, tiles.shape, inputs=inputs, device=self._device)
+            wp.launch(kernel, shape, inputs=inputs, device=self._device)
 
 
 @wp.func
@@ -128,6 +171,12 @@ def lamp_sample(view: View, p: wp.vec3, n: wp.vec3):
 
 
 @wp.func
+def shadow_limit(at: wp.vec3):
+    """Bits of the inverse depth from which on a sample hides the point of a `lamp_sample`."""
+    return wp.cast(1.0 / (at[2] - SLACK), wp.int32)
+
+
+@wp.func
 def lit_share(
     keys: wp.array2d(dtype=wp.int64),
     tops_near: wp.array2d(dtype=float),
@@ -147,7 +196,7 @@ def lit_share(
     r = int(y)
     if tops_near[r / TILE, c / TILE] < p[2] + n[2] * OFFSET:
         return 1.0
-    limit = wp.int64(wp.cast(1.0 / (at[2] - SLACK), wp.int32)) << wp.int64(32)
+    limit = wp.int64(shadow_limit(at)) << wp.int64(32)
     # most points are wholly lit or wholly dark: ask the filter's corners and centre first
     hidden = int(0)
     for i in range(-1, 2):

@@ -13,8 +13,17 @@ import warp as wp
 from ..objects.colors import TABLE, Color
 from .drawables import WORKSPACE_SEGMENT
 from .geometry import MESH_MATERIAL, Scene
-from .occlusion import Occluders, above_sample, lamp_sample, lit_share, open_share, tap_reach
-from .patches import PATCH, note_look
+from .occlusion import (
+    OFFSET,
+    SLACK,
+    Occluders,
+    above_sample,
+    lamp_sample,
+    lit_share,
+    open_share,
+    tap_reach,
+)
+from .patches import PATCH, note_above, note_lamp
 from .pinhole import View, inverse_depth, primitive_of, ray, to_camera
 from .pixels import BOUNDS
 
@@ -272,7 +281,7 @@ def radiance(
     if cosine > 0.0:
         at = lamp_sample(lamp.view, s.position, s.normal)
         seen = lit_share(lamp.keys, lamp.tops_near, at, s.position, s.normal)
-        note_look(at, 0.0, patch, 0, looks)
+        note_lamp(at, s.position[2] + s.normal[2] * OFFSET, patch, looks)
         direct = lighting.direct * cosine * seen
         if s.gloss > 0.0:
             half = wp.normalize(to_lamp + wp.normalize(view.origin - s.position))
@@ -287,7 +296,8 @@ def radiance(
     if lighting.occlusion > 0.0:
         around = above_sample(above.view, s.position, s.normal)
         closed = 1.0 - open_share(above.view, above.keys, above.tops_near, around, s.position)
-        note_look(around, 2.0 * tap_reach(above.view, around[2]), patch, 4, looks)
+        reach = 2.0 * tap_reach(above.view, around[2])
+        note_above(around, reach, s.position[2] + SLACK, patch, looks)
         ambient = ambient * wp.max(1.0 - lighting.occlusion * closed, 0.0)
     color = s.color * (direct + ambient) + wp.vec3(highlight, highlight, highlight)
     if s.segment == 0 and lighting.haze > 0.0:
