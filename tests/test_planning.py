@@ -113,11 +113,11 @@ def test_drawing_around_the_best_finds_better_than_the_candidates_alone(started)
 
 
 def test_the_planner_needs_fewer_actions_than_the_scripted_demonstrator():
-    worlds = Worlds(task(LINE), 4)
+    worlds = Worlds(task(LINE), 8)
     counts = {
         name: [
             len(run.actions)
-            for _, run in play(worlds, range(4), act=demonstrator(name), look=lambda *_: None)
+            for _, run in play(worlds, range(8), act=demonstrator(name), look=lambda *_: None)
         ]
         for name in ("scripted", "planner")
     }
