@@ -50,19 +50,10 @@ from warp_deform.worlds import Worlds
 WARM_UP = 999_000  # seed
 ORDER = ("scripted", "visible", "mpc")
 PAPER: dict[str, tuple[float | None, float]] = {
-    "cable-ring": (99.1, 6.56),
-    "cable-ring-notarget": (99.3, 6.49),
-    "cable-shape": (98.8, 6.86),
-    "cable-shape-notarget": (99.1, 6.94),
-    "cable-line-notarget": (100.0, 5.55),
-    "fabric-cover": (97.0, 2.00),
-    "fabric-flat": (98.3, 3.10),
-    "fabric-flat-notarget": (97.4, 3.12),
-    "bag-alone-open": (60.2, 5.63),
-    "bag-items-1": (41.7, 2.84),
-    "bag-items-2": (32.5, 4.07),
-    "bag-color-goal": (89.1, 2.60),
-    "block-notarget": (None, 1.00),
+    row["task"]: (row["paper_success"], row["paper_actions"])
+    for row in map(
+        json.loads, Path(__file__).with_name("paper_demonstrators.jsonl").read_text().splitlines()
+    )
 }
 """Success [%] of the original's demonstrator, and mean actions of the demonstrations kept.
 

@@ -1,96 +1,99 @@
-"""Measured numbers in the README and in docs, and the command or file that each comes from.
+"""Measured numbers in the README and in docs, and the file or command that each comes from.
 
-    python benchmarks/documented_numbers.py            what has no source, page by page
-    python benchmarks/documented_numbers.py --write    take that as the list of what is allowed to
+    python benchmarks/documented_numbers.py            how many are compared, why others are not
+    python benchmarks/documented_numbers.py --values   the same, and what each is compared with
+    python benchmarks/documented_numbers.py --write    list what has no source as allowed
 
-A measurement is a number with a unit of time, a percentage, a ratio ("3 times"), a count ("7 of
-20", "7 / 20"), or a value with what it is uncertain by ("90.3 ± 2.6", "63.0 (53.2 to 71.8)"). Its
-source is named in its section (between two headings): a file of this repository, which has to be
-there, or a command `warp-deform bench` or `gradcheck`. Files of results are named in a comment
-that no reader sees, which speaks for its paragraph, or, standing by itself, for those paragraphs
-of its section that have none of their own. One of its files has to hold each measurement:
+A measurement is a number, or several, with a unit of time, a percentage, a ratio ("3 times"), a
+count ("7 of 20", "7 / 20"), or a value with what it is uncertain by ("90.3 ± 2.6", "63.0 (53.2 to
+71.8)"). Comments that no reader sees say what its numbers are compared with, one expression a
+number, in the order in which they are printed (`documented_values.py` says what may stand there):
 
-    <!-- from: benchmarks/results/learning/report.csv[task=cable-shape] FILE -->
+    <!-- from: FILE[ROWS] EXPRESSION EXPRESSION FILE[ROWS] EXPRESSION -setting -->
 
-Brackets choose rows (`task=a|b,demos=100`); objects in a JSON file count as rows too. The parts
-of a count, or of a value and its uncertainty, have to stand in one row, or come from the chosen
-rows together: their number, how many have a value in common, and the mean (± 1.96 standard
-errors), median, least and greatest of a column. A Python file is a command: it has to be there.
+behind a paragraph or list, and before a table, by column, for each of its rows:
 
-`documented_numbers.txt` beside this file lists what has no source yet. It may only shrink.
+    <!-- table: FILE[task=$1] 2: successes attempts 4: 100*share | 100*share 100*error -->
+
+Behind a bar stands what a cell with another number of numbers is compared with. Of a mapped column
+every number is compared, measurement or not, and cells without one are passed over. A number is as
+the file has it if rounding to the printed digits gives it. In place of an expression, a word says
+why there is none: `-setting` (chosen, not measured), `-paper` (published), `-test` (held by a test
+that the section names), `-command` (the command that the section names prints it, and no file keeps
+it). So are all measurements of paragraphs and tables without a comment, if their section names a
+command; `documented_numbers.txt` beside this file lists those whose section does not.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import json
 import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from statistics import mean, median, stdev
-from typing import Any
+from textwrap import shorten
 
-ROOT = Path(__file__).resolve().parent.parent
+from documented_values import ROOT, chosen, evaluate, files_of, is_source
+
 ALLOWED = Path(__file__).with_suffix(".txt")
+WHY = {
+    "setting": "chosen, not measured",
+    "paper": "published by the paper",
+    "test": "held by a test that its section names",
+    "command": "printed by a command that its section names, and kept in no file",
+    "bare": "no source",
+}
 
-_NUMBER = r"(?<![\w.,/`-])\d[\d,]*(?:\.\d+)?"
+_NUMBER = r"(?<![\w.,/^-])(?<!\bx\s)[-+]?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?"
+_LIST = rf"{_NUMBER}(?:(?:, | to | and | or ){_NUMBER})*"
 _UNIT = r"CPU s\b|CPU seconds|CPU minutes|CPU hours|CPU-hours|ms\b|us\b|minutes\b|hours\b|%|times\b"
-_TOTAL = r"\d+(?:,\d{3})*\b(?![.]\d)"
-_PLAIN = r"\d+(?:\.\d+)?"
-_CLAIMS = (
-    re.compile(rf"({_NUMBER})(?: (?:to|and|or) ({_NUMBER}))? ?({_UNIT})"),
-    re.compile(rf"({_NUMBER})(?: (?:to|and|or) ({_NUMBER}))? (of (?:the )?{_TOTAL})"),
-    re.compile(rf"({_NUMBER})() (/ \d{{2,}}\b)"),
-    re.compile(rf"({_NUMBER})() (± {_PLAIN})"),
-    re.compile(rf"({_NUMBER})() (\({_PLAIN} to {_PLAIN}\))"),
-)
+_TOTAL = r"\d+(?:,\d{3})*\b(?!\.\d| ?%| x )"
+_MEASUREMENT = re.compile(
+    rf"{_NUMBER} ± [\d.]+|{_NUMBER} \([\d.]+ to [\d.]+\)|{_NUMBER} -> {_NUMBER}"
+    rf"|{_NUMBER} / \d{{2,}}\b|{_LIST} of (?:the )?{_TOTAL}|{_LIST} ?(?:{_UNIT})"
+    .replace(" ", r"\s+").replace(r"\s+?", r"\s?")
+)  # fmt: skip
+_PRINTED = re.compile(r"(?<![\w.])(?:(?<![\w)])[-+])?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?")
 _FILE = re.compile(r"(?:benchmarks|tests|examples|learning|hardware|warp_deform)/[\w/.-]*\w")
 _PLACEHOLDER = re.compile(r"\b[A-Z]{2,}\b")
 _COMMAND = re.compile(r"warp-deform (?:bench|gradcheck)\b|make (?:demo|test|bench)\b")
-_FROM = re.compile(r"<!-- from: (.+?) -->")
-_SOURCE = re.compile(r"(?P<file>[^\[\]]+)(?:\[(?P<chosen>[^\]]+)\])?")
-_CODE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
-_CONFIDENCE = re.compile(r"95 % (?:Wilson|interval|confidence)|95 %\s*\|")
-_NORMAL = 1.96
-"""Standard errors of an interval of 95 %."""
-
-Row = dict[str, Any]
+_COMMENT = re.compile(r"<!--\s*(?:(from|table):)?(.+?)-->", re.DOTALL)
+_UNSEEN = re.compile(r"<!--.*?-->|^```.*?^```", re.MULTILINE | re.DOTALL)
+_QUOTED = re.compile(r"`[^`]+`|\]\([^)]+\)|95\s%\s*(?:Wilson|interval|confidence|\Z)")
 
 
 @dataclass(frozen=True)
-class Claim:
-    """A measurement: the page, the numbers as they are printed, the unit, and the paragraph."""
+class Figure:
+    """A measurement of a page, or a number in a mapped column.
+
+    Attributes:
+        numbers: offset in the page and text of each that is compared, or of all if none is
+        kind: `compared`, or a key of `WHY`
+        unit: whether it is a measurement by its form
+        values: what the file says of each
+    """
 
     page: str
-    numbers: tuple[str, ...]
-    unit: str
-    paragraph: str
+    text: str
+    numbers: tuple[tuple[int, str], ...]
+    kind: str
+    unit: bool
+    values: tuple[float, ...] = ()
 
     def __str__(self) -> str:
-        return f"{self.page}: {' to '.join(self.numbers)} {self.unit}"
+        return f"{self.page}: {shorten(self.text, 90)}"
 
-    @property
-    def scales(self) -> tuple[float, ...]:
-        """What values in files are multiplied by: shares, and seconds, may stand for the unit."""
-        if self.unit.startswith(("%", "±", "(")):
-            return (1.0, 100.0)
-        if self.unit == "ms":
-            return (1.0, 1e3)
-        if self.unit == "us":
-            return (1.0, 1e6)
-        if "minutes" in self.unit:
-            return (1.0, 1 / 60)
-        return (1.0, 1 / 3600) if "hours" in self.unit else (1.0,)
 
-    @property
-    def groups(self) -> list[tuple[str, ...]]:
-        """Numbers that have to stand in one row together."""
-        rest = tuple(re.findall(_TOTAL if self.unit[0] in "o/" else _PLAIN, self.unit))
-        return [(number, *rest) for number in self.numbers]
+@dataclass(frozen=True)
+class _Block:
+    """A paragraph or a table: its offset and text, and what its section names."""
+
+    start: int
+    text: str
+    table: bool
+    named: bool
+    comments: tuple[str, ...]
 
 
 def pages() -> list[Path]:
@@ -98,176 +101,242 @@ def pages() -> list[Path]:
     return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def sections(text: str) -> list[str]:
-    """The text between two headings, without programs."""
-    return re.split(r"^#+ .*$", _CODE.sub("", text), flags=re.MULTILINE)
+def examine(page: str, text: str) -> tuple[list[Figure], list[str]]:
+    """Measurements of a page, and what is wrong with them or their sources."""
+    figures: list[Figure] = []
+    wrong: list[str] = []
+    for block in _blocks(page, text, wrong):
+        figures += (_of_table if block.table else _of_text)(page, block, wrong)
+    return figures, list(dict.fromkeys(wrong))
 
 
-def paragraphs(section: str) -> list[str]:
-    """Paragraphs, each on one line; what names the section's sources is added to those without."""
-    every = [" ".join(each.split()) for each in re.split(r"\n\s*\n", section)]
-    whole = [each for each in every if _FROM.search(each) and not _FROM.sub("", each).strip()]
+def numbers_in(text: str) -> list[re.Match[str]]:
+    """Measurements of a text."""
+    return list(_MEASUREMENT.finditer(_QUOTED.sub(_spaces, text)))
+
+
+def _spaces(match: re.Match[str]) -> str:
+    return re.sub(r"[^\n]", " ", match[0])
+
+
+def _blocks(page: str, text: str, wrong: list[str]) -> Iterator[_Block]:
+    """Paragraphs and tables; a comment is the last paragraph's, or the next table's."""
+    comments = [(m.start(), m[1], m[2]) for m in _COMMENT.finditer(text)]
+    wrong += [
+        f"{page}: a comment of another kind:{words}" for _, kind, words in comments if not kind
+    ]
+    seen = _UNSEEN.sub(_spaces, text)
+    heads = [m.span() for m in re.finditer(r"^#+ .*$", seen, re.MULTILINE)]
+    ends = [0, *(end for _, end in heads)]
+    taken = 0
+    for first, last in zip(ends, [*(start for start, _ in heads), len(text)], strict=True):
+        names = [name for name in _FILE.findall(seen[first:last]) if not _PLACEHOLDER.search(name)]
+        wrong += [f"{page} names {each}, which is not there"
+                  for each in names if not (ROOT / each).exists()]  # fmt: skip
+        parts = re.finditer(
+            r"(?:^[ ]*\|.*\n?)+|(?:^(?![ ]*\|).*\S.*\n?)+", seen[first:last], re.MULTILINE
+        )
+        spans = [(first + m.start(), m[0], m[0].lstrip().startswith("|")) for m in parts]
+        named = bool(names) or _COMMAND.search(seen[first:last]) is not None
+        for start, part, table in spans:
+            later = [s for s, _, is_table in spans if s > start and not is_table]
+            until = min(later, default=last)
+            earlier = [s for s, _, is_table in spans if s < start and is_table]
+            since = max(earlier, default=first)
+            mine = tuple(
+                words
+                for at, kind, words in comments
+                if (since <= at < start if table else start <= at < until)
+                and (kind == "table") == table
+            )
+            taken += len(mine)
+            yield _Block(start, part, table, named, mine)
+    if taken != len(comments):
+        wrong.append(f"{page}: {len(comments) - taken} comments belong to no paragraph or table")
+
+
+def _of_text(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
+    found = numbers_in(block.text)
+    printed = [_offsets(match[0], block.start + match.start()) for match in found]
+    unsaid = "command" if block.named else "bare"
+    if not block.comments:
+        return [
+            Figure(page, m[0], tuple(n), unsaid, True) for m, n in zip(found, printed, strict=True)
+        ]
+    tokens = " ".join(block.comments).split()
+    wanted = _wanted(tokens)
+    held = [number for numbers in printed for number in numbers]
+    if len(wanted) != len(held):
+        shown = " ".join(text for _, text in held)
+        wrong.append(f"{page}: {len(wanted)} expressions for {len(held)} numbers: {shown}")
+        return []
+    results = iter(
+        [_compare(page, each, number, (), wrong) for each, number in zip(wanted, held, strict=True)]
+    )
     return [
-        each if _FROM.search(each) else " ".join([each, *whole])
-        for each in every
-        if each not in whole
+        _figure(page, m[0], numbers, [next(results) for _ in numbers], True)
+        for m, numbers in zip(found, printed, strict=True)
     ]
 
 
-def claims(page: str, section: str) -> list[Claim]:
-    """Measurements of a section."""
+def _of_table(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
+    figures = []
+    specs = [_columns(words) for words in block.comments]
+    at = block.start
+    for line in block.text.splitlines(keepends=True):
+        start, at = at, at + len(line)
+        spans = [m.span(1) for m in re.finditer(r"(?<=\|)([^|\n]*)(?=\|)", line)]
+        cells = [line[a:b].strip() for a, b in spans]
+        head = start == block.start and re.match(r".*\n[\s|:-]+\n", block.text)
+        mine = [spec for spec in specs if not head and _applies(page, spec, cells, wrong)]
+        if len(mine) > 1 or (specs and not head and not mine and numbers_in(line)):
+            wrong.append(f"{page}: {len(mine)} comments are for the row {cells[0]}, {cells[1]}")
+        for column, (a, b) in enumerate(spans, 1):
+            cell, inside = line[a:b], numbers_in(line[a:b])
+            alternatives = mine[0][1].get(column) if mine else None
+            if alternatives is None:
+                kind = "command" if block.named else "bare"
+                figures += [
+                    Figure(page, m[0], tuple(_offsets(m[0], start + a + m.start())), kind, True)
+                    for m in inside
+                ]
+                continue
+            numbers = _offsets(cell, start + a)
+            if not numbers:
+                continue
+            wanted = next((each for each in alternatives if len(each) == len(numbers)), None)
+            if wanted is None and len(alternatives) == 1 and len(alternatives[0]) > len(numbers):
+                wanted = alternatives[0][: len(numbers)]
+            if wanted is None:
+                wrong.append(f"{page}: {len(numbers)} numbers in {cell.strip()}")
+                continue
+            results = [_compare(page, each, number, cells, wrong)
+                       for each, number in zip(wanted, numbers, strict=True)]  # fmt: skip
+            figures.append(_figure(page, cell.strip(), numbers, results, bool(inside)))
+    return figures
+
+
+_Wanted = tuple[str, str]
+"""A source and an expression, or "" and why there is none."""
+
+
+def _wanted(tokens: list[str], source: str = "") -> list[_Wanted]:
     found = []
-    for paragraph in paragraphs(section):
-        text = _CONFIDENCE.sub("", paragraph)
-        bare = _FROM.sub("", text)
-        for form in _CLAIMS:
-            for match in form.finditer(bare):
-                numbers = tuple(each for each in match.groups()[:2] if each)
-                found.append(Claim(page, numbers, match[3], text))
+    for token in tokens:
+        if is_source(token):
+            source = token
+        else:
+            found.append(("", token[1:]) if token[1:] in WHY else (source, token))
     return found
 
 
-def _objects(value: Any) -> Iterator[Row]:
-    if isinstance(value, dict):
-        yield value
-        value = list(value.values())
-    if isinstance(value, list):
-        for each in value:
-            yield from _objects(each)
-
-
-def _cell(text: str) -> Any:
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-@cache
-def rows(file: Path) -> list[Row]:
-    """The rows of CSV or JSON lines, or all objects of a JSON file."""
-    if file.suffix == ".csv":
-        with file.open(newline="") as lines:
-            return [{k: _cell(v) for k, v in row.items()} for row in csv.DictReader(lines)]
-    if file.suffix == ".jsonl":
-        return [json.loads(line) for line in file.read_text().splitlines() if line]
-    return list(_objects(json.loads(file.read_text())))
-
-
-def _numbers(row: Row) -> set[float]:
-    """Numbers of a row and of its lists; half of an interval, and the failed episodes."""
-    held = set()
-    for name, value in row.items():
-        for each in value if isinstance(value, list) else [value]:
-            if isinstance(each, (int, float)) and not isinstance(each, bool):
-                held.add(float(each))
-                if name.endswith("error"):
-                    held.add(_NORMAL * each)
-    if "n_episodes" in row and "n_success" in row:
-        held.add(float(row["n_episodes"] - row["n_success"]))
-    return held
-
-
-def _together(chosen: list[Row]) -> Iterator[set[float]]:
-    """What rows say together: columns' means, medians, extremes; how many share a value."""
-    for name in sorted({name for row in chosen for name in row}):
-        values = [row.get(name) for row in chosen]
-        flags = [each for each in values if isinstance(each, (str, bool)) or each in (0, 1)]
-        for count in Counter(map(str, flags)).values():
-            yield {float(count), float(len(chosen))}
-        column = [each for each in values if isinstance(each, (int, float))]
-        if column:
-            error = stdev(column) / len(column) ** 0.5 if len(column) > 1 else 0.0
-            yield {float(f(column)) for f in (mean, median, min, max)} | {_NORMAL * error}
-
-
-def holds(source: str, claim: Claim) -> list[str]:
-    """The claim's numbers that a source (a file, perhaps with rows chosen) does not hold.
-
-    Raises:
-        ValueError: The source chooses rows that are not there.
-    """
-    match = _SOURCE.fullmatch(source)
-    assert match is not None
-    chosen = rows(ROOT / match["file"])
-    for condition in (match["chosen"] or "").split(",") if match["chosen"] else []:
-        name, _, wanted = condition.partition("=")
-        values = [_cell(each) for each in wanted.split("|")]
-        chosen = [row for row in chosen if name in row and row[name] in values]
-    if not chosen:
-        raise ValueError(f"{source} chooses no rows")
-    sets = [_numbers(row) for row in chosen] + list(_together(chosen))
-    return [
-        " with ".join(group)
-        for group in claim.groups
-        if not any(
-            all(
-                any(_prints(value * scale, number) for value in values for scale in claim.scales)
-                for number in group
-            )
-            for values in sets
-        )
-    ]
-
-
-def _prints(value: float, number: str) -> bool:
-    """Whether a value is printed as this number; half a last digit may go either way."""
-    digits, wanted = len(number.partition(".")[2]), float(number.replace(",", ""))
-    return abs(value - wanted) <= 0.5 * 10.0**-digits * (1 + 1e-6)
-
-
-def _wrong(claim: Claim) -> Iterator[str]:
-    """What is wrong with the sources that the claim's paragraph names in comments."""
-    missing: list[list[str]] = []
-    sources = [each for names in _FROM.findall(claim.paragraph) for each in names.split()]
-    for source in sources:
-        file = source.partition("[")[0]
-        if not (ROOT / file).is_file():
-            yield f"{claim.page} names {file}, which is not there"
-        elif file.endswith(".py"):
-            missing.append([])
+def _columns(words: str) -> tuple[str, dict[int, list[list[_Wanted]]]]:
+    """The first source of a table's comment, and for each column what its cells may be."""
+    tokens = words.split()
+    first = tokens[0] if is_source(tokens[0]) else ""
+    columns: dict[int, list[list[_Wanted]]] = {}
+    source, column = "", 0
+    for token in tokens:
+        if is_source(token):
+            source = token
+        elif re.fullmatch(r"\d+:", token):
+            column = int(token[:-1])
+            columns[column] = [[]]
+        elif token == "|":
+            columns[column].append([])
         else:
-            try:
-                missing.append(holds(source, claim))
-            except ValueError as error:
-                yield f"{claim.page}: {error}"
-    if missing and (nowhere := set.intersection(*map(set, missing))):
-        yield f"{claim}: {' '.join(sources)} does not hold {', '.join(sorted(nowhere))}"
+            columns[column][-1] += _wanted([token], source)
+    return first, columns
 
 
-def examine(page: str, text: str) -> tuple[list[Claim], list[str]]:
-    """Measurements of a page without a source; and what is wrong with the sources it names."""
-    bare, wrong = [], []
-    for section in sections(text):
-        seen = _FROM.sub("", section)
-        named = [name for name in _FILE.findall(seen) if not _PLACEHOLDER.search(name)]
-        found = claims(page, section)
-        if found and not named and not _COMMAND.search(section):
-            bare += [claim for claim in found if not _FROM.search(claim.paragraph)]
-        wrong += [
-            f"{page} names {name}, which is not there"
-            for name in dict.fromkeys(named)
-            if not (ROOT / name).exists()
-        ]
-        for claim in found:
-            wrong += _wrong(claim)
-    return bare, list(dict.fromkeys(wrong))
+def _applies(
+    page: str, spec: tuple[str, dict[int, list[list[_Wanted]]]], cells: list[str], wrong: list[str]
+) -> bool:
+    source = spec[0]
+    if not source:
+        return True
+    if not _there(page, source, wrong):
+        return False
+    return bool(chosen(source, cells))
+
+
+def _there(page: str, source: str, wrong: list[str]) -> bool:
+    missing = [each for each in files_of(source) if not (ROOT / each).is_file()]
+    wrong += [f"{page} names {each}, which is not there" for each in missing]
+    return not missing
+
+
+def _offsets(text: str, at: int) -> list[tuple[int, str]]:
+    return [(at + m.start(), m[0]) for m in _PRINTED.finditer(text)]
+
+
+def _compare(
+    page: str, wanted: _Wanted, number: tuple[int, str], cells: tuple[str, ...] | list[str],
+    wrong: list[str],
+) -> float | str:  # fmt: skip
+    """What the file says of a number, or why no file does."""
+    source, expression = wanted
+    if not source:
+        if expression not in WHY:
+            wrong.append(f"{page}: {expression} of no file")
+            return "bare"
+        return expression
+    if not _there(page, source, wrong):
+        return "bare"
+    of = chosen(source, cells)
+    try:
+        if not of:
+            raise ValueError("no such rows")
+        value = evaluate(expression, of)
+    except ValueError as error:
+        wrong.append(f"{page}: {number[1]}: {source}: {error}")
+        return "bare"
+    if not prints(value, number[1]):
+        wrong.append(f"{page}: {number[1]}: {source} has {value:.6g} for {expression}")
+    return value
+
+
+def _figure(
+    page: str, text: str, numbers: list[tuple[int, str]], results: list[float | str], unit: bool
+) -> Figure:
+    why = [each for each in results if isinstance(each, str)]
+    held = [(n, v) for n, v in zip(numbers, results, strict=True) if not isinstance(v, str)]
+    if not held or not set(why) <= {"setting", "paper"}:
+        return Figure(page, text, tuple(numbers), why[0], unit)
+    return Figure(page, text, tuple(n for n, _ in held), "compared", unit, tuple(v for _, v in held))
+
+
+def prints(value: float, number: str) -> bool:
+    """Whether a value is printed as this number; half a last digit may go either way."""
+    mantissa, _, power = number.replace(",", "").partition("e")
+    last = 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
+    return abs(value - float(number.replace(",", ""))) <= 0.5 * last * (1 + 1e-6)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--write", action="store_true", help="write the list of what has no source")
+    parser.add_argument("--values", action="store_true", help="what each is compared with")
     options = parser.parse_args()
-    lines = []
+    every: list[Figure] = []
     for path in pages():
-        bare, wrong = examine(str(path.relative_to(ROOT)), path.read_text())
-        lines += [str(claim) for claim in bare]
+        figures, wrong = examine(str(path.relative_to(ROOT)), path.read_text())
+        every += figures
         for line in wrong:
             print("wrong:", line)
-    lines = sorted(set(lines))
-    print("\n".join(lines))
+    for figure in every:
+        if figure.kind != "compared":
+            print(f"{figure} ({WHY[figure.kind]})")
+        elif options.values:
+            print(f"{figure} = {' '.join(f'{each:.6g}' for each in figure.values)}")
+    measured = [figure for figure in every if figure.unit]
+    for kind, count in Counter(figure.kind for figure in measured).most_common():
+        print(f"{count} of {len(measured)} measurements: {WHY.get(kind, 'compared with a file')}")
+    cells = sum(len(f.numbers) for f in every if f.kind == "compared" and not f.unit)
+    print(f"{cells} further numbers of tables: compared with a file")
     if options.write:
-        ALLOWED.write_text("".join(f"{line}\n" for line in lines))
+        bare = sorted({str(figure) for figure in every if figure.kind == "bare"})
+        ALLOWED.write_text("".join(f"{line}\n" for line in bare))
 
 
 if __name__ == "__main__":
