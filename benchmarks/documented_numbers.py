@@ -303,7 +303,9 @@ def _figure(
     held = [(n, v) for n, v in zip(numbers, results, strict=True) if not isinstance(v, str)]
     if not held or not set(why) <= {"setting", "paper"}:
         return Figure(page, text, tuple(numbers), why[0], unit)
-    return Figure(page, text, tuple(n for n, _ in held), "compared", unit, tuple(v for _, v in held))
+    return Figure(
+        page, text, tuple(n for n, _ in held), "compared", unit, tuple(v for _, v in held)
+    )
 
 
 def prints(value: float, number: str) -> bool:

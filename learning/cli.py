@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from warp_deform.cli import CommandOptions, Outcome
-from warp_deform.errors import InputError
+from warp_deform.errors import InputError, Interrupted
+from warp_deform.flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
 from warp_deform.quiet import quiet_warp
 from warp_deform.robots import RobotName
 from warp_deform.tasks.registry import task as find_task
@@ -36,21 +37,21 @@ class TrainOptions(CommandOptions):
     simulator's state."""
     data: Annotated[Path, arg(metavar="DIR")]
     """Folder of demonstrations, see `warp-deform demo`."""
-    demos: Annotated[int | None, arg(metavar="N")] = None
+    demos: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Demonstrations to learn from, drawn by --seed; when left out, all that are not held out."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """Of the initial weights, of what is drawn, and of which demonstrations are used."""
     preset: Literal["paper", "fast"] = "paper"
     """The paper's network and schedule, or one for two CPU cores."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder of the run."""
-    steps: Annotated[int | None, arg(metavar="N")] = None
+    steps: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Steps of training; the preset's when left out."""
-    batch: Annotated[int | None, arg(metavar="N")] = None
+    batch: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Moments a step; the preset's when left out."""
-    lr: Annotated[float | None, arg(metavar="LR")] = None
+    lr: Annotated[float | None, arg(metavar="LR"), FlagRange(1e-12, 1e3)] = None
     """Step size of Adam; the preset's when left out."""
-    snapshots: Annotated[int | None, arg(metavar="N")] = None
+    snapshots: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Snapshots, evenly spread; when left out, the preset's: of `paper` 10, of `fast` after 1/16,
     1/8, 1/4, 1/2 and all of the steps."""
     no_augment: bool = False
@@ -59,17 +60,17 @@ class TrainOptions(CommandOptions):
     """Compute by the original's operations, several times slower; see docs/learning.md."""
     bf16: bool = False
     """Convolve in bfloat16: quicker where the processor multiplies it natively."""
-    hold_out: Annotated[int, arg(metavar="N")] = 0
+    hold_out: Annotated[int, arg(metavar="N"), COUNT_OR_NONE] = 0
     """Further demonstrations, not learnt from: the snapshot of the lowest loss on them is taken."""
-    validate: Annotated[int | None, arg(metavar="N")] = None
+    validate: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
     """Validation episodes that every snapshot plays; training ends when one solves them all, and
     `eval` does not play them again. When left out, the preset's: 20 of `fast` (0 with --hold-out),
     0 of `paper`."""
-    patience: Annotated[int | None, arg(metavar="N")] = None
+    patience: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Also stop when so many snapshots in a row played no better; needs validation."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the network computes; under `torchrun`, each process takes one GPU."""
-    threads: Annotated[int, arg(metavar="N")] = 1
+    threads: Annotated[int, arg(metavar="N"), FlagRange(1, 4096)] = 1
     """Threads of torch."""
     untrained: bool = False
     """Also keep the untrained network, as the snapshot of step 0: learning curves begin there."""
@@ -80,8 +81,9 @@ class TrainOptions(CommandOptions):
 def train(options: TrainOptions) -> Outcome:
     """Train an agent."""
     find_task(options.task)
-    from .outcome_text import trained
+    from .outcome_text import interrupted, trained
     from .processes import rank
+    from .snapshots import RunFolder
     from .training import TrainConfig
     from .training import train as run_training
 
@@ -109,7 +111,11 @@ def train(options: TrainOptions) -> Outcome:
         tensorboard=options.tensorboard,
         untrained=options.untrained,
     )
-    report = asdict(run_training(config))
+    try:
+        report = asdict(run_training(config))
+    except KeyboardInterrupt:
+        step = RunFolder(options.out).read_state()[1]
+        raise Interrupted(interrupted(step)) from None
     if rank():
         raise SystemExit(0)  # under torchrun the first process speaks for all
     return Outcome(data=report, text=trained(report, out=options.out))
@@ -125,12 +131,12 @@ class EvalOptions(CommandOptions):
 
     run: _Folder
     """Folder of a training run."""
-    episodes: Annotated[int, arg(metavar="N")] = 200
+    episodes: Annotated[int, arg(metavar="N"), COUNT] = 200
     """Test episodes."""
-    first_seed: Annotated[int | None, arg(metavar="S")] = None
+    first_seed: Annotated[int | None, arg(metavar="S"), SEED] = None
     """Play test episodes of seeds S and up in place of 10,000 and up; their result is kept apart
     from that of the test seeds."""
-    validation_episodes: Annotated[int, arg(metavar="N")] = 20
+    validation_episodes: Annotated[int, arg(metavar="N"), COUNT] = 20
     """Validation episodes a snapshot, seeds 50,000 and up."""
     paper: bool = False
     """Also the paper's protocol: every snapshot plays 20 test episodes with demonstrated goals, and
@@ -145,13 +151,13 @@ class EvalOptions(CommandOptions):
     video: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder for an MP4 of each of the first test episodes: observation, goal, heat maps of pick
     and place, action, score."""
-    videos: Annotated[int, arg(metavar="N")] = 4
+    videos: Annotated[int, arg(metavar="N"), COUNT] = 4
     """Videos at most."""
     share: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to be made: a run's with the chosen snapshot alone, in half its bytes, to hand on."""
     robot: RobotName = "ur5"
     """The arm."""
-    workers: Annotated[int | None, arg(metavar="W")] = None
+    workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
     """Processes; left out, one per core, fewer for few episodes. The result is the same."""
 
 
@@ -161,10 +167,6 @@ def evaluate(options: EvalOptions) -> Outcome:
     from .report_run import evaluate_run
     from .share import share_run
 
-    if options.workers is not None and options.workers < 1:
-        raise InputError(f"--workers is {options.workers}; it must be 1 or more")
-    if options.videos < 1:
-        raise InputError(f"--videos is {options.videos}; it must be 1 or more")
     if options.share is not None and options.share.exists():
         raise InputError(f"--share {options.share} exists; name a folder to be made")
     quiet_warp()
@@ -221,7 +223,7 @@ class SweepOptions(CommandOptions):
 
     file: Annotated[Positional[Path], arg(metavar="FILE.toml")]
     """The grid; see docs/learning.md."""
-    workers: Annotated[int | None, arg(metavar="W")] = None
+    workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
     """Processes; left out, one per core, or the cluster's cores. Each trains with one thread."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
     """Address of a Ray cluster to work on (needs the extra `ray`)."""

@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg
 
 from warp_deform.cli import CommandOptions, Outcome
 from warp_deform.errors import InputError
+from warp_deform.flag_range import COUNT
 
 __all__ = ["ConvertOptions", "convert"]
 
@@ -31,7 +32,7 @@ class ConvertOptions(CommandOptions):
     nothing of theirs."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
     """With --from: our name of the task; left out, the folder's name tells it."""
-    workers: Annotated[int | None, arg(metavar="W")] = None
+    workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
     """With --from: processes; left out, one per core, fewer for few episodes."""
 
 

@@ -8,9 +8,16 @@ from typing import Any
 
 from warp_deform.progress import duration
 
-__all__ = ["evaluated", "trained"]
+__all__ = ["evaluated", "interrupted", "trained"]
 
 _LIFT = {"action": "the policy", "privileged": "the paper's rule, which reads the simulator"}
+
+
+def interrupted(step: int) -> str:
+    """What an interruption of `train` leaves, by the step of the state that is stored."""
+    if not step:
+        return "no step is kept yet, the same command begins again"
+    return f"steps up to {step} are kept, the same command goes on and ends with the same bits"
 
 
 def trained(report: Mapping[str, Any], *, out: Path) -> str:

@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg
 
 from warp_deform.cli import CommandOptions, Outcome
 from warp_deform.errors import InputError
+from warp_deform.flag_range import COUNT
 from warp_deform.quiet import quiet_warp
 
 __all__ = ["RefineOptions", "refine"]
@@ -28,7 +29,7 @@ class RefineOptions(CommandOptions):
     best (the cross-entropy method), or down the slope of the task's loss."""
     depth: Literal[1, 2] = 2
     """Actions to look ahead."""
-    budget: Annotated[int, arg(metavar="N")] = 64
+    budget: Annotated[int, arg(metavar="N"), COUNT] = 64
     """Simulated actions that the search for one action may spend."""
     accept: Literal["score", "solved"] = "score"
     """When an episode takes the place of the original: if it has no lower last score and no more
@@ -38,7 +39,7 @@ class RefineOptions(CommandOptions):
     way_points: bool = False
     """Bend the recorded actions' paths instead, by the gradient. No policy can act so: the folder
     then holds paths, no demonstrations."""
-    workers: Annotated[int | None, arg(metavar="W")] = None
+    workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
     """Processes; left out, one per core. The result is the same."""
 
 

@@ -11,7 +11,7 @@ import warp as wp
 from solver_scenes import new_builder
 
 from warp_deform.differentiable import DifferentiableRollout
-from warp_deform.errors import InputError
+from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.objects import BoxConfig, CableConfig, add_box, add_cable, cable_line
 from warp_deform.rollout import rollout
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
@@ -215,3 +215,17 @@ def test_a_constant_start_leaves_nothing_on_the_tape():
     with wp.Tape() as tape:
         solver.step(state, after, None, None, FRAME)
     assert not tape.launches
+
+
+@pytest.mark.parametrize("kept", ["_src", "tape"])
+def test_a_warp_that_keeps_its_tape_elsewhere_is_refused_by_name(kept, monkeypatch):
+    """Nobody could tell whether derivatives are asked for, so nothing is stepped."""
+    solver = scene()
+    state, after = start(solver), solver.model.state(requires_grad=True)
+    if kept == "_src":
+        monkeypatch.delattr(wp, "_src")
+    else:
+        monkeypatch.setattr(wp._src.context, "runtime", object())
+    monkeypatch.setattr(wp, "init", lambda: None)
+    with pytest.raises(WarpDeformError, match="does not say which tape records"):
+        solver.step(state, after, None, None, FRAME)

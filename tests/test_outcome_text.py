@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from short_runs import TASK
 
+from learning import training
 from learning.evaluation import summarise
 from learning.outcome_text import evaluated, trained
 from learning.playing import Played
@@ -86,6 +87,39 @@ def test_the_commands_say_it(
     assert "success: ours 0.0 %, the paper has no number for 2 demonstrations" in (
         capsys.readouterr().out
     )
+
+
+@pytest.mark.parametrize(
+    ("stored", "expected"),
+    [
+        (0, "interrupted; no step is kept yet, the same command begins again"),
+        (2, "interrupted; steps up to 2 are kept, the same command goes on and ends with the same "
+            "bits"),
+    ],
+)  # fmt: skip
+def test_an_interrupted_training_says_which_steps_are_kept(
+    stored: int, expected: str, run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Before the first state is stored nothing is; afterwards all up to it."""
+    steps: list[int] = []
+    batch = training._batch
+
+    def interrupting(*arguments: Any) -> Any:
+        steps.append(len(steps))
+        if len(steps) == stored + 3:  # the first is the rehearsal
+            raise KeyboardInterrupt
+        return batch(*arguments)
+
+    monkeypatch.setattr(training, "_batch", interrupting)
+    monkeypatch.setattr(training, "state_steps", lambda _: stored or 100)
+    command = ["train", TASK, "--agent", "gt-mlp", "--data", run.read_settings()["data"],
+               "--preset", "fast", "--steps", "8", "--snapshots", "1", "--validate", "0",
+               "--out", str(tmp_path / "cut")]  # fmt: skip
+    assert main(command) == 130
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said == f"warp-deform: {expected}"
+    assert RunFolder(tmp_path / "cut").read_state()[1] == stored
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)

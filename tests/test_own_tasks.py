@@ -332,3 +332,55 @@ def test_an_environment_takes_a_name_a_task_or_its_class() -> None:
     for odd in (3, None, object, np.zeros(2), "cable"):
         with pytest.raises(InputError):
             PickPlaceEnv(odd)  # type: ignore[arg-type]
+
+
+def second(text: str = BOX) -> str:
+    """The same task, of version 2."""
+    return text.replace("    max_actions", "    version = 2\n    max_actions")
+
+
+def test_a_registered_task_has_the_id_of_its_version(tmp_path: Path) -> None:
+    first = box_away(tmp_path)
+    warp_deform.register_task(first)
+    assert gymnasium.make("WarpDeform/BoxAway-v1").spec is not None
+    first.version = 2
+    warp_deform.register_task(first)
+    assert [each for each in gymnasium.registry if "BoxAway" in each] == ["WarpDeform/BoxAway-v2"]
+    env = gymnasium.make("WarpDeform/BoxAway-v2")
+    assert env.unwrapped.task.version == 2  # type: ignore[attr-defined]
+    with pytest.raises(gymnasium.error.DeprecatedEnv):
+        gymnasium.make("WarpDeform/BoxAway-v1")
+
+
+def test_an_installed_task_has_the_id_of_the_version_that_its_entry_point_says(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    install(tmp_path, "new", "box-away-v2 = second_tasks:BoxAway", second_tasks=second())
+    warp_deform.registration.register_environments()
+    assert "second_tasks" not in sys.modules and is_known("box-away")
+    assert "WarpDeform/BoxAway-v2" in gymnasium.registry
+    assert "WarpDeform/BoxAway-v1" not in gymnasium.registry
+    entry = reported(capfd, "list")["tasks"][-1]
+    assert (entry["name"], entry["env_id"]) == ("box-away", "WarpDeform/BoxAway-v2")
+    env = gymnasium.make("WarpDeform/BoxAway-v2")
+    assert env.unwrapped.task.version == 2  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("point", "text", "wanted"),
+    [("box-away", second(), "'box-away-v2'"), ("box-away-v3", second(), "'box-away-v2'"),
+     ("box-away-v2", BOX, "'box-away'")],
+)  # fmt: skip
+def test_an_entry_point_of_another_version_is_refused(
+    point: str, text: str, wanted: str, tmp_path: Path
+) -> None:
+    install(tmp_path, "wrong", f"{point} = wrong_tasks:BoxAway", wrong_tasks=text)
+    with pytest.raises(InputError, match=f"its entry point must be called {wanted}"):
+        find_task("box-away")
+
+
+def test_a_name_does_not_end_like_a_version(tmp_path: Path) -> None:
+    task = box_away(tmp_path)
+    task.name = "box-away-v2"
+    with pytest.raises(InputError, match="no version behind"):
+        warp_deform.register_task(task)

@@ -116,8 +116,8 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
         (["--out", "./demos/."], "is the folder to refine"),
         (["--out", "new", "--method", "luck"], "'enumerate', 'random', 'cem', 'gradient'"),
         (["--out", "new", "--depth", "3"], "--depth"),
-        (["--out", "new", "--budget", "0"], "must be 1 or more"),
-        (["--out", "new", "--workers", "0"], "workers is 0"),
+        (["--out", "new", "--budget", "0"], "--budget is 0; allowed: 1 to"),
+        (["--out", "new", "--workers", "0"], "--workers is 0"),
         ([], "--out DIR"),
     ],
 )

@@ -28,7 +28,7 @@ from typing import Annotated, Any, NamedTuple
 from tyro.conf import arg
 
 from . import __version__
-from .errors import InputError, WarpDeformError
+from .errors import InputError, Interrupted, WarpDeformError
 from .flag_range import check_flags
 
 __all__ = ["VERBS", "CommandOptions", "Outcome", "Verb", "main"]
@@ -123,8 +123,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(error, code=2)
     except WarpDeformError as error:
         return _complain(error, code=1)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         kept = VERBS[arguments[0]].kept if arguments and arguments[0] in VERBS else ""
+        if isinstance(error, Interrupted):
+            kept = str(error)
         return _complain("; ".join(filter(None, ["interrupted", kept])), code=130)
     except BrokenPipeError:
         _discard_stdout()  # the reader went away (`| head`)

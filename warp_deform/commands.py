@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from .cli import CommandOptions, Outcome
 from .errors import InputError
+from .flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
 from .quiet import quiet_warp
 from .registration import env_id
 from .robots import RobotName
@@ -39,7 +40,8 @@ __all__ = [
 
 _Task = Annotated[Positional[str], arg(metavar="TASK")]
 _Folder = Annotated[Positional[Path], arg(metavar="DIR")]
-_Count = Annotated[int, arg(aliases=["-n"], metavar="N")]
+_Count = Annotated[int, arg(aliases=["-n"], metavar="N"), COUNT]
+_Workers = Annotated[int | None, arg(metavar="W"), COUNT]
 _Demonstrator = Literal["scripted", "visible", "mpc", "planner"]
 _File = Annotated[Path | None, arg(metavar="FILE")]
 
@@ -93,7 +95,7 @@ class DemoOptions(CommandOptions):
     """Name of the task, see `warp-deform list`."""
     episodes: _Count = 10
     """Successes to keep: the first N in the order of their seeds."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """First seed. Training 0.., test 10,000.., validation 50,000.., goals 100,000.. ."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder for the episodes; complete ones that are there already are kept."""
@@ -101,7 +103,7 @@ class DemoOptions(CommandOptions):
     """Who acts: "scripted", the paper's; "visible", which picks only what the tip would really
     meet; "mpc", which simulates eight candidates and takes the best; "planner", which searches two
     actions ahead. All see the state."""
-    workers: Annotated[int | None, arg(metavar="W")] = None
+    workers: _Workers = None
     """Processes; left out, one per core, fewer for few episodes. The result is the same."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
     """Address of a Ray cluster to work on (needs the extra `ray`)."""
@@ -114,8 +116,6 @@ class DemoOptions(CommandOptions):
 def demo(options: DemoOptions) -> Outcome:
     """Collect demonstrations into a folder."""
     find_task(options.task)
-    _check_positive("-n", options.episodes)
-    _check_positive("--workers", options.workers)
     from .collect import CollectConfig, collect
 
     quiet_warp()
@@ -151,9 +151,9 @@ class GoalsOptions(CommandOptions):
 
     task: _Task
     """Name of a goal-conditioned task."""
-    count: Annotated[int, arg(name="goals", aliases=["-n"], metavar="N")] = 20
+    count: Annotated[int, arg(name="goals", aliases=["-n"], metavar="N"), COUNT] = 20
     """Goals to make; the paper evaluates on 20."""
-    seed: int = 100_000
+    seed: Annotated[int, SEED] = 100_000
     """First seed; goals have seeds of their own."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder for the goals."""
@@ -161,7 +161,7 @@ class GoalsOptions(CommandOptions):
     """Last states of demonstrations (the paper), or objects placed at the goal and settled."""
     demonstrator: _Demonstrator = "scripted"
     """Whose demonstrations, see `warp-deform demo`."""
-    workers: Annotated[int | None, arg(metavar="W")] = None
+    workers: _Workers = None
     """Processes; one per core when left out."""
     robot: RobotName = "ur5"
     """The arm."""
@@ -170,7 +170,6 @@ class GoalsOptions(CommandOptions):
 def goals(options: GoalsOptions) -> Outcome:
     """Make a set of goals."""
     find_task(options.task)
-    _check_positive("-n", options.count)
     from .goals import make_goals
 
     quiet_warp()
@@ -198,9 +197,9 @@ class ReplayOptions(CommandOptions):
     """Folder of episodes."""
     verify: bool = False
     """Fail (exit code 1) unless every state is the recorded one, bit for bit."""
-    tolerance: Annotated[float | None, arg(metavar="M")] = None
+    tolerance: Annotated[float | None, arg(metavar="M"), FlagRange(0.0, 1e3)] = None
     """Compare positions within this distance [m] instead of bits, for another kind of processor."""
-    workers: Annotated[int | None, arg(metavar="W")] = None
+    workers: _Workers = None
     """Processes; left out, one per core, fewer for few episodes."""
 
 
@@ -228,15 +227,13 @@ class InspectOptions(CommandOptions):
     """Folder of episodes."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder for the contact sheets; `DIR/sheets` when left out."""
-    sheets: Annotated[int, arg(metavar="N")] = 20
+    sheets: Annotated[int, arg(metavar="N"), COUNT_OR_NONE] = 20
     """Contact sheets at most; 0 for statistics alone."""
 
 
 def inspect(options: InspectOptions) -> Outcome:
     """Look into a folder of episodes."""
     _check_folder(options.folder)
-    if options.sheets < 0:
-        raise InputError(f"--sheets is {options.sheets}; it must be 0 or more")
     from .episodes import EpisodeReader
     from .inspection import contact_sheet, statistics
 
@@ -287,13 +284,13 @@ class GradcheckOptions(CommandOptions):
     """Name of a task; left out, all."""
     levels: tuple[Literal["substep", "window", "action"], ...] = ("substep", "window", "action")
     """One substep; 0.1 s; whole actions."""
-    states: Annotated[int, arg(metavar="N")] = 200
+    states: Annotated[int, arg(metavar="N"), COUNT] = 200
     """States whose next substep is differentiated."""
-    windows: Annotated[int, arg(metavar="N")] = 30
+    windows: Annotated[int, arg(metavar="N"), COUNT] = 30
     """States from which 0.1 s are differentiated."""
-    actions: Annotated[int, arg(metavar="N")] = 16
+    actions: Annotated[int, arg(metavar="N"), COUNT] = 16
     """Whole actions that are differentiated."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
     """First episode, and the random directions."""
     summary: bool = False
     """One line per task and level instead of all rows."""
@@ -303,8 +300,6 @@ def gradcheck(options: GradcheckOptions) -> Outcome:
     """Check the adjoint."""
     if options.task is not None:
         find_task(options.task)
-    for flag in ("states", "windows", "actions"):
-        _check_positive(f"--{flag}", getattr(options, flag))
     from .gradcheck import GradcheckConfig, check, summarise
 
     quiet_warp()
@@ -349,11 +344,6 @@ def doctor(options: DoctorOptions) -> Outcome:
     count = len(found["problems"])
     failure = None if found["healthy"] else f"{count} problem{'s' * (count > 1)} found, see above"
     return Outcome(data=found, text=render(found), failure=failure)
-
-
-def _check_positive(flag: str, value: int | None) -> None:
-    if value is not None and value < 1:
-        raise InputError(f"{flag} is {value}; it must be 1 or more")
 
 
 def _check_folder(folder: Path) -> None:

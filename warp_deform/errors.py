@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["InputError", "WarpDeformError"]
+__all__ = ["InputError", "Interrupted", "WarpDeformError"]
 
 
 class WarpDeformError(Exception):
@@ -15,3 +15,7 @@ class InputError(WarpDeformError, ValueError):
     The message is one line that says what was wrong and what to do. The command line prints it on
     stderr and exits with code 2.
     """
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C in work that knows what it leaves: the message says what is kept, and what to do."""

@@ -15,7 +15,7 @@ from typing import Any
 
 from .errors import InputError
 
-__all__ = ["SEED", "FlagRange", "check_flags", "check_seed", "flag_range"]
+__all__ = ["COUNT", "COUNT_OR_NONE", "SEED", "FlagRange", "check_flags", "check_seed", "flag_range"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,10 @@ class FlagRange:
 
 SEED = FlagRange(0, 2**32 - 1)
 """Of NumPy's generators, as far as the numbers of episodes go."""
+COUNT = FlagRange(1, 10**9)
+"""Of episodes, steps, processes: one at least; nobody waits for more."""
+COUNT_OR_NONE = FlagRange(0, COUNT.high)
+"""The same where 0 means that there are none."""
 
 
 def check_flags(options: Any) -> None:
@@ -47,9 +51,9 @@ def check_flags(options: Any) -> None:
             continue
         for number in value if isinstance(value, tuple) else (value,):
             if not allowed.low <= number <= allowed.high:  # also when it is not a number
+                flag = _flag(field.name, hints[field.name])
                 raise InputError(
-                    f"--{field.name.replace('_', '-')} is {number}; allowed: {allowed.low:.10g} "
-                    f"to {allowed.high:.10g}"
+                    f"--{flag} is {number}; allowed: {allowed.low:.10g} to {allowed.high:.10g}"
                 )
 
 
@@ -62,6 +66,12 @@ def check_seed(seed: int) -> int:
     if not isinstance(seed, Integral) or not SEED.low <= seed <= SEED.high:
         raise InputError(f"a seed is {SEED.low:.10g} to {SEED.high:.10g}, not {seed}")
     return seed
+
+
+def _flag(name: str, hint: Any) -> str:
+    """A field's name on the command line, without hyphens in front."""
+    named = (getattr(extra, "name", None) for extra in getattr(hint, "__metadata__", ()))
+    return next((each for each in named if each), name.replace("_", "-"))
 
 
 def flag_range(hint: Any) -> FlagRange | None:

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 import newton
 import numpy as np
 import warp as wp
-from warp._src import context  # the tape that records has no public name
 
 from .differentiable import DifferentiableRollout
-from .errors import InputError
+from .errors import InputError, WarpDeformError
 from .rollout import GripPath
 
 if TYPE_CHECKING:
@@ -28,22 +27,37 @@ __all__ = ["TapedStep", "recording", "refuse_lost_derivatives", "unrecorded"]
 STATE = ("particle_q", "particle_qd", "body_q", "body_qd")
 
 
+def _runtime() -> Any:
+    """Warp's own state, whose `tape` is the one that records; it has no public name.
+
+    Raises:
+        WarpDeformError: this version of Warp keeps it elsewhere, so that nobody could tell whether
+            derivatives are asked for.
+    """
+    wp.init()
+    runtime = getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
+    if not hasattr(runtime, "tape"):
+        raise WarpDeformError(
+            f"warp-lang {wp.__version__} does not say which tape records; install the version in "
+            "constraints.txt"
+        )
+    return runtime
+
+
 def recording() -> Any:
     """The `wp.Tape` that records now, or None."""
-    return context.runtime.tape if context.runtime is not None else None
+    return _runtime().tape
 
 
 @contextmanager
 def unrecorded() -> Iterator[None]:
     """What is done in here is on no tape."""
-    if context.runtime is None:
-        yield
-        return
-    tape, context.runtime.tape = context.runtime.tape, None
+    runtime = _runtime()
+    tape, runtime.tape = runtime.tape, None
     try:
         yield
     finally:
-        context.runtime.tape = tape
+        runtime.tape = tape
 
 
 def refuse_lost_derivatives(state: newton.State) -> None:

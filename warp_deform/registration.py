@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from .errors import InputError
 from .tasks.checking import check_task
-from .tasks.elsewhere import offered
+from .tasks.elsewhere import offered, offered_version
 from .tasks.registry import FURTHER_TASKS, TASKS, add_task, registered
 
 if TYPE_CHECKING:
@@ -20,10 +20,11 @@ Registered = TypeVar("Registered", bound="type[Task]")
 def env_id(task: str) -> str:
     """Gymnasium id of the task called `task`: `cable-ring` is `WarpDeform/CableRing-v1`.
 
-    The version of a task from elsewhere, which may not have been loaded, is 1.
+    Of an installed task that has not been loaded, the version is what its entry point says.
     """
-    known = TASKS | FURTHER_TASKS
-    return f"WarpDeform/{_words(task)}-v{known[task].version if task in known else 1}"
+    known = TASKS | FURTHER_TASKS | {cls.name: cls for cls in registered()}
+    version = known[task].version if task in known else offered_version(task)
+    return f"WarpDeform/{_words(task)}-v{version}"
 
 
 def _words(task: str) -> str:
@@ -69,6 +70,9 @@ def register_task(task: Registered) -> Registered:
 def _register(task: str) -> None:
     from gymnasium.envs.registration import register, registry
 
+    same = f"WarpDeform/{_words(task)}-v"
+    for other in [each for each in registry if each.startswith(same) and each != env_id(task)]:
+        del registry[other]  # of the class whose place this one takes
     if env_id(task) not in registry:
         register(
             env_id(task),

@@ -16,7 +16,7 @@ from .task import Task
 
 __all__ = ["check_task"]
 
-_NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_NAME = re.compile(r"(?!.*-v\d+$)[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def check_task(task: object) -> type[Task]:
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise InputError(
             f"{where}: name is {name!r}; it must be words of lower-case letters and digits, with "
-            "hyphens between them, as 'cable-away'"
+            "hyphens between them and no version behind, as 'cable-away'"
         )
     for attribute, needed in _ATTRIBUTES.items():
         value = getattr(task, attribute, None)

@@ -1,12 +1,14 @@
 """Tasks from elsewhere: those of installed distributions, and modules that the user names.
 
 A distribution offers tasks as entry points of the group `warp_deform.tasks`, whose names are the
-tasks'. Names are read from metadata; code is imported when its task is asked for.
+tasks', followed by `-v2` where the task's version is 2. Names are read from metadata; code is
+imported when its task is asked for.
 """
 
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 import traceback
 from importlib.metadata import EntryPoint, entry_points
@@ -16,7 +18,7 @@ from ..errors import InputError
 from .checking import check_task
 from .task import Task
 
-__all__ = ["import_tasks", "load_offered", "offered"]
+__all__ = ["import_tasks", "load_offered", "offered", "offered_version"]
 
 _GROUP = "warp_deform.tasks"
 
@@ -25,8 +27,20 @@ def offered() -> dict[str, tuple[EntryPoint, ...]]:
     """Entry points of installed distributions by the name of the task; more than one is a clash."""
     found: dict[str, tuple[EntryPoint, ...]] = {}
     for point in entry_points(group=_GROUP):
-        found[point.name] = (*found.get(point.name, ()), point)
+        name, _ = _parts(point)
+        found[name] = (*found.get(name, ()), point)
     return dict(sorted(found.items()))
+
+
+def offered_version(name: str) -> int:
+    """The version that an entry point says, 1 where it says none; nothing is imported."""
+    return max((_parts(point)[1] for point in offered().get(name, ())), default=1)
+
+
+def _parts(point: EntryPoint) -> tuple[str, int]:
+    """The name of the task, and its version."""
+    match = re.fullmatch(r"(.+?)(?:-v([1-9]\d*))?", point.name)
+    return (point.name, 1) if match is None else (match[1], int(match[2] or 1))
 
 
 def load_offered(name: str) -> type[Task] | None:
@@ -54,6 +68,11 @@ def load_offered(name: str) -> type[Task] | None:
         raise InputError(f"{where} cannot be used: {error}") from error
     if task.name != name:
         raise InputError(f"{where} calls itself {task.name!r}; its entry point must, too")
+    if task.version != _parts(point)[1]:
+        wanted = name if task.version == 1 else f"{name}-v{task.version}"
+        raise InputError(
+            f"{where} is of version {task.version}; its entry point must be called {wanted!r}"
+        )
     return task
 
 

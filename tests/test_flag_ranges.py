@@ -1,4 +1,4 @@
-"""Every number on the command line of `warp-deform franka`: what cannot be meant is one line.
+"""Every number on the command line: what cannot be meant is one line and leaves nothing.
 
 The rows are the flags themselves: a new one without a range fails here.
 """
@@ -9,21 +9,38 @@ import math
 import types
 import typing
 from dataclasses import fields, make_dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from hardware.cli import franka
+from warp_deform import cli
 from warp_deform.cli import CommandOptions, main
 from warp_deform.errors import InputError
 from warp_deform.flag_range import FlagRange, check_flags, check_seed, flag_range
 
-VERBS: dict[str, type[CommandOptions]] = {
-    verb.__metadata__[0].name: typing.get_args(verb)[0]
+FRANKA: dict[str, type[CommandOptions]] = {
+    f"franka {verb.__metadata__[0].name}": typing.get_args(verb)[0]
     for verb in typing.get_args(typing.get_type_hints(franka, include_extras=True)["options"])
 }
-NEEDED = {"calibrate": ["lens"], "capture-goal": ["--out", "g.png"], "collect": ["--out", "demos"]}
+OWN: dict[str, type[CommandOptions]] = {
+    verb: typing.get_type_hints(getattr(import_module(module), function))["options"]
+    for verb, (target, *_) in cli.VERBS.items()
+    if verb != "franka"
+    for module, function in [target.split(":")]
+}
+VERBS = OWN | FRANKA
+LINE = "cable-line-notarget"
+NEEDED = {
+    "franka calibrate": ["lens"], "franka capture-goal": ["--out", "g.png"],
+    "franka collect": ["--out", "demos"], "demo": [LINE, "--out", "d"],
+    "goals": [LINE, "--out", "d"], "replay": ["d"], "inspect": ["d"],
+    "convert": ["d", "o", "--from", "deformable-ravens"],
+    "train": [LINE, "--agent", "gt-mlp", "--data", "d", "--out", "r"], "eval": ["r"],
+    "sweep": ["grid.toml"], "refine": ["d", "--out", "o"],
+}  # fmt: skip
 
 
 def alternatives(hint: Any) -> tuple[Any, ...]:
@@ -42,6 +59,12 @@ def kinds(hint: Any) -> set[type]:
     return found
 
 
+def printed(name: str, hint: Any) -> str:
+    """The flag of a field, as the command takes it."""
+    named = [each.name for each in hint.__metadata__ if getattr(each, "name", None)]
+    return f"--{(named or [name])[0].replace('_', '-')}"
+
+
 def numeric_flags() -> list[tuple[str, str, Any]]:
     """Verb, name and annotation of every flag that takes a number."""
     return [
@@ -57,18 +80,21 @@ FLAGS = numeric_flags()
 
 
 def test_the_table_has_the_flags() -> None:
-    assert set(VERBS) == {
+    assert {verb.removeprefix("franka ") for verb in FRANKA} == {
         "doctor", "calibrate", "capture-goal", "collect", "run", "replay", "score", "emulate",
     }  # fmt: skip
     names = {(verb, name) for verb, name, _ in FLAGS}
-    assert {("run", "seed"), ("emulate", "chain"), ("calibrate", "size")} <= names
-    assert len(FLAGS) >= 18
+    assert {("franka run", "seed"), ("franka emulate", "chain"), ("franka calibrate", "size"),
+            ("demo", "seed"), ("goals", "count"), ("train", "seed"), ("gradcheck", "seed"),
+            ("eval", "first_seed"), ("refine", "budget"), ("convert", "workers"),
+            } <= names  # fmt: skip
+    assert len(FLAGS) >= 45
 
 
 @pytest.mark.parametrize(("verb", "name", "hint"), FLAGS, ids=lambda value: str(value)[:20])
 def test_every_number_has_a_range(verb: str, name: str, hint: Any) -> None:
     allowed = flag_range(hint)
-    assert allowed is not None, f"franka {verb} --{name} takes any number"
+    assert allowed is not None, f"{verb} --{name} takes any number"
     assert math.isfinite(allowed.low) and math.isfinite(allowed.high)
     many = any(typing.get_origin(kind) is tuple for kind in alternatives(hint))
 
@@ -78,7 +104,7 @@ def test_every_number_has_a_range(verb: str, name: str, hint: Any) -> None:
         try:
             check_flags(given((allowed.low, value) if many else value))
         except InputError as error:
-            assert f"--{name.replace('_', '-')} is" in str(error)
+            assert f"{printed(name, hint)} is" in str(error)
             return True
         return False
 
@@ -98,8 +124,8 @@ def test_what_cannot_be_meant_is_one_line_and_leaves_nothing(
     bad = [str(int(allowed.low) - 1)] if int in kinds(hint) else ["nan"]
     many = [kind for kind in alternatives(hint) if typing.get_origin(kind) is tuple]
     count = len([kind for kind in typing.get_args(many[0]) if kind is not ...]) if many else 1
-    flag = f"--{name.replace('_', '-')}"
-    code = main(["franka", verb, *NEEDED.get(verb, []), flag, *(bad * count)])
+    flag = printed(name, hint)
+    code = main([*verb.split(), *NEEDED.get(verb, []), flag, *(bad * count)])
     said = capfd.readouterr()
     assert code == 2 and said.out == "" and list(tmp_path.iterdir()) == []
     (line,) = said.err.strip().splitlines()
