@@ -21,15 +21,15 @@ from statistics import median
 import numpy as np
 import tyro
 
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import HOME_Q
+from hardware.arm.pick_place import PickPlaceAction, execute
+from hardware.arm.safe_robot import SafeRobot
 from hardware.backends.franka_config import NetworkedConfig
 from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.server import EmulatorConfig
-from hardware.panda_arm import HOME_Q
-from hardware.pick_place import PickPlaceAction, execute
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.twin import CableTwin, TwinConfig
+from hardware.twin.twin import CableTwin, TwinConfig
 from warp_deform.tasks.chain_shapes import straight_chain
 
 SPEED = 0.2  # of the joints' greatest

@@ -27,13 +27,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.agents import make_chooser
-from hardware.episode import EpisodeResult, run_episode
-from hardware.goal_file import sampled_goal
-from hardware.recorder import EpisodeRecorder, RecorderConfig
-from hardware.rig import open_rig
-from hardware.rig_config import RigConfig
-from hardware.scoring import MAX_ACTIONS
+from hardware.agents.make import make_chooser
+from hardware.episodes.episode import EpisodeResult, run_episode
+from hardware.episodes.goals import sampled_goal
+from hardware.recordings.recorder import EpisodeRecorder, RecorderConfig
+from hardware.recordings.scoring import MAX_ACTIONS
+from hardware.rig.config import RigConfig
+from hardware.rig.rig import open_rig
 from learning.clustered import clustered_mean, clustered_rate
 from warp_deform.quiet import quiet_warp
 from warp_deform.solver.guards import PhysicsError

@@ -23,11 +23,11 @@ from board_photographs import (
     transform,
 )
 
-from hardware.calibration import Calibration
-from hardware.charuco import find_corners
-from hardware.homography import board_on_table, fit_homography
-from hardware.panda_arm import HOME_Q
-from hardware.top_down_view import TopDownView
+from hardware.arm.panda import HOME_Q
+from hardware.calibration.calibration import Calibration
+from hardware.calibration.charuco import find_corners
+from hardware.calibration.homography import board_on_table, fit_homography
+from hardware.vision.top_down_view import TopDownView
 from warp_deform.errors import InputError
 
 TILE = (320, 180)

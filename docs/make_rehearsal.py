@@ -13,8 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hardware.camera import read_image
-from hardware.recording import Recording
+from hardware.cameras.camera import read_image
+from hardware.recordings.recording import Recording
 
 HEIGHT = 480  # [pixels]
 SECONDS, LAST_SECONDS = 1.2, 3.0

@@ -5,7 +5,7 @@ on `warp_deform` and never the other way round; importing it loads no vendor's l
 device.
 """
 
-from .robot import (
+from .arm.robot import (
     BackendMissing,
     ConnectionFailed,
     ConnectionLost,

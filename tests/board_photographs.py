@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from hardware.camera import CameraIntrinsics
-from hardware.charuco import BoardSpec
-from hardware.homography import apply_homography
-from hardware.table_plane import TablePlane
+from hardware.arm.table_plane import TablePlane
+from hardware.calibration.charuco import BoardSpec
+from hardware.calibration.homography import apply_homography
+from hardware.cameras.camera import CameraIntrinsics
 
 SIZE = (1280, 720)
 INTRINSICS = CameraIntrinsics(

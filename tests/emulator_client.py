@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from hardware import RobotError
+from hardware.arm.panda import HOME_Q, PandaKinematics
 from hardware.emulator import EmulatorProcess
-from hardware.panda_arm import HOME_Q, PandaKinematics
 
 # Where the vendor offers wheels they are part of the development install, so a missing one fails.
 if (sys.platform, platform.machine()) == ("linux", "x86_64"):

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import HOME_Q, PandaKinematics
+from hardware.arm.pick_place import PickPlaceAction
+from hardware.arm.safe_robot import SafeRobot
 from hardware.backends.dry_run import DryRunConfig, DryRunRobot
-from hardware.calibration import Calibration
-from hardware.camera import Frame
-from hardware.cameras.sim import SimCamera, SimCameraConfig, sim_calibration
-from hardware.episode import EpisodeConfig, Observation, run_episode
-from hardware.panda_arm import HOME_Q, PandaKinematics
-from hardware.pick_place import PickPlaceAction
-from hardware.recorder import EpisodeRecorder, RecorderConfig
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.twin import TwinConfig, TwinLook
+from hardware.calibration.calibration import Calibration
+from hardware.cameras.camera import Frame
+from hardware.episodes.episode import EpisodeConfig, Observation, run_episode
+from hardware.recordings.recorder import EpisodeRecorder, RecorderConfig
+from hardware.twin.camera import SimCamera, SimCameraConfig, sim_calibration
+from hardware.twin.twin import TwinConfig, TwinLook
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.chain_shapes import straight_chain
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hardware.arm.pick_place import PickPlaceAction, PickPlaceOutcome, PickPlaceResult
 from hardware.backends.dry_run import DryRunRobot
-from hardware.camera import CameraIntrinsics, Frame
-from hardware.pick_place import PickPlaceAction, PickPlaceOutcome, PickPlaceResult
-from hardware.recorder import EpisodeRecorder, RecorderConfig
+from hardware.cameras.camera import CameraIntrinsics, Frame
+from hardware.recordings.recorder import EpisodeRecorder, RecorderConfig
 
 INTRINSICS = CameraIntrinsics(
     (64, 48), np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]), np.zeros(5)

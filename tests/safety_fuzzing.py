@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 from panda_urdf import about_z, poses
 
-from hardware.backends.sim import SimRobot, SimRobotConfig
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import HOME_Q
+from hardware.arm.robot import RobotError
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.table_plane import TablePlane
 from hardware.emulator.world import Contact, Hand, TableWorld
-from hardware.panda_arm import HOME_Q
-from hardware.robot import RobotError
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.table_plane import TablePlane
+from hardware.twin.robot import SimRobot, SimRobotConfig
 from warp_deform.errors import InputError
 
 JOINT_LOW = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])  # [rad]

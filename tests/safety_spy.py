@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 
 from hardware import MoveResult, RobotMode, RobotState
-from hardware.panda_arm import HOME_Q, Q_MAX, Q_MIN, PandaKinematics
-from hardware.safety_limits import SafetyLimits
-from hardware.straight_line import straight_line
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import HOME_Q, Q_MAX, Q_MIN, PandaKinematics
+from hardware.arm.straight_line import straight_line
 
 ARM = PandaKinematics()
 HOME = np.array(HOME_Q)

@@ -24,13 +24,13 @@ from hardware import (
     UnreachablePose,
     UserStopped,
 )
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import DQ_MAX, HOME_Q, Q_MAX
+from hardware.arm.pick_place import PickPlaceAction, execute
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.table_plane import TablePlane
 from hardware.backends.fr3 import FR3_Q_MAX, FR3_Q_MIN, FR3Robot
 from hardware.backends.frankapy import FrankapyConfig, FrankapyRobot
-from hardware.panda_arm import DQ_MAX, HOME_Q, Q_MAX
-from hardware.pick_place import PickPlaceAction, execute
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.table_plane import TablePlane
 from warp_deform.errors import InputError
 
 HOME = np.array(HOME_Q)

@@ -18,17 +18,17 @@ from board_photographs import (
     transform,
 )
 
-from hardware.charuco import Corners, board_pose, calibrate_intrinsics, find_corners
-from hardware.hand_eye import calibrate_hand_eye
-from hardware.homography import (
+from hardware.arm.table_plane import TablePlane
+from hardware.calibration.charuco import Corners, board_pose, calibrate_intrinsics, find_corners
+from hardware.calibration.hand_eye import calibrate_hand_eye
+from hardware.calibration.homography import (
     apply_homography,
     board_on_table,
     fit_homography,
     plane_homography,
     solve_homography,
 )
-from hardware.poor_fit import PoorFit
-from hardware.table_plane import TablePlane
+from hardware.calibration.poor_fit import PoorFit
 from warp_deform.errors import InputError
 
 # The homography.

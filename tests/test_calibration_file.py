@@ -12,14 +12,14 @@ from board_photographs import INTRINSICS, SIZE, TABLE, camera_above
 from safety_spy import ARM, SpyRobot
 
 from hardware import GraspError, MotionError, SafetyViolation
-from hardware.calibration import Calibration
-from hardware.homography import plane_homography
-from hardware.panda_arm import HOME_Q
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.table_plane import TablePlane, fit_table_plane
-from hardware.top_down_view import TopDownView
-from hardware.touch_off import touch_off
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import HOME_Q
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.table_plane import TablePlane, fit_table_plane
+from hardware.calibration.calibration import Calibration
+from hardware.calibration.homography import plane_homography
+from hardware.measuring.touch_off import touch_off
+from hardware.vision.top_down_view import TopDownView
 from warp_deform.errors import InputError
 
 # The table.

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hardware.camera import CameraError, CameraIntrinsics, FileCamera, Frame, read_image
 from hardware.cameras.azure_kinect import AzureKinectCamera
+from hardware.cameras.camera import CameraError, CameraIntrinsics, FileCamera, Frame, read_image
 from hardware.cameras.realsense import RealSenseCamera
 from hardware.cameras.streaming import StreamConfig, StreamingCamera
 from hardware.cameras.uvc import UVCCamera

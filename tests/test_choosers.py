@@ -20,19 +20,19 @@ from franka_episodes import (
 )
 from test_episode import Arm
 
-from hardware.backends.sim import SimRobot
-from hardware.cameras.sim import SimCamera
-from hardware.chain_from_mask import estimate_chain
-from hardware.choosers import RandomChooser, ScriptedChooser, still_chain, to_action
-from hardware.episode import EpisodeConfig, Observation, refusal, run_episode
-from hardware.finger_room import has_finger_room
-from hardware.human import HumanChooser
-from hardware.pick_place import PickPlaceAction, PickPlaceConfig
-from hardware.planner import PlannerChooser, PlannerConfig, SeenChain, chord_error
-from hardware.recording import Recording
-from hardware.replaying import replay_recording
-from hardware.safety import SafeRobot
-from hardware.twin import CableTwin
+from hardware.agents.choosers import RandomChooser, ScriptedChooser, still_chain, to_action
+from hardware.agents.finger_room import has_finger_room
+from hardware.agents.human import HumanChooser
+from hardware.agents.planner import PlannerChooser, PlannerConfig, SeenChain, chord_error
+from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig
+from hardware.arm.safe_robot import SafeRobot
+from hardware.episodes.episode import EpisodeConfig, Observation, refusal, run_episode
+from hardware.recordings.recording import Recording
+from hardware.recordings.replay import replay_recording
+from hardware.twin.camera import SimCamera
+from hardware.twin.robot import SimRobot
+from hardware.twin.twin import CableTwin
+from hardware.vision.chain_from_mask import estimate_chain
 from warp_deform.tasks.chain_shapes import curved_chain
 from warp_deform.tasks.task import Layout
 

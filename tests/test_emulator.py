@@ -18,9 +18,9 @@ from emulator_client import (
 )
 from emulator_worlds import TABLE_Z
 
+from hardware.arm.panda import Q_MAX, Q_MIN, PandaKinematics
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.protocol import ERRORS
-from hardware.panda_arm import Q_MAX, Q_MIN, PandaKinematics
 
 pytestmark = [
     pytest.mark.emulator,

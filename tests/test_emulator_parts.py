@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hardware.arm.panda import HOME_Q, Q_MAX, Q_MIN, PandaKinematics, flange_T_tcp
 from hardware.emulator.arm import Arm
 from hardware.emulator.gripper import Gripper
 from hardware.emulator.model_library import CompilerMissing, find_compiler, model_library
@@ -22,7 +23,6 @@ from hardware.emulator.protocol import (
     Request,
     Stream,
 )
-from hardware.panda_arm import HOME_Q, Q_MAX, Q_MIN, PandaKinematics, flange_T_tcp
 
 HOME = np.array(HOME_Q)
 

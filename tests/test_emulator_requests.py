@@ -11,6 +11,7 @@ from fci_wire import DEVIATIONS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hardware.arm.panda import HOME_Q, flange_T_tcp
 from hardware.emulator.frames import difference, is_frame, moved_on
 from hardware.emulator.gripper import Gripper
 from hardware.emulator.model_library import model_library
@@ -27,7 +28,6 @@ from hardware.emulator.protocol import (
 )
 from hardware.emulator.requests import GRIPPER_FORMS, ROBOT_FORMS, read
 from hardware.emulator.robot import EmulatedRobot
-from hardware.panda_arm import HOME_Q, flange_T_tcp
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 FRAME = flange_T_tcp().T.ravel()

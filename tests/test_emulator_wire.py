@@ -12,6 +12,7 @@ import pytest
 from emulator_client import libfranka
 from fci_wire import BUMP, Wire, serves
 
+from hardware.arm.panda import HOME_Q
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.protocol import (
     GRIPPER_COMMAND_PORT,
@@ -24,7 +25,6 @@ from hardware.emulator.protocol import (
     RobotMode,
     SetStatus,
 )
-from hardware.panda_arm import HOME_Q
 
 pytestmark = [
     pytest.mark.emulator,

@@ -37,21 +37,21 @@ from hardware import (
     SafetyViolation,
     UserStopped,
 )
+from hardware.agents.choosers import PolicyChooser
+from hardware.agents.human import Terminal
+from hardware.arm.panda import HOME_Q
+from hardware.arm.pick_place import PickPlaceAction
+from hardware.arm.safe_robot import SafeRobot
 from hardware.backends.dry_run import DryRunConfig, DryRunRobot
-from hardware.cameras.sim import SimCamera, sim_calibration
-from hardware.choosers import PolicyChooser
 from hardware.emulator import EmulatorProcess
-from hardware.episode import EpisodeConfig, EpisodeResult, run_episode
-from hardware.human import Terminal
-from hardware.operators import Answer, Plan, Unattended
-from hardware.panda_arm import HOME_Q
-from hardware.pick_place import PickPlaceAction
-from hardware.recording import Recording
-from hardware.replaying import replay_recording
-from hardware.rig_config import RigConfig
-from hardware.safety import SafeRobot
-from hardware.scoring import StartAtGoal, score_recording
-from hardware.twin import CableTwin, TwinConfig
+from hardware.episodes.episode import EpisodeConfig, EpisodeResult, run_episode
+from hardware.episodes.operators import Answer, Plan, Unattended
+from hardware.recordings.recording import Recording
+from hardware.recordings.replay import replay_recording
+from hardware.recordings.scoring import StartAtGoal, score_recording
+from hardware.rig.config import RigConfig
+from hardware.twin.camera import SimCamera, sim_calibration
+from hardware.twin.twin import CableTwin, TwinConfig
 from warp_deform.cli import main as command
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind

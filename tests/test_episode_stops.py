@@ -10,8 +10,8 @@ from franka_episodes import ACTION, LIMITS
 from test_episode import Arm, Person, episode
 
 from hardware import MotionError, ReflexError, RobotMode, RobotState, UserStopped
-from hardware.operators import Answer
-from hardware.panda_arm import HOME_Q
+from hardware.arm.panda import HOME_Q
+from hardware.episodes.operators import Answer
 from warp_deform.errors import InputError
 
 REFLEX = ReflexError("met something", reflexes=("cartesian_reflex",))

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from hardware.cli import franka
+from hardware.command.franka import franka
 from warp_deform import cli
 from warp_deform.cli import CommandOptions, main
 from warp_deform.errors import InputError

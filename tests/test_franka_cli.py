@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,18 +14,18 @@ from board_photographs import BOARD
 from franka_episodes import ACTION, CALIBRATION, GOAL, chain, recorder
 from test_episode import Arm, episode
 
-import hardware.robot as robot_module
+import hardware.arm.robot as robot_module
 from hardware import RobotError
 from hardware.backends.panda import BUSY
-from hardware.camera import CameraError
-from hardware.goal_file import read_goal, sampled_goal, write_goal
-from hardware.look_server import LookServer, remote_look
-from hardware.revision import software_revision
-from hardware.scoring import StartAtGoal
-from hardware.top_down_view import TopDownView
-from hardware.twin import TwinLook
+from hardware.cameras.camera import CameraError
+from hardware.episodes.goals import read_goal, sampled_goal, write_goal
+from hardware.recordings.scoring import StartAtGoal
+from hardware.twin.look_server import LookServer, remote_look
+from hardware.twin.twin import TwinLook
+from hardware.vision.top_down_view import TopDownView
 from warp_deform.cli import main
 from warp_deform.errors import InputError
+from warp_deform.revision import running_revision
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -49,22 +47,9 @@ def test_a_dry_run_needs_nothing_and_moves_nothing(
     assert data["folder"] == "franka-episodes/0000" and "dry run: move_linear" in said
     meta = json.loads(Path("franka-episodes/0000/episode.json").read_text())
     assert (meta["robot_id"], meta["camera_id"]) == ("panda 10.0.0.1", "sim")
-    assert meta["revision"] == software_revision()
+    assert meta["revision"] == running_revision().described
     code, data, _ = run(capfd, "score", "franka-episodes/0000")
     assert code == 0 and data["n_episodes"] == 1
-
-
-@pytest.mark.skipif(shutil.which("git") is None, reason="reads a checkout")
-def test_the_revision_is_that_of_a_checkout(tmp_path: Path) -> None:
-    assert software_revision(tmp_path) == ""
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
-    (tmp_path / "file").write_text("1")
-    for words in (["init", "-q"], ["add", "file"], ["commit", "-q", "-m", "first"]):
-        subprocess.run([*git, *words], check=True)
-    revision = software_revision(tmp_path)
-    assert re.fullmatch("[0-9a-f]{40}", revision)
-    (tmp_path / "file").write_text("2")
-    assert software_revision(tmp_path) == f"{revision}-dirty"
 
 
 def test_a_simulated_episode_is_run_scored_replayed_and_packed(
@@ -222,7 +207,11 @@ def test_a_goal_is_captured_and_read(tmp_path: Path, capfd: pytest.CaptureFixtur
         (["score"], "EPISODE|episode"),
         (["score", "nowhere"], "nowhere"),
         (["replay", "nowhere"], "nowhere"),
-        (["emulate", "--chain", "1", "--table-z", "0.1"], "exclude"),
+        (["emulate", "--chain", "1", "--table-z", "0.1"], "--chain excludes"),
+        (["emulate", "--chain", "1", "--object-width", "0.02"], "--chain excludes"),
+        (["emulate", "--chain", "one"], "chain"),
+        (["emulate", "--chain"], "chain"),
+        (["emulate", "--no-such-flag"], "no-such-flag"),
         (["emulate", "--host", "0.0.0.0"], "not an address of this machine"),
         (["calibrate", "table"], "--table-z"),
         (["calibrate", "table", "--table-z", "0.0"], "--execute"),
@@ -274,7 +263,7 @@ def test_the_board_is_written_at_its_size(
 ) -> None:
     code, data, _ = run(capfd, "calibrate", "board", "--setup", str(tmp_path))
     assert code == 0 and data["dots_an_inch"] == 254
-    from hardware.camera import read_image
+    from hardware.cameras.camera import read_image
 
     height, width = read_image(tmp_path / "board.png", color=True).shape[:2]
     assert (width, height) == (BOARD.columns * 360, BOARD.rows * 360)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hardware import doctor
-from hardware.doctor import Check, examine
+from hardware.command import doctor
+from hardware.command.doctor import Check, examine
 
 LOCAL = "127.0.79.9"
 

@@ -11,7 +11,7 @@ from cable_drawings import coverage, curve, draw, lone
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware.segmentation import SegmentationConfig, SegmentationError, segment_cable
+from hardware.vision.segmentation import SegmentationConfig, SegmentationError, segment_cable
 from warp_deform.errors import InputError
 from warp_deform.tasks.metrics import mask_iou
 from warp_deform.tasks.strand_grasp import find_grasp, map_direction, wrap_half_turn

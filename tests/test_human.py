@@ -14,12 +14,12 @@ import pytest
 from franka_episodes import ACTION, GOAL
 from test_episode import FAR, Arm, Person, episode
 
-from hardware.camera import read_image
-from hardware.episode import EpisodeConfig
-from hardware.human import Terminal
-from hardware.operators import Answer, Plan
-from hardware.overlay import draw_action
-from hardware.recording import Recording
+from hardware.agents.human import Terminal
+from hardware.cameras.camera import read_image
+from hardware.episodes.episode import EpisodeConfig
+from hardware.episodes.operators import Answer, Plan
+from hardware.recordings.recording import Recording
+from hardware.vision.overlay import draw_action
 
 PLAN = Plan(ACTION, {}, None, 1)
 

@@ -13,18 +13,18 @@ from board_photographs import BOARD, INTRINSICS, SIZE, TABLE, rotation
 from safety_spy import HOME, SpyRobot
 from test_setting_up import BASE_T_BOARD, TCP_T_CAMERA, GuidedRobot, setup
 
-from hardware.calibration import Calibration
-from hardware.camera import CameraError, Frame
-from hardware.charuco import BoardSpec, Corners
-from hardware.gathering import Kept, gather
-from hardware.human import Terminal
-from hardware.json_file import write_json
-from hardware.poor_fit import PoorFit
-from hardware.rig import read_intrinsics
-from hardware.rig_config import RigConfig
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.setting_up import measure_hand_eye, measure_lens
+from hardware.agents.human import Terminal
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.safe_robot import SafeRobot
+from hardware.calibration.calibration import Calibration
+from hardware.calibration.charuco import BoardSpec, Corners
+from hardware.calibration.poor_fit import PoorFit
+from hardware.cameras.camera import CameraError, Frame
+from hardware.measuring.kept_measurements import Kept, gather
+from hardware.measuring.with_board import measure_hand_eye, measure_lens
+from hardware.rig.config import RigConfig
+from hardware.rig.rig import read_intrinsics
+from hardware.support.json_file import write_json
 from warp_deform.errors import InputError
 
 VIEWS = 10
@@ -128,7 +128,7 @@ class Bench:
         self.seen = 0
         self.asked: list[str] = []
         self.fail: Callable[[str], str | None] = lambda text: None
-        monkeypatch.setattr("hardware.setting_up.find_corners", self.corners)
+        monkeypatch.setattr("hardware.measuring.with_board.find_corners", self.corners)
 
     def corners(self, rgb: np.ndarray, board: BoardSpec) -> Corners:
         """The corners of the board, which is printed with squares of `BOARD`."""
@@ -312,7 +312,7 @@ class Desk:
         self.seen = 0
         self.asked: list[str] = []
         self.stop: tuple[str, ...] = ()
-        monkeypatch.setattr("hardware.setting_up.find_corners", self.corners)
+        monkeypatch.setattr("hardware.measuring.with_board.find_corners", self.corners)
 
     def corners(self, rgb: np.ndarray, board: BoardSpec) -> Corners:
         self.seen += 1

@@ -1,5 +1,8 @@
 """The direction of imports, read from every file: hardware -> warp_deform <- learning.
 
+Within a package the rooms (folders, and files beside them) stand on floors: what is imported stands
+below, and no two files know each other, however many lie between them.
+
 One named exception: hardware may load `learning.policy` inside a function. The command's table
 names verbs as "module:function" strings, which stand outside this rule because nothing is imported
 until a verb is called.
@@ -24,6 +27,20 @@ MAY_IMPORT = {
 }
 OURS = {*MAY_IMPORT, "tests", "examples", "benchmarks"}
 LAZY_EXCEPTION = ("hardware", "learning.policy")
+FLOORS = {
+    "hardware": [
+        "command",
+        "measuring",
+        "agents",
+        "rig episodes",
+        "twin recordings",
+        "calibration",
+        "vision backends emulator",
+        "arm cameras",
+        "support",
+    ],
+}
+"""Rooms from top to bottom; those of one floor do not know each other."""
 OPTIONAL = {
     "pybullet", "pybullet_data", "ray", "tensorboard", "h5py", "panda_py",
     "franky", "frankapy", "pyk4a", "pyrealsense2",
@@ -100,15 +117,89 @@ def test_imports_point_one_way(path: Path) -> None:
         assert "sys.path." not in source
 
 
+def modules(package: str) -> dict[str, set[str]]:
+    """By dotted name, the modules of `package` that each of them imports, lazily or not."""
+    found = {}
+    for path in FILES:
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        if parts[0] == package:
+            found[".".join(parts).removesuffix(".__init__")] = path
+    arrows: dict[str, set[str]] = {}
+    for name, path in found.items():
+        every = imports(path.read_text(), name, is_package=path.name == "__init__.py")
+        # `from .b import c` names the module a.b.c where there is one, else a.b
+        named = {
+            item.module if item.module in found else item.module.rpartition(".")[0]
+            for item in every
+        }
+        arrows[name] = named & found.keys()
+    return arrows
+
+
+def room(module: str) -> str:
+    """The folder, or the file, that a module of a package stands in; empty for the package."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def upward(arrows: dict[str, set[str]], floors: list[str]) -> list[str]:
+    """Imports that do not go down."""
+    level = {name: k for k, names in enumerate(floors) for name in names.split()}
+    return [
+        f"{module} imports {other}"
+        for module, others in sorted(arrows.items())
+        for other in sorted(others)
+        if room(module) and room(module) != room(other)
+        and (not room(other) or level[room(module)] >= level[room(other)])
+    ]  # fmt: skip
+
+
+def circle(arrows: dict[str, set[str]]) -> list[str]:
+    """Modules of which each imports the next, and the last the first; none where there are none."""
+    left = {name: set(others) - {name} for name, others in arrows.items()}
+    while True:
+        ends = {name for name, others in left.items() if not others & left.keys()}
+        if not ends:
+            break
+        left = {name: others for name, others in left.items() if name not in ends}
+    trail: list[str] = []
+    step = min(left, default=None)
+    while step is not None and step not in trail:
+        trail.append(step)
+        step = min(left[step] & left.keys())
+    return trail[trail.index(step) :] if step is not None else []
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_rooms_stand_on_floors(package: str) -> None:
+    arrows = modules(package)
+    named = [name for floor in FLOORS[package] for name in floor.split()]
+    assert sorted(named) == sorted({room(name) for name in arrows} - {""})
+    assert upward(arrows, FLOORS[package]) == []
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_no_files_import_each_other(package: str) -> None:
+    assert circle(modules(package)) == []
+
+
+def test_a_circle_and_an_upward_import_are_found() -> None:
+    arrows = {"p.a.x": {"p.b.y"}, "p.b.y": {"p.c"}, "p.c": {"p.b.y", "p.d"}, "p.d": set()}
+    assert circle(arrows) == ["p.b.y", "p.c"]
+    assert circle({"p.a": {"p.b"}, "p.b": set()}) == []
+    assert upward(arrows, ["a", "b", "c", "d"]) == ["p.c imports p.b.y"]
+    assert upward(arrows, ["a", "b c", "d"]) == ["p.b.y imports p.c", "p.c imports p.b.y"]
+    assert upward({"p.a": {"p"}, "p": set()}, ["a"]) == ["p.a imports p"]
+
+
 @pytest.mark.parametrize(
     ("module", "source"),
     [
         ("warp_deform.env", "import learning"),
         ("warp_deform.env", "def f():\n    from learning.policy import load"),
         ("warp_deform.env", "from hardware import safety"),
-        ("learning.policy", "import hardware.safety"),
-        ("hardware.episode", "from learning.policy import load"),
-        ("hardware.episode", "def f():\n    import learning.training"),
+        ("learning.policy", "import hardware.arm.safe_robot"),
+        ("hardware.episodes.episode", "from learning.policy import load"),
+        ("hardware.episodes.episode", "def f():\n    import learning.training"),
         ("hardware.backends.panda", "import panda_py"),
         ("warp_deform.env", "import tests.test_cli"),
     ],
@@ -122,7 +213,7 @@ def test_a_wrong_import_is_found(module: str, source: str) -> None:
     [
         ("warp_deform.tasks.task", "from ..objects import cable"),
         ("learning.policy", "from warp_deform.episodes import Episode"),
-        ("hardware.episode", "def f():\n    from learning.policy import load"),
+        ("hardware.episodes.episode", "def f():\n    from learning.policy import load"),
         ("hardware.backends.panda", "def connect():\n    import panda_py"),
     ],
 )

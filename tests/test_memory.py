@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from franka_episodes import GOAL, TASK, chain
 
-from hardware.choosers import PolicyChooser
-from hardware.episode import Observation
-from hardware.pick_place import PickPlaceAction, PickPlaceOutcome
+from hardware.agents.choosers import PolicyChooser
+from hardware.arm.pick_place import PickPlaceAction, PickPlaceOutcome
+from hardware.episodes.episode import Observation
 from learning.batches import task_lifts
 from learning.memory import MISSED, PUT_DOWN, RESTING, Memory
 from learning.models.transporter import PRESETS
@@ -135,7 +135,7 @@ def test_a_pick_without_finger_room_is_passed_over_unless_there_is_no_other(
 
         asked.clear()
         chooser.reset()
-        monkeypatch.setattr("hardware.choosers.has_finger_room", room)
+        monkeypatch.setattr("hardware.agents.choosers.has_finger_room", room)
 
     after(2)
     action = chosen(chooser, 0.45)

@@ -10,6 +10,7 @@ import pytest
 from emulator_client import min_jerk
 from fci_wire import DEVIATIONS
 
+from hardware.arm.panda import HOME_Q
 from hardware.emulator.arm import Arm
 from hardware.emulator.model_library import model_library
 from hardware.emulator.motion_limits import (
@@ -32,7 +33,6 @@ from hardware.emulator.protocol import (
     RobotMode,
 )
 from hardware.emulator.robot import EmulatedRobot
-from hardware.panda_arm import HOME_Q
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 HOME = np.array(HOME_Q)

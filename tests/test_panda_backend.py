@@ -24,12 +24,12 @@ from hardware import (
     UnreachablePose,
     UserStopped,
 )
+from hardware.arm.panda import PandaKinematics
+from hardware.arm.stop_latch import StopLatch
+from hardware.arm.straight_line import distance
 from hardware.backends.franka_config import NetworkedConfig
 from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
-from hardware.panda_arm import PandaKinematics
-from hardware.stop_latch import StopLatch
-from hardware.straight_line import distance
 from warp_deform.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -26,13 +26,13 @@ from hardware import (
     ReflexError,
     RobotMode,
 )
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.table_plane import TablePlane
 from hardware.backends.franka_config import NetworkedConfig
 from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.server import EmulatorConfig
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.table_plane import TablePlane
 
 ROOT = Path(__file__).resolve().parent.parent
 pytestmark = [

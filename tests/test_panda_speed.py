@@ -9,11 +9,11 @@ import pytest
 from emulator_client import HOME
 from emulator_worlds import TABLE_Z
 
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.table_plane import TablePlane
 from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.table_plane import TablePlane
 
 pytestmark = [
     pytest.mark.emulator,

@@ -10,20 +10,20 @@ from hypothesis import strategies as st
 from safety_spy import ARM, HOME, SpyRobot, assert_within
 
 from hardware import MoveResult, RobotError, SafetyViolation
-from hardware.backends.dry_run import DryRunRobot
-from hardware.calibration import Calibration
-from hardware.homography import plane_homography
-from hardware.panda_arm import HOME_Q
-from hardware.pick_place import (
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import HOME_Q
+from hardware.arm.pick_place import (
     PickPlaceAction,
     PickPlaceConfig,
     PickPlaceOutcome,
     execute,
     way_points,
 )
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.table_plane import TablePlane
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.table_plane import TablePlane
+from hardware.backends.dry_run import DryRunRobot
+from hardware.calibration.calibration import Calibration
+from hardware.calibration.homography import plane_homography
 from warp_deform.errors import InputError
 
 TABLE = TablePlane(0.012, slope_x=0.01, slope_y=-0.02)

@@ -11,13 +11,13 @@ from emulator_client import HOME
 from emulator_worlds import TABLE_Z
 
 from hardware import RobotMode, SafetyViolation
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.pick_place import PickPlaceAction, PickPlaceOutcome, execute
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.table_plane import TablePlane, fit_table_plane
 from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
-from hardware.pick_place import PickPlaceAction, PickPlaceOutcome, execute
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.table_plane import TablePlane, fit_table_plane
-from hardware.touch_off import TouchOffConfig, touch_off
+from hardware.measuring.touch_off import TouchOffConfig, touch_off
 
 pytestmark = [
     pytest.mark.emulator,

@@ -17,13 +17,13 @@ import pytest
 from record_until_killed import ACTION, CONFIG, INTRINSICS, frame, mask, observe, result
 
 from hardware import RobotState
+from hardware.arm.pick_place import PickPlaceOutcome
 from hardware.backends.dry_run import DryRunRobot
-from hardware.camera import FileCamera
-from hardware.packing import pack
-from hardware.pick_place import PickPlaceOutcome
-from hardware.recorder import EpisodeRecorder
-from hardware.recording import Recording
-from hardware.scoring import SUCCESS_IOU, score_masks, score_recording
+from hardware.cameras.camera import FileCamera
+from hardware.recordings.pack import pack
+from hardware.recordings.recorder import EpisodeRecorder
+from hardware.recordings.recording import Recording
+from hardware.recordings.scoring import SUCCESS_IOU, score_masks, score_recording
 from warp_deform.episodes import EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
 from warp_deform.tasks.metrics import mask_iou
@@ -312,9 +312,9 @@ def test_readings_keep_their_rate_whatever_one_takes(
 
     with EpisodeRecorder(tmp_path / "a", CONFIG) as recorder:
         observe(recorder, 0, 1)
-        monkeypatch.setattr("hardware.recorder.time", clock)
+        monkeypatch.setattr("hardware.recordings.recorder.time", clock)
         names = SimpleNamespace(Event=lambda: clock, Thread=threading.Thread)
-        monkeypatch.setattr("hardware.recorder.threading", names)
+        monkeypatch.setattr("hardware.recordings.recorder.threading", names)
         recorder._start = 0.0
         with recorder.following(Slow()):
             assert clock.done.wait(30.0)

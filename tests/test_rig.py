@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from franka_episodes import CALIBRATION
 
-from hardware.goal_file import write_picture
-from hardware.rig import open_rig, read_calibration, read_intrinsics, read_table
-from hardware.rig_config import RigConfig
-from hardware.table_plane import TablePlane
+from hardware.arm.table_plane import TablePlane
+from hardware.episodes.goals import write_picture
+from hardware.rig.config import RigConfig
+from hardware.rig.rig import open_rig, read_calibration, read_intrinsics, read_table
 from warp_deform.errors import InputError
 
 

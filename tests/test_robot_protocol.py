@@ -25,13 +25,13 @@ from hardware import (
     UnreachablePose,
     UserStopped,
 )
-from hardware.backends.bounded import run_bounded
+from hardware.arm.joint_path import path_pieces
+from hardware.arm.panda import DQ_MAX, HOME_Q, Q_MAX, Q_MIN, PandaKinematics
+from hardware.arm.robot import REFLEX_ADVICE, check_joints, check_pose
+from hardware.arm.straight_line import distance, straight_line
 from hardware.backends.dry_run import DryRunConfig, DryRunRobot, RecordedCommand
 from hardware.backends.libfranka_errors import reflex_names, typed_error
-from hardware.joint_path import path_pieces
-from hardware.panda_arm import DQ_MAX, HOME_Q, Q_MAX, Q_MIN, PandaKinematics
-from hardware.robot import REFLEX_ADVICE, check_joints, check_pose
-from hardware.straight_line import distance, straight_line
+from hardware.support.bounded import run_bounded
 from warp_deform.errors import InputError, WarpDeformError
 
 ROOT = Path(__file__).resolve().parent.parent

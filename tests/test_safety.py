@@ -17,10 +17,10 @@ from hardware import (
     SafetyViolation,
     UserStopped,
 )
-from hardware.safety import SafeRobot
-from hardware.safety_limits import PATH_TOLERANCE, SafetyLimits, dense_path
-from hardware.straight_line import StraightLine
-from hardware.table_plane import TablePlane
+from hardware.arm.limits import PATH_TOLERANCE, SafetyLimits, dense_path
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.straight_line import StraightLine
+from hardware.arm.table_plane import TablePlane
 from warp_deform.errors import InputError
 
 FLAT = SafetyLimits(table=TablePlane(0.0))

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from safety_spy import ARM, HOME, SpyRobot, assert_within, joints_at, pose
 
 from hardware import RobotError
-from hardware.panda_arm import Q_MAX, Q_MIN
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.straight_line import StraightLine, straight_line
-from hardware.table_plane import TablePlane
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import Q_MAX, Q_MIN
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.straight_line import StraightLine, straight_line
+from hardware.arm.table_plane import TablePlane
 from warp_deform.errors import InputError
 
 FLAT = SafetyLimits(table=TablePlane(0.0))

@@ -16,12 +16,12 @@ from safety_spy import ARM, HOME, joints_at, pose
 from watched_sim import DT, Watched, watched
 
 from hardware import RobotError
-from hardware.joint_path import corner_cuts, path_pieces
-from hardware.motion_checks import LEVEL
-from hardware.panda_arm import DQ_MAX
-from hardware.path_speed import MAX_TURN_SPEED, OVERSHOOT, fitting_share
-from hardware.safety_limits import SafetyLimits, dense_path
-from hardware.table_plane import TablePlane
+from hardware.arm.joint_path import corner_cuts, path_pieces
+from hardware.arm.limits import SafetyLimits, dense_path
+from hardware.arm.motion_checks import LEVEL
+from hardware.arm.panda import DQ_MAX
+from hardware.arm.path_speed import MAX_TURN_SPEED, OVERSHOOT, fitting_share
+from hardware.arm.table_plane import TablePlane
 from warp_deform.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -13,15 +13,15 @@ from safety_spy import ARM, HOME, SpyRobot, pose
 from watched_sim import watched
 
 from hardware import MotionError, RobotError
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import DQ_MAX
+from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.stop_latch import StopLatch
+from hardware.arm.table_plane import TablePlane
 from hardware.backends.dry_run import DryRunRobot
-from hardware.backends.sim import SimRobot
 from hardware.emulator.world import TableWorld
-from hardware.panda_arm import DQ_MAX
-from hardware.pick_place import PickPlaceAction, PickPlaceConfig
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.stop_latch import StopLatch
-from hardware.table_plane import TablePlane
+from hardware.twin.robot import SimRobot
 from warp_deform.errors import InputError
 
 FLAT = SafetyLimits(table=TablePlane(0.0))
@@ -99,7 +99,7 @@ def test_what_is_checked_is_what_is_sent() -> None:
     target = pose(z=0.3)
 
     def meddling(arm: object, q: np.ndarray, T: np.ndarray, *, speed: float) -> object:
-        from hardware.straight_line import straight_line
+        from hardware.arm.straight_line import straight_line
 
         target[2, 3] = -0.5
         return straight_line(ARM, q, T, speed=speed)

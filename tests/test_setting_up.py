@@ -13,16 +13,21 @@ from safety_spy import ARM, HOME, SpyRobot, joints_at, pose
 from test_calibration_file import TouchedTable
 
 from hardware import GraspError, RobotMode
-from hardware.calibration import Calibration
-from hardware.camera import Frame
-from hardware.homography import plane_homography
-from hardware.human import Terminal
-from hardware.rig import read_table
-from hardware.rig_config import RigConfig
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.setting_up import measure_camera, measure_hand_eye, measure_lens, measure_table
-from hardware.table_plane import TablePlane
+from hardware.agents.human import Terminal
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.table_plane import TablePlane
+from hardware.calibration.calibration import Calibration
+from hardware.calibration.homography import plane_homography
+from hardware.cameras.camera import Frame
+from hardware.measuring.with_board import (
+    measure_camera,
+    measure_hand_eye,
+    measure_lens,
+    measure_table,
+)
+from hardware.rig.config import RigConfig
+from hardware.rig.rig import read_table
 from warp_deform.errors import InputError
 
 # The long side of the picture along y; a lens so narrow sees no more of the table from home.

@@ -15,17 +15,17 @@ from safety_spy import HOME, SpyRobot, joints_at, pose
 from test_kept_measurements import BlindCamera
 from test_setting_up import setup
 
-from hardware.calibration import Calibration
-from hardware.homography import apply_homography, plane_homography
-from hardware.human import Terminal
-from hardware.json_file import write_json
-from hardware.points_file import TouchedPoint, read_points, write_points
-from hardware.poor_fit import PoorFit
-from hardware.rig import read_calibration
-from hardware.rig_config import RigConfig
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.touching_points import click_point, measure_points, points_from_file, type_point
+from hardware.agents.human import Terminal
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.safe_robot import SafeRobot
+from hardware.calibration.calibration import Calibration
+from hardware.calibration.homography import apply_homography, plane_homography
+from hardware.calibration.poor_fit import PoorFit
+from hardware.measuring.points_file import TouchedPoint, read_points, write_points
+from hardware.measuring.with_points import click_point, measure_points, points_from_file, type_point
+from hardware.rig.config import RigConfig
+from hardware.rig.rig import read_calibration
+from hardware.support.json_file import write_json
 from warp_deform.cli import main
 from warp_deform.errors import InputError
 

@@ -18,18 +18,18 @@ from hardware import (
     RobotMode,
     UnreachablePose,
 )
-from hardware.backends.sim import SimRobot, SimRobotConfig
-from hardware.camera import CameraError
-from hardware.cameras.sim import SimCamera, SimCameraConfig, sim_calibration
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.panda import HOME_Q, PandaKinematics
+from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig, PickPlaceOutcome, execute
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.straight_line import distance
+from hardware.cameras.camera import CameraError
 from hardware.emulator import Contact, EmulatorProcess, Hand, TableWorld
-from hardware.panda_arm import HOME_Q, PandaKinematics
-from hardware.pick_place import PickPlaceAction, PickPlaceConfig, PickPlaceOutcome, execute
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
-from hardware.segmentation import segment_cable
-from hardware.straight_line import distance
-from hardware.top_down_view import TopDownView
-from hardware.twin import CableTwin, TwinConfig
+from hardware.twin.camera import SimCamera, SimCameraConfig, sim_calibration
+from hardware.twin.robot import SimRobot, SimRobotConfig
+from hardware.twin.twin import CableTwin, TwinConfig
+from hardware.vision.segmentation import segment_cable
+from hardware.vision.top_down_view import TopDownView
 from warp_deform.errors import InputError
 from warp_deform.robots.jaw_primitive import JawActionConfig
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal

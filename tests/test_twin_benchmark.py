@@ -15,9 +15,9 @@ import pytest
 from franka_episodes import CALIBRATION, LIMITS, drawn_camera
 from test_episode import Arm
 
-from hardware.camera import CameraError, Frame
-from hardware.safety import SafeRobot
-from hardware.top_down_view import TopDownView
+from hardware.arm.safe_robot import SafeRobot
+from hardware.cameras.camera import CameraError, Frame
+from hardware.vision.top_down_view import TopDownView
 from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -82,7 +82,7 @@ def test_an_episode_is_played(twin: ModuleType, monkeypatch: pytest.MonkeyPatch)
 
 
 def _short(run_episode: object) -> object:
-    from hardware.episode import EpisodeConfig
+    from hardware.episodes.episode import EpisodeConfig
 
     return lambda *a, **k: run_episode(*a, **k, config=EpisodeConfig(max_actions=1))
 

@@ -14,23 +14,24 @@ from test_episode import Arm, episode
 from test_rig import filmed
 from test_setting_up import Homing
 
-from hardware.calibration import Calibration
-from hardware.cameras.sim import SimCameraConfig, sim_calibration
-from hardware.human import Terminal
-from hardware.measuring import touched_table
-from hardware.packing import pack
-from hardware.panda_arm import HOME_Q, PandaKinematics
-from hardware.picture_coverage import camera_pose, check_picture, outside
-from hardware.points_file import origin_line
-from hardware.reach import check_workplace
-from hardware.rig import open_rig, read_calibration
-from hardware.rig_config import RigConfig
-from hardware.safety import SafeRobot
-from hardware.setting_up import measure_table
-from hardware.table_plane import TablePlane
-from hardware.task_frame import fits_task, to_base, to_task
-from hardware.twin import TwinConfig
-from hardware.workplace import Workplace, workplace_of
+from hardware.agents.human import Terminal
+from hardware.arm.panda import HOME_Q, PandaKinematics
+from hardware.arm.safe_robot import SafeRobot
+from hardware.arm.table_plane import TablePlane
+from hardware.calibration.calibration import Calibration
+from hardware.calibration.picture_coverage import camera_pose, check_picture, outside
+from hardware.calibration.reach import check_workplace
+from hardware.calibration.workplace import Workplace
+from hardware.measuring.points_file import origin_line
+from hardware.measuring.steps import touched_table
+from hardware.measuring.with_board import measure_table
+from hardware.recordings.pack import pack
+from hardware.rig.config import RigConfig
+from hardware.rig.rig import open_rig, read_calibration
+from hardware.rig.workplace import workplace_of
+from hardware.twin.camera import SimCameraConfig, sim_calibration
+from hardware.twin.twin import TwinConfig
+from hardware.vision.task_frame import fits_task, to_base, to_task
 from warp_deform.cli import main
 from warp_deform.errors import InputError
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
@@ -138,7 +139,7 @@ def test_the_whole_picture_needs_no_cure_and_no_lens_may_have_one() -> None:
 def test_the_camera_is_where_its_homography_says() -> None:
     """On a table that slopes, too; the sign and the scale are not in a homography."""
     true = PandaKinematics().pose(np.array(TILTED)) @ SimCameraConfig().tcp_T_camera
-    from hardware.homography import plane_homography
+    from hardware.calibration.homography import plane_homography
 
     table = TablePlane(0.02, slope_x=0.03, slope_y=-0.02)
     H = plane_homography(CALIBRATION.intrinsics, true, table)

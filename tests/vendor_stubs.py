@@ -8,8 +8,8 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 
-from hardware.panda_arm import HOME_Q, PandaKinematics
-from hardware.straight_line import straight_line
+from hardware.arm.panda import HOME_Q, PandaKinematics
+from hardware.arm.straight_line import straight_line
 
 ARM = PandaKinematics()
 

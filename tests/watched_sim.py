@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from safety_spy import HOME
 
-from hardware.backends.sim import SimRobot, SimRobotConfig
+from hardware.arm.limits import SafetyLimits
+from hardware.arm.safe_robot import SafeRobot
 from hardware.emulator.world import Contact, Hand, TableWorld
-from hardware.safety import SafeRobot
-from hardware.safety_limits import SafetyLimits
+from hardware.twin.robot import SimRobot, SimRobotConfig
 
 DT = 2e-3  # [s]
 

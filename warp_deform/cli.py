@@ -82,7 +82,7 @@ VERBS: dict[str, Verb] = {
         "warp_deform.commands:gradcheck", "compare derivatives with finite differences"
     ),
     "franka": Verb(
-        "hardware.cli:franka", "the cable task on a Franka arm or its twin",
+        "hardware.command.franka:franka", "the cable task on a Franka arm or its twin",
         kept="episodes already written are complete",
     ),
     "doctor": Verb("warp_deform.commands:doctor", "versions, devices, caches and what is missing"),

@@ -30,6 +30,11 @@ class Revision:
     commit: str | None = None
     dirty: bool | None = None
 
+    @property
+    def described(self) -> str:
+        """As `git describe` has it: the commit, "-dirty" behind it where edited; empty without."""
+        return (self.commit or "") + ("-dirty" if self.dirty else "")
+
     def __str__(self) -> str:
         """As people read it, "0.1.0 at 581dce6a1b2c, edited"."""
         if self.commit is None:

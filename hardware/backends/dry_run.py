@@ -11,18 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ..closing import Closing
-from ..panda_arm import GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
-from ..robot import (
-    MoveResult,
-    RobotMode,
-    RobotState,
-    check_joints,
-    check_pose,
-    check_range,
-)
-from ..stop_latch import StopLatch
-from ..straight_line import straight_line
+from ..arm.panda import GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
+from ..arm.robot import MoveResult, RobotMode, RobotState, check_joints, check_pose, check_range
+from ..arm.stop_latch import StopLatch
+from ..arm.straight_line import straight_line
+from ..support.closing import Closing
 
 __all__ = ["DryRunConfig", "DryRunRobot", "RecordedCommand"]
 

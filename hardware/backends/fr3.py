@@ -24,9 +24,8 @@ import numpy as np
 from warp_deform.errors import InputError
 from warp_deform.extras import install_extra
 
-from ..closing import Closing
-from ..panda_arm import DQ_MAX, GRIPPER_MAX_WIDTH
-from ..robot import (
+from ..arm.panda import DQ_MAX, GRIPPER_MAX_WIDTH
+from ..arm.robot import (
     BackendMissing,
     ConnectionFailed,
     ConnectionLost,
@@ -43,9 +42,10 @@ from ..robot import (
     check_pose,
     check_range,
 )
-from ..stop_latch import StopLatch
-from ..straight_line import distance
-from .bounded import run_bounded
+from ..arm.stop_latch import StopLatch
+from ..arm.straight_line import distance
+from ..support.bounded import run_bounded
+from ..support.closing import Closing
 from .franka_config import RECOVERY_TIMEOUT, NetworkedConfig
 from .libfranka_errors import typed_error
 

@@ -24,9 +24,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..closing import Closing
-from ..panda_arm import DQ_MAX, GRIPPER_MAX_WIDTH
-from ..robot import (
+from ..arm.panda import DQ_MAX, GRIPPER_MAX_WIDTH
+from ..arm.robot import (
     BackendMissing,
     ConnectionFailed,
     ConnectionLost,
@@ -41,9 +40,10 @@ from ..robot import (
     check_pose,
     check_range,
 )
-from ..stop_latch import StopLatch
-from ..straight_line import distance
-from .bounded import run_bounded
+from ..arm.stop_latch import StopLatch
+from ..arm.straight_line import distance
+from ..support.bounded import run_bounded
+from ..support.closing import Closing
 from .franka_config import FrankaConfig
 from .libfranka_errors import typed_error
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from ..robot import ConnectionLost, MotionError, ReflexError, RobotError, UserStopped
+from ..arm.robot import ConnectionLost, MotionError, ReflexError, RobotError, UserStopped
 
 __all__ = ["reflex_names", "typed_error"]
 

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ..closing import Closing
-from ..joint_path import path_pieces
-from ..panda_arm import GRIPPER_MAX_WIDTH
-from ..robot import (
+from ..arm.joint_path import path_pieces
+from ..arm.panda import GRIPPER_MAX_WIDTH
+from ..arm.robot import (
     GraspError,
     MotionError,
     MoveResult,
@@ -28,7 +27,8 @@ from ..robot import (
     check_pose,
     check_range,
 )
-from ..straight_line import distance, straight_line
+from ..arm.straight_line import distance, straight_line
+from ..support.closing import Closing
 from .franka_config import RECOVERY_TIMEOUT, NetworkedConfig
 from .libfranka_errors import reflex_names
 from .panda_link import BUSY, PandaLink

@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..panda_arm import DDQ_MAX, DQ_MAX, GRIPPER_MAX_WIDTH
-from ..robot import (
+from ..arm.panda import DDQ_MAX, DQ_MAX, GRIPPER_MAX_WIDTH
+from ..arm.robot import (
     BackendMissing,
     ConnectionFailed,
     ConnectionLost,
@@ -28,8 +28,8 @@ from ..robot import (
     MotionError,
     RobotError,
 )
-from ..stop_latch import StopLatch
-from .bounded import POLL, run_bounded
+from ..arm.stop_latch import StopLatch
+from ..support.bounded import POLL, run_bounded
 from .franka_config import NetworkedConfig
 from .libfranka_errors import typed_error
 

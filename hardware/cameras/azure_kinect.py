@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..camera import CameraError, CameraIntrinsics
+from .camera import CameraError, CameraIntrinsics
 from .streaming import StreamConfig, StreamingCamera
 
 __all__ = ["AzureKinectCamera"]

@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_deform.extras import install_extra
 
-from ..camera import CameraError, CameraIntrinsics
+from .camera import CameraError, CameraIntrinsics
 from .streaming import StreamConfig, StreamingCamera
 
 __all__ = ["RealSenseCamera"]

@@ -13,9 +13,9 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from ..backends.bounded import run_bounded
-from ..camera import CameraError, CameraIntrinsics, Frame
-from ..closing import Closing
+from ..support.bounded import run_bounded
+from ..support.closing import Closing
+from .camera import CameraError, CameraIntrinsics, Frame
 
 __all__ = ["Device", "StreamConfig", "StreamingCamera"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ..camera import CameraError, CameraIntrinsics
+from .camera import CameraError, CameraIntrinsics
 from .streaming import StreamConfig, StreamingCamera
 
 __all__ = ["UVCCamera"]

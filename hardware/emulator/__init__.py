@@ -5,7 +5,7 @@ The vendor's own client, libfranka 0.9 as panda-python brings it, connects to it
     with EmulatorProcess() as emulator:
         panda = panda_py.Panda(emulator.host)
 
-or from a shell, `python -m hardware.emulator`.
+or from a shell, `warp-deform franka emulate`.
 
 It has both ports, all four motion generators and torque control, the gripper, loss of
 communication, user stop and recovery, and a hook for a simulated world around the hand. It raises

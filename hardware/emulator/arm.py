@@ -12,7 +12,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from ..panda_arm import DQ_MAX, Q_MAX, Q_MIN, flange_T_tcp
+from ..arm.panda import DQ_MAX, Q_MAX, Q_MIN, flange_T_tcp
 from .frames import difference, is_frame, moved_on
 from .model_library import INERTIA, ModelLibrary
 from .motion_limits import (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..panda_arm import GRIPPER_MAX_WIDTH
+from ..arm.panda import GRIPPER_MAX_WIDTH
 from .protocol import GripperCommand, GripperStatus, Request
 from .requests import GRIPPER_FORMS, read
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from warp_deform.errors import WarpDeformError
 
-from ..panda_arm import DH_A, DH_ALPHA, DH_D, FLANGE
+from ..arm.panda import DH_A, DH_ALPHA, DH_D, FLANGE
 
 __all__ = ["INERTIA", "CompilerMissing", "ModelLibrary", "find_compiler", "model_library"]
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..panda_arm import DDQ_MAX, DQ_MAX, TAU_MAX
+from ..arm.panda import DDQ_MAX, DQ_MAX, TAU_MAX
 
 __all__ = [
     "DT",

@@ -16,7 +16,7 @@ import numpy as np
 
 from warp_deform.errors import WarpDeformError
 
-from ..closing import Closing
+from ..support.closing import Closing
 from .model_library import model_library
 from .server import AddressTaken, EmulatorConfig, FciServer
 from .world import TableWorld, World

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..panda_arm import GRIPPER_MAX_WIDTH
+from ..arm.panda import GRIPPER_MAX_WIDTH
 from .frames import is_frame
 from .protocol import GripperCommand, GripperStatus, MoveStatus, Request, RobotCommand, SetStatus
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from warp_deform.errors import InputError, WarpDeformError
 
-from ..panda_arm import GRIPPER_MAX_WIDTH, HOME_Q
+from ..arm.panda import GRIPPER_MAX_WIDTH, HOME_Q
 from .clients import Client, Port, is_loopback
 from .gripper import Gripper
 from .model_library import ModelLibrary

@@ -1,0 +1,170 @@
+"""A person at the table: confirms plans, clears problems, shows where to pick and place."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from typing import TextIO
+
+import numpy as np
+
+from warp_deform.errors import InputError, WarpDeformError
+
+from ..arm.pick_place import PickPlaceAction
+from ..episodes.episode import Observation
+from ..episodes.operators import Answer, Plan
+from ..vision.overlay import draw_action
+from ..vision.top_down_view import TopDownView
+from .choosers import tangent_at
+
+__all__ = ["HumanChooser", "Point", "Terminal", "clicked", "typed"]
+
+Point = tuple[float, float]
+"""Row and column in the view."""
+
+
+class Terminal:
+    """An operator at a terminal.
+
+    Enter goes ahead, "s" asks for another action, "q" stops; the end of the input stops.
+
+    Args:
+        ask: shows a text and returns the answer; default: on stderr and from stdin
+    """
+
+    attends = True
+
+    def __init__(self, ask: Callable[[str], str] | None = None) -> None:
+        self._ask = ask or _prompt
+
+    def confirm(self, plan: Plan) -> Answer:
+        """Show the plan and wait for an answer."""
+        if plan.action is None:
+            text = "the arm goes to its home pose"
+        else:
+            turn = math.degrees(plan.action.place_yaw - plan.action.pick_yaw)
+            heights = ", ".join(f"{name} {T[2, 3]:.3f}" for name, T in plan.poses.items())
+            text = (
+                f"action {plan.number}: pick {_xy(plan.action.pick_xy)} at "
+                f"{math.degrees(plan.action.pick_yaw):.0f} deg, place {_xy(plan.action.place_xy)} "
+                f"turned by {turn:.0f} deg; z [m]: {heights}"
+            )
+            if plan.picture is not None:
+                text += f"\n  drawn in {plan.picture}"
+        answers = {"": Answer.DO, "s": Answer.SKIP, "q": Answer.STOP}
+        while True:
+            said = self._ask(f"{text}\n  Enter: do it, s: another, q: stop > ").strip().lower()
+            if said in answers:
+                return answers[said]
+
+    def go_on(self, problem: WarpDeformError) -> bool:
+        """Show the problem and wait until it is cleared, or the episode given up."""
+        said = self._ask(f"{problem}\n  Enter: cleared, go on; q: stop > ")
+        return said.strip().lower() != "q"
+
+    def wait(self, text: str) -> bool:
+        """Wait for something to be done by hand; False where the operator stops instead."""
+        return self.answer(text, "Enter: done") is not None
+
+    def answer(self, text: str, choices: str) -> str | None:
+        """Return what the operator says to a text, "" for Enter; None to stop.
+
+        Args:
+            choices: what may be said, for people: "Enter: done"
+        """
+        said = self._ask(f"{text}\n  {choices}, q: stop > ").strip()
+        return None if said.lower() == "q" else said
+
+
+def _prompt(text: str, source: TextIO | None = None) -> str:
+    """Ask on stderr; the end of the input counts as "q".
+
+    What was typed at a terminal before the question is no answer to it, and is dropped.
+    """
+    source = source or sys.stdin
+    if source.isatty():
+        import termios  # not on every system, and neither is a terminal
+
+        termios.tcflush(source, termios.TCIFLUSH)
+    print(text, end="", file=sys.stderr, flush=True)
+    line = source.readline()
+    return line.rstrip("\n") if line else "q"
+
+
+def _xy(xy: tuple[float, float]) -> str:
+    return f"({xy[0]:.3f}, {xy[1]:.3f})"
+
+
+class HumanChooser:
+    """A person shows where to pick and place; the fingers go across the cable there.
+
+    Args:
+        points: shown the enlarged view; returns the points of pick and place, None to stop
+        view: the workspace
+    """
+
+    name = "human"
+
+    def __init__(
+        self,
+        points: Callable[[np.ndarray, TopDownView], tuple[Point, Point] | None],
+        *,
+        view: TopDownView | None = None,
+    ) -> None:
+        self._points = points
+        self._view = view or TopDownView()
+
+    def reset(self) -> None:
+        """Nothing is remembered."""
+
+    def choose(self, seen: Observation) -> PickPlaceAction | None:
+        """See `Chooser.choose`."""
+        picture = draw_action(seen.view, self._view, mask=seen.mask, goal=seen.goal)
+        shown = self._points(picture, self._view)
+        if shown is None:
+            return None
+        pick, place = (tuple(self._view.pixel_to_base(np.array(p)).tolist()) for p in shown)
+        yaw = tangent_at(seen.mask, self._view, pick)
+        return PickPlaceAction(pick, yaw, place, yaw)
+
+
+def clicked(picture: np.ndarray, view: TopDownView) -> tuple[Point, Point] | None:
+    """Return two points clicked in a window; None where it is closed.
+
+    Raises:
+        InputError: there is no display
+    """
+    import matplotlib
+
+    if matplotlib.get_backend().lower() == "agg":
+        raise InputError("there is no display to click on; use --agent typed")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(5, 9))
+    axes.imshow(picture)
+    axes.set_title("click pick, then place; close to stop")
+    points = plt.ginput(2, timeout=0)
+    plt.close(figure)
+    if len(points) < 2:
+        return None
+    scale = picture.shape[0] / view.shape[0]
+    pick, place = (((y + 0.5) / scale - 0.5, (x + 0.5) / scale - 0.5) for x, y in points)
+    return pick, place
+
+
+def typed(picture: np.ndarray, view: TopDownView) -> tuple[Point, Point] | None:
+    """Return two points typed as "row column row column", in pixels of the view; "q" stops."""
+    rows, columns = view.shape
+    while True:
+        said = _prompt(
+            f"pick and place in the newest *_view.png ({columns} x {rows}): "
+            "row column row column, or q > "
+        )
+        if said.strip().lower() == "q":
+            return None
+        try:
+            a, b, c, d = (float(word) for word in said.split())
+        except ValueError:
+            continue
+        return (a, b), (c, d)

@@ -1,0 +1,55 @@
+"""Where a motion ended: at its target, or short of it against something."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .limits import SafetyLimits
+from .robot import MotionError, MoveResult, RobotMode, RobotState
+from .straight_line import distance
+
+__all__ = ["check_arrival", "pressed_contact"]
+
+# How far a soft arm that presses may slide from its line [m].
+_SLIDE = 6e-3
+# Share of the stop force against the motion that tells a contact from a failed motion.
+_PRESSING = 0.25
+
+
+def check_arrival(limits: SafetyLimits, reached: np.ndarray, target: np.ndarray) -> None:
+    """Refuse a measured pose (4, 4) [m] that is not at its target.
+
+    Raises:
+        MotionError: it is farther off than an arrival may be
+    """
+    off, turned = distance(reached, target)
+    tolerance = limits.arrival_tolerance_m, limits.arrival_tolerance_rad
+    if off > tolerance[0] or turned > tolerance[1]:
+        raise MotionError(
+            f"the TCP ended {1e3 * off:.1f} mm and {turned:.3f} rad from its target "
+            f"(allowed: {1e3 * tolerance[0]:.1f} mm, {tolerance[1]:.3f} rad)"
+        )
+
+
+def pressed_contact(
+    state: RobotState, start: np.ndarray, target: np.ndarray, stop_force_N: float
+) -> MoveResult | None:
+    """Return a contact where the hand ended short of its target, on its line, pressing; else None.
+
+    The arm's controller is soft: a surface a few millimetres above the target holds it with less
+    than the stop force. That is the contact that was looked for.
+
+    Args:
+        state: after the motion
+        start, target: of the line, (4, 4) [m]
+        stop_force_N: at which it was to stop
+    """
+    line = target[:3, 3] - start[:3, 3]
+    length = max(float(np.linalg.norm(line)), 1e-9)
+    done = float((state.base_T_tcp[:3, 3] - start[:3, 3]) @ line) / length
+    aside = np.linalg.norm(state.base_T_tcp[:3, 3] - start[:3, 3] - done * line / length)
+    force = -float(state.force_N[:3] @ line) / length
+    on_line = 0.0 <= done <= length and aside <= _SLIDE
+    if state.mode != RobotMode.IDLE or not on_line or force < _PRESSING * stop_force_N:
+        return None
+    return MoveResult(state.base_T_tcp, contact=True)

@@ -1,0 +1,352 @@
+"""`warp-deform franka`: the cable task on an arm, or on its twin.
+
+    warp-deform franka run --robot sim --agent planner
+
+Options are read here, and everything heavy is loaded by the verb that needs it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import arg, subcommand
+
+from warp_deform.cli import CommandOptions, Outcome
+from warp_deform.errors import InputError
+from warp_deform.flag_range import SEED, FlagRange
+from warp_deform.quiet import quiet_warp
+
+from ..rig.config import AgentName, CameraName, RigConfig, RobotName
+from .calibrate import CalibrateOptions, DoctorOptions, HomeFlag, WorkspaceFlag, calibrate, doctor
+from .emulate import EmulateOptions, emulate
+from .records import ReplayOptions, ScoreOptions, replay, score
+
+if TYPE_CHECKING:
+    from ..episodes.episode import EpisodeResult
+    from ..episodes.goals import GoalSeen
+    from ..rig.rig import Rig
+
+__all__ = ["CaptureGoalOptions", "CollectOptions", "EmulateOptions", "RunOptions", "franka"]
+
+_DRY_ACTIONS = 1
+"""Nothing moves in a dry run, so every further action would be planned on the same picture."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RigOptions(CommandOptions):
+    """Robot, camera and where their calibration is."""
+
+    robot: RobotName = "dry_run"
+    """dry_run prints commands and moves nothing, sim moves a simulated chain; panda (panda-python,
+    server version 5), fr3 (franky, 10) and frankapy (ROS) move an arm, with --execute."""
+    camera: CameraName = "sim"
+    """sim sees the simulated chain, also that of `emulate --chain`; file replays --frames."""
+    host: str | None = None
+    """Address of the robot, or of the emulator."""
+    setup: Annotated[Path, arg(metavar="DIR")] = field(default_factory=lambda: Path("franka-setup"))
+    """Folder of the calibration, see `calibrate`; not needed with --camera sim."""
+    device: str | None = None
+    """Number of a video device, or serial number of a RealSense."""
+    frames: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Recorded pictures for --camera file: the folder `frames` of an episode."""
+    seed: Annotated[int, SEED] = 0
+    """Of the simulated toss and goal, and of what an agent draws."""
+    execute: bool = False
+    """Let a real arm move; without it, its commands are printed."""
+    auto: bool = False
+    """Do not ask before every action of a real arm."""
+    home: HomeFlag = None
+    """Joint positions of the home pose [rad]; a setup has it from its calibration, and others are
+    refused. With --camera sim, any that the arm can wait at."""
+    workspace: WorkspaceFlag = None
+    """Ends of the workspace along x and y [m]; as for --home."""
+    joint_speed: Annotated[float, FlagRange(1e-3, 0.2)] = 0.05
+    """Share of the joints' greatest speeds between poses, at most 0.2; begin with 0.05."""
+
+    def rig(self) -> RigConfig:
+        """What to open."""
+        return RigConfig(**{field.name: getattr(self, field.name) for field in fields(RigConfig)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(_RigOptions):
+    """Run one episode and record it.
+
+    Nothing needs to be installed or prepared for `--robot sim`.
+    """
+
+    agent: AgentName = "planner"
+    """planner simulates actions from what the mask shows; policy is a training run's; scripted
+    knows the simulated chain; human clicks, typed types where to pick and place."""
+    policy: Annotated[Path | None, arg(metavar="RUN")] = None
+    """Training run or snapshot of cable-mask-goal, for --agent policy."""
+    goal: Annotated[Path | None, arg(metavar="FILE.png")] = None
+    """Mask to reach, see `capture-goal`; left out with --camera sim, a curve drawn by --seed."""
+    max_actions: Annotated[int | None, arg(metavar="N"), FlagRange(1, 1000)] = None
+    """Actions at most; 10, and 1 where nothing moves."""
+    budget: Annotated[int | None, arg(metavar="N"), FlagRange(1, 10_000)] = None
+    """Simulated actions that the planner spends on each real one; 32."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for the recording; left out, the next number in franka-episodes."""
+    note: str = ""
+    """The operator's words, recorded."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectOptions(RunOptions):
+    """Record episodes one after another, and pack them as demonstrations.
+
+    The packed episodes are a dataset for `warp-deform train cable-mask-goal`.
+    """
+
+    agent: AgentName = "human"
+    """Who demonstrates, see `run`."""
+    episodes: Annotated[int, arg(aliases=["-n"], metavar="N"), FlagRange(1, 100_000)] = 1
+    """Episodes to record."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureGoalOptions(_RigOptions):
+    """Write the mask of the cable as it lies now, as a goal.
+
+    With --camera sim the simulated chain is laid along a curve first.
+    """
+
+    out: Annotated[Path, arg(metavar="FILE.png")]
+    """The mask; the picture is written beside it."""
+
+
+_Options = (
+    Annotated[DoctorOptions, subcommand("doctor")]
+    | Annotated[CalibrateOptions, subcommand("calibrate")]
+    | Annotated[CaptureGoalOptions, subcommand("capture-goal")]
+    | Annotated[CollectOptions, subcommand("collect")]
+    | Annotated[RunOptions, subcommand("run")]
+    | Annotated[ReplayOptions, subcommand("replay")]
+    | Annotated[ScoreOptions, subcommand("score")]
+    | Annotated[EmulateOptions, subcommand("emulate")]
+)
+
+
+def franka(options: _Options) -> Outcome:
+    """The cable task on a Franka arm."""
+    quiet_warp()
+    if isinstance(options, DoctorOptions):
+        return doctor(options)
+    if isinstance(options, CalibrateOptions):
+        return calibrate(options)
+    if isinstance(options, CaptureGoalOptions):
+        return _capture_goal(options)
+    if isinstance(options, CollectOptions):
+        return _collect(options)
+    if isinstance(options, RunOptions):
+        return _run(options)
+    if isinstance(options, ReplayOptions):
+        return replay(options)
+    if isinstance(options, ScoreOptions):
+        return score(options)
+    return emulate(options)
+
+
+def _run(options: RunOptions) -> Outcome:
+    from ..rig.rig import open_rig
+
+    folder = options.out or _next_folder(Path("franka-episodes"))
+    clock = time.monotonic()
+    with open_rig(options.rig()) as rig:
+        result = _episode(options, rig, folder, seed=options.seed)
+    data = {**_described(options, result), "seconds": time.monotonic() - clock}
+    return Outcome(data=data, text=_text(data), failure=_failure(result))
+
+
+def _collect(options: CollectOptions) -> Outcome:
+    from warp_deform.episodes import EpisodeWriter
+
+    from ..agents.human import Terminal
+    from ..recordings.pack import pack
+    from ..rig.rig import open_rig
+    from ..twin.camera import SimCamera
+
+    if options.out is None:
+        raise InputError("collect needs --out, the folder of the dataset")
+    config = options.rig()
+    live, writer = options.out / "live", EpisodeWriter(options.out)
+    done: list[EpisodeResult] = []
+    kept = 0
+    with contextlib.ExitStack() as stack:
+        rig: Rig | None = None
+        for number in range(options.episodes):
+            seed = options.seed + number
+            if rig is None or rig.toss is not None:
+                # What is simulated is made anew, so that every episode is that of `run --seed`.
+                stack.close()
+                rig = stack.enter_context(open_rig(replace(config, seed=seed)))
+            if isinstance(rig.camera, SimCamera):
+                rig.camera.reseed(seed)
+            simulated = rig.toss is not None or options.auto
+            if not simulated and not Terminal().wait(f"episode {number + 1}: toss the cable"):
+                break
+            done.append(_episode(options, rig, _next_folder(live), seed=seed))
+            if done[-1].error is not None:
+                break
+            if not done[-1].outcomes:
+                continue
+            episode = pack(done[-1].folder, seed=int(done[-1].folder.name))
+            if episode.info.success:
+                writer.write(episode)
+                kept += 1
+            else:
+                _say(f"{done[-1].folder} is not kept as a demonstration: {_why_not(done[-1])}")
+    data = {
+        "out": options.out,
+        "episodes": len(done),
+        "demonstrations": kept,
+        "actions": sum(len(r.outcomes) for r in done),
+        "recordings": [r.folder for r in done],
+    }
+    text = f"{len(done)} episodes, {kept} of them kept as demonstrations, in {options.out}"
+    return Outcome(data=data, text=text, failure=_failure(done[-1]) if done else None)
+
+
+def _why_not(result: EpisodeResult) -> str:
+    return "it begins where it ends" if result.score is None else "it did not reach its goal"
+
+
+def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> EpisodeResult:
+    from warp_deform.revision import running_revision
+
+    from ..agents.human import Terminal
+    from ..agents.make import make_chooser
+    from ..episodes.episode import EpisodeConfig, run_episode
+    from ..episodes.goals import write_picture
+    from ..episodes.operators import Unattended
+    from ..recordings.recorder import EpisodeRecorder, RecorderConfig
+
+    config = options.rig()
+    actions = options.max_actions
+    if actions is None:
+        actions = EpisodeConfig().max_actions if config.moves else _DRY_ACTIONS
+    settings = EpisodeConfig(max_actions=actions, view=rig.view)
+    goal = _goal(options, rig, seed)
+    chooser = make_chooser(
+        options.agent, rig, goal, seed=seed, policy=options.policy, budget=options.budget
+    )
+    described = RecorderConfig(
+        robot_id=config.robot_id,
+        camera_id=config.camera_id,
+        actor=chooser.name,
+        calibration=rig.calibration.digest(),
+        config={
+            "episode": settings.to_record(),
+            "robot": config.robot,
+            "camera": config.camera,
+            "executed": config.moves,
+            "seed": seed,
+            "policy": None if options.policy is None else str(options.policy),
+        },
+        note=options.note,
+        revision=running_revision().described,
+    )
+    mask = None if goal is None else goal.mask
+    with EpisodeRecorder(folder, described, goal_mask=mask) as recorder:
+        # with these and the pictures, `replay` makes the masks again
+        rig.calibration.save(folder / "calibration.json")
+        if rig.empty is not None:
+            write_picture(folder / "empty_view.png", rig.empty)
+        return run_episode(
+            rig.robot,
+            rig.camera,
+            rig.calibration,
+            chooser,
+            recorder=recorder,
+            goal=mask,
+            config=settings,
+            operator=Terminal() if config.real and not options.auto else Unattended(),
+            empty=rig.empty,
+            toss=rig.toss,
+            say=_say,
+        )
+
+
+def _goal(options: RunOptions, rig: Rig, seed: int) -> GoalSeen | None:
+    from ..episodes.goals import read_goal, sampled_goal
+
+    if options.goal is not None:
+        return read_goal(options.goal, rig.view)
+    if options.camera == "sim":
+        return sampled_goal(seed, rig.view)
+    if isinstance(options, CollectOptions):
+        return None
+    raise InputError("run needs --goal; capture one with `warp-deform franka capture-goal`")
+
+
+def _capture_goal(options: CaptureGoalOptions) -> Outcome:
+    import numpy as np
+
+    from ..episodes.goals import sampled_goal, write_goal
+    from ..rig.rig import open_rig
+    from ..vision.segmentation import segment_cable
+
+    with open_rig(options.rig()) as rig:
+        if rig.lay is not None:
+            targets = sampled_goal(options.seed, rig.view).targets
+            assert targets is not None
+            z = float(rig.calibration.table.height_m) + 0.003
+            rig.lay(np.column_stack([targets, np.full(len(targets), z)]))
+        view = rig.view.rectify(rig.camera.read().rgb, rig.calibration)
+        mask = segment_cable(view, empty=rig.empty)
+    if not mask.any():
+        raise InputError("no cable is seen; lay it into the workspace, under even light")
+    beside = write_goal(options.out, mask, view)
+    data = {"goal": options.out, "view": beside, "pixels": int(np.count_nonzero(mask))}
+    return Outcome(data=data, text=f"{data['pixels']} px of cable: {options.out}, {beside}")
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _next_folder(parent: Path) -> Path:
+    """The folder with the next free number."""
+    return next(path for path in _numbered(parent) if not path.exists())
+
+
+def _numbered(parent: Path) -> Iterator[Path]:
+    for number in range(10**6):
+        yield parent / f"{number:04d}"
+
+
+def _described(options: RunOptions, result: EpisodeResult) -> dict[str, Any]:
+    score = result.score
+    return {
+        "folder": result.folder,
+        "robot": options.robot,
+        "camera": options.camera,
+        "agent": options.agent,
+        "executed": options.rig().moves,
+        "outcome": result.outcome,
+        "success": score is not None and score.success,
+        "actions": len(result.outcomes),
+        "outcomes": [str(outcome) for outcome in result.outcomes],
+        "iou": [] if score is None else list(score.iou),
+        "actions_to_success": None if score is None else score.actions_to_success,
+    }
+
+
+def _text(data: dict[str, Any]) -> str:
+    overlaps = " ".join(f"{value:.3f}" for value in data["iou"]) or "no goal"
+    moved = "" if data["executed"] else " (nothing moved: --robot sim, or --execute, moves)"
+    return (
+        f"{data['outcome']} after {data['actions']} actions{moved}; overlap {overlaps}\n"
+        f"recorded in {data['folder']}"
+    )
+
+
+def _failure(result: EpisodeResult) -> str | None:
+    return None if result.error is None else result.outcome.removeprefix("error: ")

@@ -1,0 +1,1 @@
+"""An episode in a closed loop, who watches it, and which goal it has."""

@@ -1,0 +1,108 @@
+"""Whoever watches the robot during an episode, or a setup: confirms plans and clears problems."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from warp_deform.errors import WarpDeformError
+
+from ..arm.pick_place import PickPlaceAction
+from ..arm.robot import MotionError, ReflexError, SafetyViolation
+from ..arm.safe_robot import SafeRobot
+
+__all__ = ["Answer", "Operator", "Plan", "Unattended", "until_cleared"]
+
+T = TypeVar("T")
+
+
+class Answer(StrEnum):
+    """What an operator says to a plan."""
+
+    DO = "do"
+    SKIP = "skip"
+    """Propose another."""
+    STOP = "stop"
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is about to happen.
+
+    Attributes:
+        action: the action; None for the way to the home pose
+        poses: its way-points by name [m], (4, 4) each
+        overlay: the action drawn on the workspace; None for the way home
+        number: of the action, from 1
+        picture: file that shows `overlay`; None where there is none
+    """
+
+    action: PickPlaceAction | None
+    poses: dict[str, np.ndarray]
+    overlay: np.ndarray | None
+    number: int
+    picture: Path | None = None
+
+
+class Operator(Protocol):
+    """Whoever watches the robot."""
+
+    attends: bool
+    """Whether a person answers. What a person has cleared is no recovery without an operator."""
+
+    def confirm(self, plan: Plan) -> Answer:
+        """Whether a plan may go ahead."""
+        ...
+
+    def go_on(self, problem: WarpDeformError) -> bool:
+        """Whether the cause of a problem is cleared and the episode may go on."""
+        ...
+
+
+class Unattended:
+    """Nobody watches: every plan goes ahead, and a reflex is recovered from; nothing else is."""
+
+    attends = False
+
+    def confirm(self, plan: Plan) -> Answer:
+        """Go ahead."""
+        return Answer.DO
+
+    def go_on(self, problem: WarpDeformError) -> bool:
+        """Only after a reflex."""
+        return isinstance(problem, ReflexError)
+
+
+def until_cleared(
+    robot: SafeRobot,
+    operator: Operator,
+    attempt: Callable[[], T],
+    *,
+    problem: MotionError | SafetyViolation | None = None,
+) -> T:
+    """Return `attempt()`, made again after each problem that the operator has cleared.
+
+    The arm is recovered before each further attempt, which may be a problem itself: Enter came
+    before the user stop was released.
+
+    Args:
+        attempt: what to do with the robot; may be made several times
+        problem: one that has come up already
+
+    Raises:
+        RobotError: a problem that is not cleared, or none that an operator can clear
+    """
+    while True:
+        if problem is not None and not operator.go_on(problem):
+            raise problem
+        try:
+            if problem is not None:
+                robot.recover(confirmed=operator.attends)
+            return attempt()
+        except (MotionError, SafetyViolation) as error:
+            problem = error

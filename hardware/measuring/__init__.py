@@ -1,0 +1,1 @@
+"""Measuring a setup step by step, with a person at the robot."""

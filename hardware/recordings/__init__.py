@@ -1,0 +1,1 @@
+"""Episodes on the disk: written while they run, read, replayed, scored and packed."""

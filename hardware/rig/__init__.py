@@ -1,0 +1,1 @@
+"""A robot, a camera and their calibration, opened together."""

@@ -1,0 +1,1 @@
+"""The robot, the camera and the cable in software: to rehearse without any of them."""
