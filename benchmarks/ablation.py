@@ -26,14 +26,15 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from learning.dataset import Demonstrations
-from learning.evaluation import evaluate_snapshot
+from learning.data.dataset import Demonstrations
+from learning.evaluation.evaluate import evaluate_snapshot
+from learning.evaluation.protocol import Protocol
 from learning.models.transporter import PRESETS
-from learning.policy import ImagePolicy, load_policy
-from learning.protocol import Protocol
-from learning.schedules import SCHEDULES
-from learning.snapshots import RunFolder
-from learning.training import TrainConfig, train
+from learning.policy.policy import ImagePolicy, load_policy
+from learning.runs.folder import RunFolder
+from learning.training.config import TrainConfig
+from learning.training.schedules import SCHEDULES
+from learning.training.train import train
 from warp_deform.collect import CollectConfig, collect
 from warp_deform.quiet import quiet_warp
 from warp_deform.tasks.registry import task as find_task

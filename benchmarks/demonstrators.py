@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bag_scenes import pierced
 from cloth_scenes import edges_of
 
-from learning.refinement import RefineConfig, refine
+from learning.refinement.refine import RefineConfig, refine
 from warp_deform.collect import CollectConfig, collect
 from warp_deform.demonstrators import DEMONSTRATORS, demonstrator, planner
 from warp_deform.episode_loop import SOLVED, play, worlds_for

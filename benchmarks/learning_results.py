@@ -16,10 +16,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from learning.report import read_runs, write_report
-from learning.schedules import preset_schedule
-from learning.share import share_run
-from learning.snapshots import RunFolder, read_json, write_json
+from learning.evaluation.share import share_run
+from learning.report.read import read_runs
+from learning.report.report import write_report
+from learning.runs.folder import RunFolder, read_json, write_json
+from learning.training.schedules import preset_schedule
 
 
 def main() -> None:

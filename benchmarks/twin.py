@@ -9,7 +9,8 @@ segmentation and recording are those of `warp-deform franka run --robot sim`; to
 of seeds that no demonstration has. Episodes whose physics cannot be trusted, the toss included, or
 that end in another error count as failed, after 10 actions. Mean actions are given over all
 episodes and over the solved ones, as the paper's. With --out, episodes already in that file are not
-played again. Intervals are 95 % and know that tosses at one goal are alike (`learning.clustered`).
+played again. Intervals are 95 % and know that tosses at one goal are alike, see
+`learning.evaluation.clustered`.
 The paper's protocol is `--tosses 1` with a policy of 24 demonstrations and 6 held out.
 """
 
@@ -34,7 +35,7 @@ from hardware.recordings.recorder import EpisodeRecorder, RecorderConfig
 from hardware.recordings.scoring import MAX_ACTIONS
 from hardware.rig.config import RigConfig
 from hardware.rig.rig import open_rig
-from learning.clustered import clustered_mean, clustered_rate
+from learning.evaluation.clustered import clustered_mean, clustered_rate
 from warp_deform.quiet import quiet_warp
 from warp_deform.solver.guards import PhysicsError
 from warp_deform.workers import single_threaded

@@ -37,12 +37,13 @@ from warp_deform.robots import robot as find_robot
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.workers import Workers, worker_count
 
+from .evaluation.run import evaluate_run
 from .models.transporter import Transporter
-from .policy import AGENTS, AgentDescription
-from .report import write_report
-from .report_run import evaluate_run
-from .snapshots import read_json, write_json
-from .training import TrainConfig, train
+from .policy.policy import AGENTS, AgentDescription
+from .report.report import write_report
+from .runs.folder import read_json, write_json
+from .training.config import TrainConfig
+from .training.train import train
 
 __all__ = ["Collecting", "Evaluating", "SweepConfig", "read_sweep", "run_sweep"]
 

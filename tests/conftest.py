@@ -69,7 +69,7 @@ def trained(tmp_path_factory):
 @pytest.fixture
 def run(trained, tmp_path):
     """A copy of it to spoil."""
-    from learning.snapshots import RunFolder
+    from learning.runs.folder import RunFolder
 
     shutil.copytree(trained, tmp_path / "run")
     return RunFolder(tmp_path / "run")

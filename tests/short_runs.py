@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 from training_samples import write_demonstrations
 
-from learning.schedules import Schedule
-from learning.snapshots import RunFolder, read_json, write_json
-from learning.training import TrainConfig, train
+from learning.runs.folder import RunFolder, read_json, write_json
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.train import train
 from warp_deform.cli import main
 
 TASK = "block-notarget"

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learning import augmentation
-from learning.augmentation import (
+from learning.data import augmentation
+from learning.data.augmentation import (
     RigidTransform,
     draw_transform,
     move_actions,

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_deform  # noqa: F401  registers the ids
-from learning.augmentation import RigidTransform, draw_transform, move_actions, move_states
+from learning.data.augmentation import RigidTransform, draw_transform, move_actions, move_states
 from warp_deform.demonstrators import demonstrator
 from warp_deform.episode_loop import SOLVED, play
 from warp_deform.episodes import EpisodeReader, EpisodeWriter

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from short_runs import SHORT, TASK, said, settle
 
-from learning.evaluation import evaluate_snapshot
-from learning.policy import load_policy
-from learning.protocol import Protocol
-from learning.report_run import evaluate_run
-from learning.share import share_run
-from learning.snapshots import RunFolder, read_json, write_json
+from learning.evaluation.evaluate import evaluate_snapshot
+from learning.evaluation.protocol import Protocol
+from learning.evaluation.run import evaluate_run
+from learning.evaluation.share import share_run
+from learning.policy.policy import load_policy
+from learning.runs.folder import RunFolder, read_json, write_json
 from warp_deform.errors import InputError
 
 SPOILT_RECORDS: list[Any] = [

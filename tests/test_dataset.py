@@ -12,11 +12,12 @@ import pytest
 from episode_samples import with_info
 from training_samples import block_episode, write_demonstrations
 
-from learning.dataset import Demonstrations, choose
+from learning.data.dataset import Demonstrations, choose
 from learning.interchange.deformable_ravens import DEMONSTRATOR
-from learning.schedules import Schedule
-from learning.snapshots import RunFolder
-from learning.training import TrainConfig, train
+from learning.runs.folder import RunFolder
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.train import train
 from warp_deform.episodes import HEIGHT_UNIT, Episode, EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
 

@@ -14,9 +14,9 @@ import pytest
 import torch
 from training_samples import write_demonstrations
 
-from learning import evaluation
-from learning.evaluation import Evaluation, best, evaluate_snapshot, known, summarise
-from learning.failures import (
+from learning.evaluation import evaluate as evaluation
+from learning.evaluation.evaluate import Evaluation, best, evaluate_snapshot, known, summarise
+from learning.evaluation.failures import (
     FAILURES,
     bag_holds_items,
     bag_opening,
@@ -24,13 +24,14 @@ from learning.failures import (
     failure,
     puts_back,
 )
-from learning.playing import Played, goal_distance
-from learning.policy import load_policy
-from learning.protocol import Protocol
-from learning.report_run import evaluate_run
-from learning.schedules import Schedule
-from learning.snapshots import RunFolder
-from learning.training import TrainConfig, train
+from learning.evaluation.play import Played, goal_distance
+from learning.evaluation.protocol import Protocol
+from learning.evaluation.run import evaluate_run
+from learning.policy.policy import load_policy
+from learning.runs.folder import RunFolder
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.train import train
 from warp_deform.cli import main
 from warp_deform.episode_loop import Run
 from warp_deform.episodes import EpisodeReader, EpisodeWriter

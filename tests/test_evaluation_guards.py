@@ -14,14 +14,21 @@ import pytest
 from short_runs import SHORT, TASK, said, settle
 from training_samples import block_episode
 
-from learning import evaluation, protocol, share
-from learning.evaluation import evaluate_snapshot, measure, stopped_early, trained_steps, wilson
-from learning.playing import Played
-from learning.policy import AgentDescription, ImagePolicy, RetryingPolicy, make_agent
-from learning.protocol import Protocol, check_splits, goals_for, goals_of
-from learning.report_run import evaluate_run
-from learning.share import share_run
-from learning.snapshots import RunFolder, read_json
+from learning.evaluation import evaluate as evaluation
+from learning.evaluation import protocol, share
+from learning.evaluation.evaluate import (
+    evaluate_snapshot,
+    measure,
+    stopped_early,
+    trained_steps,
+    wilson,
+)
+from learning.evaluation.play import Played
+from learning.evaluation.protocol import Protocol, check_splits, goals_for, goals_of
+from learning.evaluation.run import evaluate_run
+from learning.evaluation.share import share_run
+from learning.policy.policy import AgentDescription, ImagePolicy, RetryingPolicy, make_agent
+from learning.runs.folder import RunFolder, read_json
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
 
@@ -234,7 +241,7 @@ def test_the_papers_rule_chooses_the_lift_where_there_are_several(
         episodes = tuple(Played(seed, False, 0.0, 1, "") for seed in protocol.seeds)
         return evaluation.Evaluation(step, episodes, evaluation.summarise(episodes, task=TASK))
 
-    monkeypatch.setattr("learning.report_run.evaluate_snapshot", judged)
+    monkeypatch.setattr("learning.evaluation.run.evaluate_snapshot", judged)
     for lifts, rule in (([0.05], "action"), ([0.05, 0.3], "privileged")):
         agent = read_json(run.settings)["agent"]
         settle(run, agent={**agent, "config": {**agent["config"], "lifts": lifts}})

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from training_samples import block_episode, write_demonstrations
 
-from learning.evaluation import evaluate_snapshot
-from learning.film import HeatMaps, Sight, draw, film_episodes, heat_maps
+from learning.evaluation.evaluate import evaluate_snapshot
+from learning.evaluation.protocol import Protocol
+from learning.evaluation.video import HeatMaps, Sight, draw, film_episodes, heat_maps
 from learning.models.transporter import PRESETS
-from learning.policy import AgentDescription, ImagePolicy, make_agent
-from learning.protocol import Protocol
-from learning.schedules import Schedule
-from learning.snapshots import RunFolder
-from learning.training import TrainConfig, train
+from learning.policy.policy import AgentDescription, ImagePolicy, make_agent
+from learning.runs.folder import RunFolder
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.train import train
 from warp_deform import filming
 from warp_deform.cli import main
 from warp_deform.errors import InputError, WarpDeformError

@@ -10,11 +10,12 @@ from typing import Any
 import pytest
 from training_samples import write_demonstrations
 
-from learning.dataset import Demonstrations
-from learning.policy import load_policy
-from learning.schedules import Schedule
-from learning.snapshots import RunFolder
-from learning.training import TrainConfig, train
+from learning.data.dataset import Demonstrations
+from learning.policy.policy import load_policy
+from learning.runs.folder import RunFolder
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.train import train
 from warp_deform.errors import InputError
 
 TASK = "cable-line-notarget"

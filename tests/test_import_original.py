@@ -24,7 +24,7 @@ from original_recordings import (
 
 from learning.interchange import deformable_ravens
 from learning.interchange.deformable_ravens import import_deformable_ravens, read_recording
-from learning.snapshots import RunFolder, read_snapshot
+from learning.runs.folder import RunFolder, read_snapshot
 from warp_deform.cli import main
 from warp_deform.episodes import HEIGHT_UNIT, EpisodeReader
 from warp_deform.errors import InputError

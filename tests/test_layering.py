@@ -28,6 +28,16 @@ MAY_IMPORT = {
 OURS = {*MAY_IMPORT, "tests", "examples", "benchmarks"}
 LAZY_EXCEPTION = ("hardware", "learning.policy")
 FLOORS = {
+    "learning": [
+        "command",
+        "sweep",
+        "report",
+        "training",
+        "evaluation",
+        "policy",
+        "data",
+        "models runs refinement interchange",
+    ],
     "hardware": [
         "command",
         "measuring",

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from learning.dataset import Demonstrations
-from learning.policy import ImagePolicy, load_policy
-from learning.schedules import SCHEDULES
-from learning.snapshots import RunFolder
-from learning.training import TrainConfig, train
+from learning.data.dataset import Demonstrations
+from learning.policy.policy import ImagePolicy, load_policy
+from learning.runs.folder import RunFolder
+from learning.training.config import TrainConfig
+from learning.training.schedules import SCHEDULES
+from learning.training.train import train
 from warp_deform.collect import CollectConfig, collect
 
 TASK = "cable-shape"

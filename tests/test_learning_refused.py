@@ -11,13 +11,14 @@ import pytest
 from short_runs import said
 from training_samples import block_episode, write_demonstrations
 
-from learning import training
-from learning.refinement import RefineConfig, refine
-from learning.report import read_runs
-from learning.schedules import Schedule
-from learning.snapshots import RunFolder
+from learning.refinement.refine import RefineConfig, refine
+from learning.report.read import read_runs
+from learning.runs.folder import RunFolder
 from learning.sweep import read_sweep, run_sweep
-from learning.training import TrainConfig, train
+from learning.training import train as training
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.train import train
 from warp_deform.collection import Attempt, Collection, append_attempt
 from warp_deform.episodes import EpisodeWriter
 from warp_deform.errors import InputError, WarpDeformError
@@ -168,7 +169,7 @@ def test_what_cannot_be_refined_leaves_no_folder(
     def refuse(_: object) -> None:
         raise InputError("the episode of seed 0 does not start as recorded")
 
-    monkeypatch.setattr("learning.refinement._refine_chunk", refuse)
+    monkeypatch.setattr("learning.refinement.refine._refine_chunk", refuse)
     with pytest.raises(InputError, match="does not start"):
         refine(RefineConfig(source=data, out=tmp_path / "refined", workers=1))
     assert not (tmp_path / "refined").exists()

@@ -15,11 +15,11 @@ from franka_episodes import GOAL, TASK, chain
 from hardware.agents.choosers import PolicyChooser
 from hardware.arm.pick_place import PickPlaceAction, PickPlaceOutcome
 from hardware.episodes.episode import Observation
-from learning.batches import task_lifts
-from learning.memory import MISSED, PUT_DOWN, RESTING, Memory
+from learning.data.batches import task_lifts
 from learning.models.transporter import PRESETS
-from learning.policy import AgentDescription, ImagePolicy, make_agent
-from learning.snapshots import RunFolder
+from learning.policy.memory import MISSED, PUT_DOWN, RESTING, Memory
+from learning.policy.policy import AgentDescription, ImagePolicy, make_agent
+from learning.runs.folder import RunFolder
 
 PLACES = np.linspace([0.3, 0.0], [0.5, 0.2], 6)
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from short_runs import SHORT, TASK, said, settle
 
-from learning import evaluation
-from learning.evaluation import evaluate_snapshot
-from learning.playing import play_policy
-from learning.policy import load_policy
-from learning.protocol import Protocol, check_splits
-from learning.report import write_report
-from learning.report_run import evaluate_run
-from learning.snapshots import RunFolder, read_json
+from learning.evaluation import evaluate as evaluation
+from learning.evaluation.evaluate import evaluate_snapshot
+from learning.evaluation.play import play_policy
+from learning.evaluation.protocol import Protocol, check_splits
+from learning.evaluation.run import evaluate_run
+from learning.policy.policy import load_policy
+from learning.report.report import write_report
+from learning.runs.folder import RunFolder, read_json
 from warp_deform import __version__
 from warp_deform.cli import main
 from warp_deform.episode_loop import worlds_for
@@ -76,7 +76,7 @@ def test_an_evaluation_tells_of_every_episode(
         shown.append((what, total, lines))
         yield lines
 
-    monkeypatch.setattr("learning.report_run.progress_bar", heard)
+    monkeypatch.setattr("learning.evaluation.run.progress_bar", heard)
     for _ in range(2):  # played, and read
         shown.clear()
         evaluate_run(run.path, episodes=3, **ONE)
@@ -159,7 +159,7 @@ def test_the_papers_protocol_asks_for_motions_that_succeed(
         seen.append((protocol.goals == "demonstrated", protocol.motions_must_succeed))
         return original(run, step, Protocol(split="validation", episodes=1), **options)
 
-    monkeypatch.setattr("learning.report_run.evaluate_snapshot", heard)
+    monkeypatch.setattr("learning.evaluation.run.evaluate_snapshot", heard)
     evaluate_run(run.path, episodes=1, paper=True, **ONE)
     assert set(seen) == {(True, True), (False, False)}
 

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from short_runs import TASK
 
-from learning import training
-from learning.evaluation import summarise
-from learning.outcome_text import evaluated, trained
-from learning.playing import Played
-from learning.snapshots import RunFolder
+from learning.command.outcome_text import evaluated, trained
+from learning.evaluation.evaluate import summarise
+from learning.evaluation.play import Played
+from learning.runs.folder import RunFolder
+from learning.training import train as training
 from warp_deform import cli
 from warp_deform.cli import main
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from training_samples import block_episode, write_demonstrations
 
-from learning.policy import load_policy
-from learning.schedules import Schedule
-from learning.snapshots import RunFolder
-from learning.training import TrainConfig, train
+from learning.policy.policy import load_policy
+from learning.runs.folder import RunFolder
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.train import train
 from warp_deform.episodes import Episode
 
 PICTURES = Schedule(steps=40, batch=1, lr=5e-4, warmup=5, snapshots=1)

@@ -17,11 +17,12 @@ import pytest
 import torch
 from training_samples import write_demonstrations
 
-from learning import training
-from learning.processes import join_processes
-from learning.schedules import STATE_SCHEDULES
-from learning.snapshots import RunFolder, read_snapshot
-from learning.training import TrainConfig, train
+from learning.runs.folder import RunFolder, read_snapshot
+from learning.training import train as training
+from learning.training.config import TrainConfig
+from learning.training.processes import join_processes
+from learning.training.schedules import STATE_SCHEDULES
+from learning.training.train import train
 from warp_deform.errors import InputError
 
 TASK = "cable-line-notarget"

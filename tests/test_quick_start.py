@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from training_samples import write_demonstrations
 
-from learning import evaluation
-from learning.playing import Played
-from learning.snapshots import RunFolder
+from learning.evaluation import evaluate as evaluation
+from learning.evaluation.play import Played
+from learning.runs.folder import RunFolder
 from warp_deform.cli import main
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from episode_samples import make_episode
 
-from learning import refinement, way_points
-from learning.refinement import REFINED, REFINEMENT, RefineConfig, RefineReport, refine
-from learning.way_points import WAY_POINTS, BendConfig, bend, read_path
+from learning.refinement import refine as refinement
+from learning.refinement import waypoints as way_points
+from learning.refinement.refine import REFINED, REFINEMENT, RefineConfig, RefineReport, refine
+from learning.refinement.waypoints import WAY_POINTS, BendConfig, bend, read_path
 from warp_deform.cli import main
 from warp_deform.collect import CollectConfig, collect
 from warp_deform.episode_loop import SOLVED, Run, worlds_for

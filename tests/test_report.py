@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
-from learning.evaluation import summarise
-from learning.paper_results import read_paper
-from learning.playing import Played
-from learning.policy import AGENTS
-from learning.report import Point, pool, read_runs, version_notes, write_report
-from learning.report_curves import draw_curves
-from learning.report_tables import compared
+from learning.evaluation.evaluate import summarise
+from learning.evaluation.paper_results import read_paper
+from learning.evaluation.play import Played
+from learning.policy.policy import AGENTS
+from learning.report.cells import Point, pool, version_notes
+from learning.report.curves import draw_curves
+from learning.report.read import read_runs
+from learning.report.report import write_report
+from learning.report.tables import compared
 from warp_deform.cli import main
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import TASKS

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from learning.schedules import SCHEDULES, STATE_SCHEDULES, Schedule, preset_schedule
-from learning.training import TrainConfig
+from learning.training.config import TrainConfig
+from learning.training.schedules import SCHEDULES, STATE_SCHEDULES, Schedule, preset_schedule
 from warp_deform.errors import InputError
 
 

@@ -11,7 +11,7 @@ import pytest
 from training_samples import block_episode, write_demonstrations
 
 from learning import sweep
-from learning.snapshots import RunFolder
+from learning.runs.folder import RunFolder
 from learning.sweep import Collecting, Evaluating, read_sweep, run_sweep
 from warp_deform.cli import main
 from warp_deform.episodes import EpisodeWriter

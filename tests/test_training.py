@@ -14,12 +14,13 @@ import torch
 from episode_samples import with_step
 from training_samples import block_episode, write_demonstrations
 
-from learning.batches import check_lifts, state_batch
-from learning.dataset import Demonstrations
-from learning.policy import ImagePolicy, RetryingPolicy, StatePolicy, load_policy
-from learning.schedules import Schedule
-from learning.snapshots import RunFolder, read_snapshot
-from learning.training import TrainConfig, TrainReport, train
+from learning.data.batches import check_lifts, state_batch
+from learning.data.dataset import Demonstrations
+from learning.policy.policy import ImagePolicy, RetryingPolicy, StatePolicy, load_policy
+from learning.runs.folder import RunFolder, read_snapshot
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.train import TrainReport, train
 from warp_deform.cli import main
 from warp_deform.episodes import Episode, EpisodeWriter
 from warp_deform.errors import InputError
@@ -171,7 +172,7 @@ def test_without_augmentation_nothing_is_moved(
     def never(*_: Any, **__: Any) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("learning.batches.draw_transform", never)
+    monkeypatch.setattr("learning.data.batches.draw_transform", never)
     for agent in "goal-stack", "gt-mlp":
         out = tmp_path / agent
         one = replace(SHORT, steps=1, snapshots=1)

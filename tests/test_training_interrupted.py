@@ -13,12 +13,15 @@ import torch
 from torch import nn
 from training_samples import write_demonstrations
 
-from learning import evaluation, log, training
-from learning.log import TrainingLog, read_log
-from learning.schedules import Schedule
-from learning.snapshots import RunFolder, read_json, write_json
-from learning.training import TrainConfig, train
-from learning.training_state import Trained, state_steps
+from learning.evaluation import evaluate as evaluation
+from learning.runs import log
+from learning.runs.folder import RunFolder, read_json, write_json
+from learning.runs.log import TrainingLog, read_log
+from learning.training import train as training
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.state import Trained, state_steps
+from learning.training.train import train
 from warp_deform.errors import InputError, WarpDeformError
 
 TASK = "cable-line-notarget"

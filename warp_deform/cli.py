@@ -59,22 +59,24 @@ VERBS: dict[str, Verb] = {
     ),
     "replay": Verb("warp_deform.commands:replay", "simulate recorded episodes again and compare"),
     "inspect": Verb("warp_deform.commands:inspect", "statistics and contact sheets of a dataset"),
-    "convert": Verb("learning.convert_cli:convert", "datasets to and from other formats"),
+    "convert": Verb("learning.command.convert:convert", "datasets to and from other formats"),
     "train": Verb(
-        "learning.cli:train", "train an agent on demonstrations",
+        "learning.command.verbs:train", "train an agent on demonstrations",
         kept=f"all but the last steps is kept, {_GOES_ON} and ends with the same bits",
     ),
     "eval": Verb(
-        "learning.cli:evaluate", "choose a run's best snapshot and test it",
+        "learning.command.verbs:evaluate", "choose a run's best snapshot and test it",
         kept=f"what was played is kept, {_GOES_ON}",
     ),
-    "report": Verb("learning.cli:report", "tables and learning curves beside the paper's"),
+    "report": Verb(
+        "learning.command.verbs:report", "tables and learning curves beside the paper's",
+    ),
     "sweep": Verb(
-        "learning.cli:sweep", "train and evaluate a grid, as long as it takes",
+        "learning.command.verbs:sweep", "train and evaluate a grid, as long as it takes",
         kept=f"what is done is kept, {_GOES_ON}",
     ),
     "refine": Verb(
-        "learning.refine_cli:refine", "improve demonstrations by search",
+        "learning.command.refine:refine", "improve demonstrations by search",
         kept=f"episodes already written are complete, {_GOES_ON}",
     ),
     "bench": Verb("warp_deform.commands:bench", "time the simulator, alone or beside a peer"),

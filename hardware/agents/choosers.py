@@ -156,20 +156,13 @@ class PolicyChooser:
     """A policy that `warp-deform train` made.
 
     It sees the mask as three channels of 0 or 255 and a height of zeros, as in `cable-mask-goal`,
-    and has the `learning.memory.Memory` of policies in simulation. Where a finger would come down
-    on the cable its next best pick is taken, unless its first eight are all like that; each that
-    is passed over costs as much as choosing one.
-
-    Args:
-        path: a run's folder or a snapshot
-        view: the workspace; its pixels must be about as large as the task's
-
-    Raises:
-        InputError: no such policy, one of another task, or one that needs the simulator's state
+    and has the memory of policies in simulation, `learning.policy.memory`. Where a finger would
+    come down on the cable its next best pick is taken, unless its first eight are all like that;
+    each that is passed over costs as much as choosing one.
     """
 
     def __init__(self, path: Path, *, view: TopDownView | None = None) -> None:
-        from learning.policy import ImagePolicy, load_policy
+        from learning.policy.policy import ImagePolicy, load_policy
 
         self._view = view or TopDownView()
         policy = load_policy(path)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ..episodes.goals import GoalSeen
     from ..rig.rig import Rig
 
-__all__ = ["CaptureGoalOptions", "CollectOptions", "EmulateOptions", "RunOptions", "franka"]
+__all__ = ["CaptureGoalOptions", "CollectOptions", "RunOptions", "franka"]
 
 _DRY_ACTIONS = 1
 """Nothing moves in a dry run, so every further action would be planned on the same picture."""

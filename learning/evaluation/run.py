@@ -16,13 +16,13 @@ from warp_deform.progress import progress_bar
 from warp_deform.revision import running_revision
 from warp_deform.workers import worker_count
 
-from .evaluation import Evaluation, best, evaluate_snapshot, trained_steps
-from .log import cpu_seconds, read_log
+from ..policy.policy import load_policy
+from ..runs.folder import RunFolder, write_json
+from ..runs.log import cpu_seconds, read_log
+from .evaluate import Evaluation, best, evaluate_snapshot, trained_steps
 from .paper_results import PARTIAL_SCORE, SUCCESS, partial_credit, read_paper
-from .playing import Played
-from .policy import load_policy
+from .play import Played
 from .protocol import FIRST_SEED, Protocol, check_goals, check_splits
-from .snapshots import RunFolder, write_json
 
 __all__ = ["evaluate_run"]
 
@@ -173,7 +173,7 @@ def evaluate_run(
     kept = report if first_seed is None else _beside(earlier, report, first_seed)
     write_json(run.report, kept)  # before films, which may fail
     if video is not None:
-        from .film import film_episodes
+        from .video import film_episodes
 
         count = min(videos, episodes)
         paths = film_episodes(run, result, test, video, count=count)

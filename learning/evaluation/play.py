@@ -15,8 +15,8 @@ from warp_deform.tasks.task import Stage
 from warp_deform.worlds import Worlds
 from warp_deform.wrappers import stage_at
 
+from ..policy.policy import ImagePolicy, Policy, RetryingPolicy, StatePolicy
 from .failures import bag_opening, failure
-from .policy import ImagePolicy, Policy, RetryingPolicy, StatePolicy
 from .protocol import Protocol
 
 __all__ = ["Measured", "Played", "goal_distance", "play_policy"]

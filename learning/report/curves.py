@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from .paper_results import PaperResults
-from .report import Cell, Point
+from ..evaluation.paper_results import PaperResults
+from .cells import Cell, Point
 
 __all__ = ["draw_curves"]
 

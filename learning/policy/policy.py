@@ -24,11 +24,11 @@ from warp_deform.rendering.pixels import SHAPE
 from warp_deform.tasks.metrics import wrap_angle
 from warp_deform.tasks.registry import task as find_task
 
-from .batches import task_lifts
+from ..data.batches import task_lifts
+from ..models.gt_state import GtState, GtState2Step, GtStateConfig
+from ..models.transporter import GoalSplit, GoalStack, Transporter, TransporterConfig
+from ..runs.folder import RunFolder, read_snapshot
 from .memory import Memory
-from .models.gt_state import GtState, GtState2Step, GtStateConfig
-from .models.transporter import GoalSplit, GoalStack, Transporter, TransporterConfig
-from .snapshots import RunFolder, read_snapshot
 
 __all__ = ["AGENTS", "Agent", "AgentDescription", "ImagePolicy", "Policy", "RetryingPolicy",
            "StatePolicy", "load_policy", "make_agent"]  # fmt: skip

@@ -16,7 +16,7 @@ from torch import Tensor
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.extras import install_extra
 
-from .snapshots import TENSORBOARD, RunFolder, check_fields
+from .folder import TENSORBOARD, RunFolder, check_fields
 
 __all__ = ["LINE_STEPS", "TrainingLog", "cpu_seconds", "load_tensorboard",
            "read_log"]  # fmt: skip

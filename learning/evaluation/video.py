@@ -26,11 +26,11 @@ from warp_deform.tasks.registry import task as find_task
 from warp_deform.workers import single_threaded
 from warp_deform.worlds import Worlds
 
-from .evaluation import Evaluation
-from .playing import Measured, Played, play_policy
-from .policy import ImagePolicy, load_policy
+from ..policy.policy import ImagePolicy, load_policy
+from ..runs.folder import RunFolder
+from .evaluate import Evaluation
+from .play import Measured, Played, play_policy
 from .protocol import Protocol, goals_for, goals_of
-from .snapshots import RunFolder
 
 __all__ = ["HeatMaps", "Sight", "draw", "film_episodes", "heat_maps"]
 

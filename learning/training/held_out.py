@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .batches import image_batch, state_batch
-from .dataset import Demonstrations
-from .models.transporter import Transporter
-from .policy import Agent
+from ..data.batches import image_batch, state_batch
+from ..data.dataset import Demonstrations
+from ..models.transporter import Transporter
+from ..policy.policy import Agent
 
 __all__ = ["HeldOut"]
 

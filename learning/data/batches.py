@@ -12,10 +12,10 @@ from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE
 from warp_deform.tasks.task import Task
 
+from ..models.gt_state import encode_action
+from ..models.transporter import Batch, Transporter
 from .augmentation import draw_transform, move_actions, move_picture, move_states
 from .dataset import Demonstrations
-from .models.gt_state import encode_action
-from .models.transporter import Batch, Transporter
 
 __all__ = ["StateBatch", "check_lifts", "check_view", "image_batch", "state_batch", "task_lifts"]
 

@@ -21,7 +21,7 @@ from warp_deform.errors import InputError
 from warp_deform.goals import GOAL_SEED, load_goal, load_goals, make_goals
 from warp_deform.tasks.registry import task as find_task
 
-from .snapshots import RunFolder
+from ..runs.folder import RunFolder
 
 __all__ = ["FIRST_SEED", "Protocol", "check_goals", "check_splits", "goals_for", "goals_of"]
 

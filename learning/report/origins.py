@@ -8,7 +8,7 @@ from typing import Any
 from warp_deform.progress import duration
 from warp_deform.revision import Revision
 
-from .report import RunResult
+from .cells import RunResult
 
 __all__ = ["origin", "origins"]
 

@@ -35,7 +35,7 @@ from warp_deform.workers import Workers, worker_count
 from warp_deform.world_state import WorldState
 from warp_deform.worlds import Worlds
 
-from .refinement import seeds_by_task
+from .refine import seeds_by_task
 
 __all__ = ["WAY_POINTS", "BendConfig", "BendReport", "bend", "read_path"]
 

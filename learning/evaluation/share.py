@@ -6,9 +6,9 @@ from pathlib import Path
 
 import torch
 
-from .evaluation import trained_steps
-from .interchange.conversion import new_folder
-from .snapshots import RunFolder, read_snapshot, write_json
+from ..interchange.conversion import new_folder
+from ..runs.folder import RunFolder, read_snapshot, write_json
+from .evaluate import trained_steps
 
 __all__ = ["share_run"]
 

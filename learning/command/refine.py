@@ -47,8 +47,8 @@ def refine(options: RefineOptions) -> Outcome:
     """Refine a folder of demonstrations."""
     from warp_deform.planning import SearchConfig
 
-    from .refinement import RefineConfig
-    from .refinement import refine as refine_folder
+    from ..refinement.refine import RefineConfig
+    from ..refinement.refine import refine as refine_folder
 
     quiet_warp()
     if options.way_points:
@@ -81,7 +81,7 @@ def _bend(options: RefineOptions) -> Outcome:
     from warp_deform.planning.search import SLOPE_COST
     from warp_deform.planning.way_points import WayPointConfig
 
-    from .way_points import BendConfig, bend
+    from ..refinement.waypoints import BendConfig, bend
 
     others = RefineOptions(
         source=options.source,

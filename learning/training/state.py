@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,15 +16,13 @@ from warp_deform.episodes import EpisodeReader, versions
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.revision import running_revision
 
-from .dataset import Demonstrations
-from .log import LINE_STEPS
-from .models.adam import KerasAdam
-from .policy import AgentDescription
+from ..data.dataset import Demonstrations
+from ..models.adam import KerasAdam
+from ..policy.policy import AgentDescription
+from ..runs.folder import RunFolder, read_json, write_json
+from ..runs.log import LINE_STEPS
+from .config import TrainConfig
 from .schedules import Schedule
-from .snapshots import RunFolder, read_json, write_json
-
-if TYPE_CHECKING:
-    from .training import TrainConfig
 
 __all__ = ["Trained", "claim", "state_steps"]
 

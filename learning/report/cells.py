@@ -1,4 +1,4 @@
-"""The paper's tables from run folders: runs pooled over seeds, the paper's numbers beside ours.
+"""Runs that differ in their seed alone, taken together, with the paper's number beside ours.
 
 A cell is a task, an agent, a number of demonstrations and a variant: preset, steps where they are
 not the preset's, who chooses the lift, whose goals, which arm, who demonstrated. Runs of a cell
@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,10 @@ import numpy as np
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import TASKS
 
-from .evaluation import wilson
-from .paper_results import PARTIAL_SCORE, SUCCESS, PaperResults, partial_credit, read_paper
-from .schedules import SCHEDULES, preset_schedule
-from .snapshots import RunFolder
+from ..evaluation.evaluate import wilson
+from ..evaluation.paper_results import PARTIAL_SCORE, SUCCESS, PaperResults, partial_credit
 
-__all__ = ["Cell", "Point", "Report", "RunResult", "pool", "read_runs", "version_notes",
-           "write_report"]  # fmt: skip
+__all__ = ["Cell", "Point", "RunResult", "check_run", "pool", "version_notes"]
 
 _ALIKE = ("agent", "schedule", "augment", "processes", "device", "patience")
 """Settings that runs of a cell have in common."""
@@ -103,165 +100,6 @@ class Cell:
     test: tuple[Point, ...]
 
 
-@dataclass(frozen=True)
-class Report:
-    """What a report says: as a JSON object, and as Markdown."""
-
-    data: dict[str, Any]
-    text: str
-
-
-def write_report(paths: Sequence[Path], out: Path | None) -> Report:
-    """Tables of the evaluated runs in folders; with `out`, files of them and of the curves too.
-
-    The object has `runs`, `cells` (the fields of `Cell`), `origins` (of each run, see
-    `report_origins.origin`), `notes` and `files` (paths).
-
-    Raises:
-        InputError: no evaluated run, runs that cannot be told apart, or a folder that cannot be
-            made.
-    """
-    from .report_curves import draw_curves
-    from .report_origins import origin
-    from .report_tables import csv_text, latex_text, markdown_text
-
-    runs, notes = read_runs(paths)
-    paper = read_paper()
-    cells = pool(runs, paper)
-    notes += version_notes(runs)
-    files: list[Path] = []
-    made = [origin(run) for run in runs]
-    text = markdown_text(cells, paper, notes, made=made)
-    if out is not None:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"--out {out} cannot be made: {error.strerror}") from error
-        pictures = draw_curves(cells, paper, out)
-        texts = {
-            "report.md": markdown_text(cells, paper, notes, pictures, made=made),
-            "report.csv": csv_text(cells),
-            "report.tex": latex_text(cells, paper),
-        }
-        for name, content in texts.items():
-            (out / name).write_text(content)
-        files = [*(out / name for name in texts), *pictures]
-    data = {
-        "runs": len(runs),
-        "origins": made,
-        "cells": [asdict(cell) for cell in cells],
-        "notes": notes,
-        "files": [str(path) for path in files],
-    }
-    return Report(data, text)
-
-
-def read_runs(paths: Sequence[Path]) -> tuple[list[RunResult], list[str]]:
-    """Evaluated runs of folders, each a run or holding runs at any depth; and notes on the others.
-
-    Raises:
-        InputError: a folder is missing or holds no run, none is evaluated, or a file is damaged.
-    """
-    folders: dict[Path, Path] = {}
-    for path in paths:
-        here = [path] if (path / "run.json").is_file() else sorted(_inside(path))
-        if not here:
-            raise InputError(
-                f"{path} holds no training run; `warp-deform train` makes one with --out"
-            )
-        folders |= {each.resolve(): each for each in here}
-    runs, notes = [], []
-    for folder in folders.values():
-        run = RunFolder(folder)
-        if run.report.is_file():
-            info = run.read_report()
-            notes += _other_seeds(folder, info)
-            if info["test"] is not None:
-                runs.append(_read(run))
-                continue
-        if not run.report.is_file() or info["test"] is None:
-            notes.append(f"{folder} is not evaluated and left out; run `warp-deform eval {folder}`")
-    if not runs:
-        raise InputError(f"no run is evaluated yet; run `warp-deform eval {next(iter(folders))}`")
-    return runs, notes
-
-
-def _other_seeds(folder: Path, info: Mapping[str, Any]) -> list[str]:
-    """A line for every set of other seeds that a run played."""
-    return [
-        f"{folder} also played seeds {other['first_seed']} and up: {other['test']['n_success']} of "
-        f"{other['test']['n_episodes']} solved, mean score {other['test']['mean_score']:.3f}; "
-        "tables and curves leave them out"
-        for other in info.get("other_seeds", {}).values()
-    ]
-
-
-def _inside(path: Path) -> Iterable[Path]:
-    if not path.is_dir():
-        raise InputError(f"there is no folder {path}")
-    return (found.parent for found in path.rglob("run.json"))
-
-
-def _read(run: RunFolder) -> RunResult:
-    info, settings = run.read_report(), run.read_settings()
-    try:
-        result = RunResult(
-            path=run.path,
-            task=info["task"],
-            agent=info["agent"],
-            demos=info["demos"],
-            seed=info["seed"],
-            variant=_variant(info, settings),
-            info=info,
-            settings=settings,
-        )
-        _cell([result], None)  # all that is needed later is there
-        _compared(result)
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{run.report} is not what this release's `warp-deform eval` writes; evaluate again"
-        ) from error
-    return result
-
-
-def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
-    """How a run was trained and played, but for task, agent, demonstrations and seed."""
-    parts = [info["preset"], *_steps(info, settings)]
-    if info["stage_rule"] != "action":
-        parts.append(f"{info['stage_rule']} lift")
-    if not info["retry"]:
-        parts.append("no retries")
-    if info["goals"] != "constructed":
-        parts.append(f"goals {info['goals']}")
-    if info["robot"] != "ur5":
-        parts.append(info["robot"])
-    names = settings["demonstrators"]
-    if names != ["scripted"]:
-        parts.append(f"{' and '.join(names)} demonstrations")
-    return ", ".join(parts)
-
-
-def _steps(info: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
-    """How long a run was trained, where that is not its preset's length.
-
-    Where validation may stop it, as long as that allowed.
-    """
-    planned, trained = int(settings["schedule"]["steps"]), int(info["trained_steps"])
-    if settings.get("patience") is not None:
-        return [f"up to {planned} steps, patience {settings['patience']}"]
-    if settings.get("validate"):
-        return [f"up to {planned} steps"]
-    if trained != planned:
-        return [f"{trained} of {planned} steps"]
-    usual = None
-    if info["preset"] in SCHEDULES:
-        usual = preset_schedule(
-            info["preset"], task=info["task"], demos=info["demos"],
-            sees_state=settings["agent"].get("state_size") is not None,
-        )  # fmt: skip
-    return [] if usual is not None and planned == usual.steps else [f"{planned} steps"]
-
-
 def pool(runs: Sequence[RunResult], paper: PaperResults) -> list[Cell]:
     """Cells of runs, ordered by variant, task, agent and number of demonstrations.
 
@@ -274,6 +112,12 @@ def pool(runs: Sequence[RunResult], paper: PaperResults) -> list[Cell]:
     order = {name: n for n, name in enumerate(TASKS)}
     keys = sorted(groups, key=lambda k: (k[0], order.get(k[1], len(order)), *k[1:]))
     return [_cell(sorted(groups[key], key=lambda run: run.seed), paper) for key in keys]
+
+
+def check_run(run: RunResult) -> None:
+    """See that a run has all that a cell is made of; LookupError, TypeError, ... if not."""
+    _cell([run], None)
+    _compared(run)
 
 
 def version_notes(runs: Sequence[RunResult]) -> list[str]:

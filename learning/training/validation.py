@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from ..runs.folder import RunFolder
 from .processes import Process
-from .snapshots import RunFolder
 
 if TYPE_CHECKING:
-    from .protocol import Protocol
+    from ..evaluation.protocol import Protocol
 
 __all__ = ["Validation"]
 
@@ -43,7 +43,7 @@ class Validation:
         self.found: dict[int, dict[str, Any]] = {}
         """`n_success`, `n_episodes` and `mean_score` of snapshots by step."""
         if episodes:
-            from .protocol import Protocol, check_splits  # loads the simulator
+            from ..evaluation.protocol import Protocol, check_splits  # loads the simulator
 
             self._protocol = Protocol(split="validation", episodes=episodes)
             check_splits(trained, [self._protocol], task=task)
@@ -52,7 +52,7 @@ class Validation:
         """Play the snapshots of these steps; returns whether training ends with the last."""
         if self._protocol is None:
             return False
-        from .evaluation import evaluate_snapshot, stopped_early
+        from ..evaluation.evaluate import evaluate_snapshot, stopped_early
 
         for step in steps if self._here.rank == 0 else ():
             found = evaluate_snapshot(self._run, step, self._protocol).summary

@@ -43,15 +43,15 @@ def convert(options: ConvertOptions) -> Outcome:
     if options.to is not None and (options.task, options.workers) != (None, None):
         raise InputError("--task and --workers go with --from")
     if options.to == "lerobot":
-        from .interchange.lerobot import export_lerobot
+        from ..interchange.lerobot import export_lerobot
 
         report = export_lerobot(options.source, options.target)
     elif options.to == "robomimic":
-        from .interchange.robomimic import export_robomimic
+        from ..interchange.robomimic import export_robomimic
 
         report = export_robomimic(options.source, options.target)
     else:
-        from .interchange.deformable_ravens import import_deformable_ravens
+        from ..interchange.deformable_ravens import import_deformable_ravens
 
         report = import_deformable_ravens(
             options.source, options.target, task=options.task, workers=options.workers

@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .failures import FAILURES
-from .paper_results import SUCCESS, PaperResults
-from .report import Cell
-from .report_origins import origins
+from ..evaluation.failures import FAILURES
+from ..evaluation.paper_results import SUCCESS, PaperResults
+from .cells import Cell
+from .origins import origins
 
 __all__ = ["Rows", "compared", "csv_text", "details", "failed", "latex_text",
            "markdown_text"]  # fmt: skip

@@ -81,11 +81,11 @@ class TrainOptions(CommandOptions):
 def train(options: TrainOptions) -> Outcome:
     """Train an agent."""
     find_task(options.task)
+    from ..runs.folder import RunFolder
+    from ..training.config import TrainConfig
+    from ..training.processes import rank
+    from ..training.train import train as run_training
     from .outcome_text import interrupted, trained
-    from .processes import rank
-    from .snapshots import RunFolder
-    from .training import TrainConfig
-    from .training import train as run_training
 
     quiet_warp()
     config = TrainConfig(
@@ -163,9 +163,9 @@ class EvalOptions(CommandOptions):
 
 def evaluate(options: EvalOptions) -> Outcome:
     """Evaluate a training run."""
+    from ..evaluation.run import evaluate_run
+    from ..evaluation.share import share_run
     from .outcome_text import evaluated
-    from .report_run import evaluate_run
-    from .share import share_run
 
     if options.share is not None and options.share.exists():
         raise InputError(f"--share {options.share} exists; name a folder to be made")
@@ -207,7 +207,7 @@ def report(options: ReportOptions) -> Outcome:
     """Report evaluated runs."""
     if not options.runs:
         raise InputError("no run is named; name folders that `warp-deform train` made with --out")
-    from .report import write_report
+    from ..report.report import write_report
 
     found = write_report(options.runs, options.out)
     return Outcome(data=found.data, text=found.text)
@@ -231,7 +231,7 @@ class SweepOptions(CommandOptions):
 
 def sweep(options: SweepOptions) -> Outcome:
     """Run a grid."""
-    from .sweep import read_sweep, run_sweep
+    from ..sweep import read_sweep, run_sweep
 
     config = read_sweep(options.file)
     quiet_warp()

@@ -28,11 +28,11 @@ from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.workers import Workers
 
+from ..policy.policy import ImagePolicy, StatePolicy, load_policy
+from ..runs.folder import Fields, RunFolder, check_fields, read_json, read_record, write_json
 from .paper_results import partial_credit
-from .playing import Played, play_policy
-from .policy import ImagePolicy, StatePolicy, load_policy
+from .play import Played, play_policy
 from .protocol import Protocol, goals_for, goals_of
-from .snapshots import Fields, RunFolder, check_fields, read_json, read_record, write_json
 
 __all__ = ["Evaluation", "best", "evaluate_snapshot", "known", "measure", "stopped_early",
            "summarise", "trained_steps", "wilson"]  # fmt: skip

@@ -1,0 +1,1 @@
+"""The verbs of the `warp-deform` command that train, evaluate, refine and convert."""

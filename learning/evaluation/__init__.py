@@ -1,0 +1,1 @@
+"""How good a snapshot is: protocols, episodes, kinds of failure, intervals, videos."""

@@ -1,0 +1,1 @@
+"""What acts: a snapshot's agent, and what it remembers within an episode."""

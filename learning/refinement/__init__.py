@@ -1,0 +1,1 @@
+"""Better demonstrations from recorded ones, by search and by gradient."""
