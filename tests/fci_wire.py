@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import socket
 import struct
-from types import TracebackType
 
 import numpy as np
 
+from hardware.closing import Closing
 from hardware.emulator.protocol import (
     GRIPPER_COMMAND_PORT,
     GRIPPER_VERSION,
@@ -30,7 +30,7 @@ DEVIATIONS = struct.pack("<6d", *[10.0, 3.12, 2 * np.pi] * 2)
 BUMP = 0.05 * np.sin(np.linspace(0.0, np.pi, 101)) ** 2
 
 
-class Wire:
+class Wire(Closing):
     """A connection to the robot's port, or to the gripper's."""
 
     def __init__(self, host: str, *, gripper: bool = False) -> None:
@@ -44,15 +44,7 @@ class Wire:
         self._next_id = 0
         self.message_id = 0
 
-    def __enter__(self) -> Wire:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         self.tcp.close()
         self.udp.close()
 

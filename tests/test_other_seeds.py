@@ -97,7 +97,7 @@ def test_the_usual_first_seed_is_the_usual_evaluation(run: RunFolder) -> None:
     [
         (0, "seed 0 is one of training and of the test seeds 0 to 199"),
         (49_990, "seed 50000 is one of validation and of test"),
-        (-1, "the seed is -1; it must be 0 to"),
+        (-1, "--first-seed is -1; allowed: 0 to"),
         (10**9, "it must be 0 to"),
     ],
 )

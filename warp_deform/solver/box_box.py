@@ -13,6 +13,7 @@ from typing import Any
 import warp as wp
 
 from .body_contact import AHEAD, body_contact
+from .box_axes import box_axes
 from .structures import structures
 
 __all__ = ["POINTS", "box_box"]
@@ -30,21 +31,11 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     t = structures(scalar, lanes)
     S, R3, M33 = t.S, t.R3, t.M33
     Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
-    contact = body_contact(scalar, lanes, noted)
+    contact, box = body_contact(scalar, lanes, noted), box_axes(scalar, lanes)
     list_contact, share_load = contact.list_contact, contact.share_load
-
-    @wp.func
-    def column(m: M33, k: int):
-        return R3(m[0, k], m[1, k], m[2, k])
-
-    @wp.func
-    def reach(axes: M33, half: R3, n: R3):
-        """Half width of a box along n."""
-        return (
-            wp.abs(wp.dot(column(axes, 0), n)) * half[0]
-            + wp.abs(wp.dot(column(axes, 1), n)) * half[1]
-            + wp.abs(wp.dot(column(axes, 2), n)) * half[2]
-        )
+    center, axes, column, reach, candidate = (
+        box.center, box.axes, box.column, box.reach, box.candidate
+    )  # fmt: skip
 
     @wp.func
     def list_face(
@@ -134,26 +125,19 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
         start = int(c)
         ha = shapes.half[sa]
         hb = shapes.half[sb]
-        ca = bodies.x[a] + wp.quat_rotate(bodies.q[a], shapes.center[sa])
-        cb = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[sb])
+        ca = center(sa, a, shapes, bodies)
+        cb = center(sb, b, shapes, bodies)
         d = cb - ca
         if wp.dot(d, d) < (wp.length(ha) + wp.length(hb)) * (wp.length(ha) + wp.length(hb)):
-            aa = wp.quat_to_matrix(bodies.q[a] * shapes.rotation[sa])
-            ab = wp.quat_to_matrix(bodies.q[b] * shapes.rotation[sb])
+            aa = axes(sa, a, shapes, bodies)
+            ab = axes(sb, b, shapes, bodies)
             least = S(1.0e9)
             kind = int(-1)
             normal = R3()
             for k in range(15):
-                n = R3()
+                n = candidate(aa, ab, k)
                 # edge axes must win clearly: near-parallel edges would otherwise flicker
-                bias = S(1.0)
-                if k < 3:
-                    n = column(aa, k)
-                elif k < 6:
-                    n = column(ab, k - 3)
-                else:
-                    n = wp.cross(column(aa, (k - 6) // 3), column(ab, (k - 6) % 3))
-                    bias = S(1.05)
+                bias = wp.where(k < 6, S(1.0), S(1.05))
                 l = wp.length(n)
                 if l > S(1.0e-3) and least > S(0.0):
                     n = n / l

@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from .box_axes import box_axes
 from .structures import structures
 
 __all__ = ["box_overlap"]
@@ -18,21 +19,10 @@ PARALLEL = 1.0e-3
 def box_overlap(scalar: Any, lanes: int) -> SimpleNamespace:
     """`overlap_share(sa, a, sb, b, ...)` and `corner_depth(shape, b, ...)`."""
     t = structures(scalar, lanes)
-    S, R3, M33 = t.S, t.R3, t.M33
+    S, R3 = t.S, t.R3
     Shapes, Bodies = t.Shapes, t.Bodies
-
-    @wp.func
-    def column(m: M33, k: int):
-        return R3(m[0, k], m[1, k], m[2, k])
-
-    @wp.func
-    def reach(axes: M33, half: R3, n: R3):
-        """Half width of a box along the unit vector n [m]."""
-        return (
-            wp.abs(wp.dot(column(axes, 0), n)) * half[0]
-            + wp.abs(wp.dot(column(axes, 1), n)) * half[1]
-            + wp.abs(wp.dot(column(axes, 2), n)) * half[2]
-        )
+    box = box_axes(scalar, lanes)
+    center, axes, reach, candidate = box.center, box.axes, box.reach, box.candidate
 
     @wp.func
     def thinnest(half: R3):
@@ -51,25 +41,16 @@ def box_overlap(scalar: Any, lanes: int) -> SimpleNamespace:
         """
         ha = shapes.half[sa]
         hb = shapes.half[sb]
-        d = (
-            bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[sb])
-            - bodies.x[a] - wp.quat_rotate(bodies.q[a], shapes.center[sa])
-        )  # fmt: skip
+        d = center(sb, b, shapes, bodies) - center(sa, a, shapes, bodies)
         share = S(0.0)
         radii = wp.length(ha) + wp.length(hb)
         if wp.dot(d, d) < radii * radii:
-            aa = wp.quat_to_matrix(bodies.q[a] * shapes.rotation[sa])
-            ab = wp.quat_to_matrix(bodies.q[b] * shapes.rotation[sb])
+            aa = axes(sa, a, shapes, bodies)
+            ab = axes(sb, b, shapes, bodies)
             depth = S(1.0e9)
             k = int(0)
             while k < 15 and depth > S(0.0):
-                n = R3()
-                if k < 3:
-                    n = column(aa, k)
-                elif k < 6:
-                    n = column(ab, k - 3)
-                else:
-                    n = wp.cross(column(aa, (k - 6) // 3), column(ab, (k - 6) % 3))
+                n = candidate(aa, ab, k)
                 l = wp.length(n)
                 if l > S(PARALLEL):
                     n = n / l
@@ -82,8 +63,8 @@ def box_overlap(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def corner_depth(shape: int, b: int, shapes: Shapes, bodies: Bodies):
         """How deep the lowest corner of a shape of body b is under the table [m]; below 0 above."""
-        center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
-        axes = wp.quat_to_matrix(bodies.q[b] * shapes.rotation[shape])
-        return reach(axes, shapes.half[shape], R3(S(0.0), S(0.0), S(1.0))) - center[2]
+        middle = center(shape, b, shapes, bodies)
+        up = R3(S(0.0), S(0.0), S(1.0))
+        return reach(axes(shape, b, shapes, bodies), shapes.half[shape], up) - middle[2]
 
     return SimpleNamespace(overlap_share=overlap_share, corner_depth=corner_depth)
