@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from learning.clustered import clustered_mean, clustered_rate
+from learning.evaluation.clustered import clustered_mean, clustered_rate
 
 ROOT = Path(__file__).resolve().parent.parent
 

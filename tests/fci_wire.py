@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 
-from hardware.closing import Closing
+from hardware.support.closing import Closing
 from hardware.emulator.protocol import (
     GRIPPER_COMMAND_PORT,
     GRIPPER_VERSION,

@@ -14,7 +14,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import documented_numbers as numbers  # noqa: E402
 import documented_values as values  # noqa: E402
 
-from learning.clustered import clustered_mean, clustered_rate  # noqa: E402
+from learning.evaluation.clustered import clustered_mean, clustered_rate  # noqa: E402
 
 REPORT = "benchmarks/results/learning/report.csv"
 CELL = f"{REPORT}[task=cable-shape,agent=transporter,demos=100,variant=fast]"
