@@ -60,6 +60,8 @@ PAPER: dict[str, tuple[float | None, float]] = {
 Source: Seita et al., ICRA 2021 (arXiv:2012.03385v4), tables of tasks and of demonstrations.
 """
 REFINED = tuple(f"refined-{method}" for method in METHODS)
+WITH_MORE = ("gradient+lifts", "gradient+joint")
+"""A search with an option of `SearchConfig` that is off by default."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--by", nargs="+", default=["scripted", "visible", "mpc"],
-                        choices=[*DEMONSTRATORS, *METHODS, *REFINED])  # fmt: skip
+                        choices=[*DEMONSTRATORS, *METHODS, *REFINED, *WITH_MORE])  # fmt: skip
     parser.add_argument("--budget", type=int, default=64, help="simulated actions a choice")
     parser.add_argument("--depth", type=int, nargs="+", default=[2], choices=[1, 2],
                         help="actions that searches look ahead")  # fmt: skip
@@ -161,7 +163,7 @@ def main() -> None:
               "| CPU s an attempt | pierced edges, mean / worst state |")  # fmt: skip
         print("|---|---|---|---|---|---|---|---|")
     for task, name in itertools.product(options.tasks, options.by):
-        searches = name in METHODS or name in REFINED
+        searches = name in (*METHODS, *REFINED, *WITH_MORE)
         for depth in options.depth if searches else [None]:
             budget = options.budget if searches else None
             key = (task, name, budget, depth, options.first, options.seeds)
@@ -184,8 +186,10 @@ def measure(
     """Play every seed once; says on stderr how far it is."""
     search = None
     if budget is not None and depth is not None:
-        method = by.removeprefix("refined-")
-        search = SearchConfig(method=method, budget=budget, depth=depth)
+        method, _, more = by.removeprefix("refined-").partition("+")
+        search = SearchConfig(
+            method=method, budget=budget, depth=depth, lifts=more == "lifts", joint=more == "joint"
+        )
     with single_threaded():
         watch = Watch()
         if by in REFINED:

@@ -7,7 +7,6 @@ import struct
 
 import numpy as np
 
-from hardware.support.closing import Closing
 from hardware.emulator.protocol import (
     GRIPPER_COMMAND_PORT,
     GRIPPER_VERSION,
@@ -23,6 +22,7 @@ from hardware.emulator.protocol import (
     RobotCommand,
     RobotMode,
 )
+from hardware.support.closing import Closing
 
 PATIENCE = 30.0  # [s], on a busy machine
 DEVIATIONS = struct.pack("<6d", *[10.0, 3.12, 2 * np.pi] * 2)

@@ -1,0 +1,121 @@
+"""How many edges of a folded sheet pierce it, with and without contact between edges, and the cost.
+
+    python benchmarks/folds.py [--quick] [--json]
+
+Sheets of 10 x 10 and of 25 x 25 particles, side by side in lanes: a random particle of the rim is
+carried a random way over the sheet, and, once it is at rest, any particle of the heap as far again.
+Edges are counted exactly at rest after each. Costs are of the same rollouts, in CPU ms per
+simulated second and sheet, and speak for no other machine; their ratio does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from cloth_scenes import cloth_solver, edge_ratios, edges_of, fold_path, piercing
+
+from warp_deform.objects import ClothConfig
+from warp_deform.quiet import quiet_warp
+from warp_deform.rollout import rollout
+from warp_deform.workers import single_threaded
+
+SHEETS = {10: 16, 25: 8}
+"""Rows of a sheet, and how many sheets are folded."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Sheets at rest after their first or their second fold.
+
+    Attributes:
+        edge_contact: share of `ClothConfig`
+        pierced_least, pierced_most: edges of a sheet that pierce it
+        shortest: edge of all sheets, over its rest length
+        guards: sheets that a guard stopped
+    """
+
+    rows: int
+    edge_contact: float
+    fold: int
+    sheets: int
+    edges: int
+    pierced_least: int
+    pierced_most: int
+    shortest: float
+    guards: int
+    cpu_ms_per_second: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="a smoke run; not for publication")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    options = parser.parse_args()
+    quiet_warp()
+    with single_threaded():
+        found = [
+            row
+            for rows, sheets in (((10, 2),) if options.quick else SHEETS.items())
+            for edge_contact in (0.0, 0.2)
+            for row in folded(rows, sheets, edge_contact)
+        ]
+    if options.json:
+        print(json.dumps({"rows": [asdict(row) for row in found]}))
+        return
+    print("| rows | edge contact | fold | pierced | of | shortest | CPU ms |\n" + "|---" * 7 + "|")
+    for row in found:
+        print(f"| {row.rows} | {row.edge_contact} | {row.fold} | {row.pierced_least} to "
+              f"{row.pierced_most} | {row.edges} | {row.shortest:.2f} "
+              f"| {row.cpu_ms_per_second:.1f} |")  # fmt: skip
+
+
+def folded(rows: int, sheets: int, edge_contact: float) -> list[Row]:
+    """Fold sheets twice; the draws are the same with and without contact between edges."""
+    config = replace(ClothConfig(), rows=rows, columns=rows, edge_contact=edge_contact)
+    solver, cloth = cloth_solver(config, worlds=sheets, lanes=8)
+    flat = _positions(solver, 0)
+    rim = np.flatnonzero((np.abs(flat[:, :2] - [0.5, 0.0]).max(axis=1)) > 0.099)
+    found, rng = [], np.random.default_rng(0)
+    # compiled, and the kernels' caches filled, before anything is timed
+    rollout(solver, range(sheets), most=0.05)
+    for fold, choices in enumerate((rim, np.arange(len(flat))), 1):
+        paths = {}
+        for w in range(sheets):
+            particle = int(rng.choice(choices))
+            at = _positions(solver, w)[particle]
+            inwards = rng.normal(0, 0.04, 2) + 1.2 * (np.array([0.5, 0.0]) - at[:2])
+            paths[w] = fold_path(at, tuple(inwards), particle=particle)
+        began = time.process_time()
+        results = rollout(solver, range(sheets), paths=paths, least=1.2, most=2.5)
+        cpu = time.process_time() - began
+        ends = [_positions(solver, w) for w in range(sheets)]
+        pierced = [piercing(x, cloth.faces) for x in ends]
+        found.append(
+            Row(
+                rows=rows, edge_contact=edge_contact, fold=fold, sheets=sheets,
+                edges=len(edges_of(cloth.faces)),
+                pierced_least=min(pierced), pierced_most=max(pierced),
+                shortest=min(float(edge_ratios(x, flat, cloth.faces).min()) for x in ends),
+                guards=sum(
+                    results[w].watch.problems(w, solver.config.limits) != () for w in range(sheets)
+                ),
+                cpu_ms_per_second=1e3 * cpu / sum(results[w].seconds for w in range(sheets)),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _positions(solver: object, world: int) -> np.ndarray:
+    return solver.data.lane("particles.x", world).astype(float)  # type: ignore[attr-defined]
+
+
+if __name__ == "__main__":
+    main()
