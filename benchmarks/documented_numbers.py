@@ -18,10 +18,11 @@ behind a paragraph or list, and before a table, by column, for each of its rows:
 Behind a bar stands what a cell with another number of numbers is compared with. Of a mapped column
 every number is compared, measurement or not, and cells without one are passed over. A number is as
 the file has it if rounding to the printed digits gives it. In place of an expression, a word says
-why there is none: `-setting` (chosen, not measured), `-paper` (published), `-test` (held by a test
-that the section names), `-command` (the command that the section names prints it, and no file keeps
-it). So are all measurements of paragraphs and tables without a comment, if their section names a
-command; `documented_numbers.txt` beside this file lists those whose section does not.
+why there is none: `-setting` (chosen, not measured), `-published` (by others), `-test` (held by a
+test that the section names), `-command` (the command that the section names prints it, and no file
+keeps it); `-setting*` is for all numbers of a column. Without a comment a paragraph or a row that
+names a test is held by it, and by a command that its section names; `documented_numbers.txt` beside
+this file lists what has none of these. Numbers in other columns of tables are counted, by page.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from documented_values import ROOT, chosen, evaluate, files_of, is_source
 ALLOWED = Path(__file__).with_suffix(".txt")
 WHY = {
     "setting": "chosen, not measured",
-    "paper": "published by the paper",
+    "published": "published by others",
     "test": "held by a test that its section names",
     "command": "printed by a command that its section names, and kept in no file",
     "bare": "no source",
@@ -59,7 +60,7 @@ _FILE = re.compile(r"(?:benchmarks|tests|examples|learning|hardware|warp_deform)
 _PLACEHOLDER = re.compile(r"\b[A-Z]{2,}\b")
 _COMMAND = re.compile(r"warp-deform (?:bench|gradcheck)\b|make (?:demo|test|bench)\b")
 _COMMENT = re.compile(r"<!--\s*(?:(from|table):)?(.+?)-->", re.DOTALL)
-_UNSEEN = re.compile(r"<!--.*?-->|^```.*?^```", re.MULTILINE | re.DOTALL)
+_UNSEEN = re.compile(r"<!--.*?-->|^```.*?^```|^    [^\n]*$", re.MULTILINE | re.DOTALL)
 _QUOTED = re.compile(r"`[^`]+`|\]\([^)]+\)|95\s%\s*(?:Wilson|interval|confidence|\Z)")
 
 
@@ -87,12 +88,12 @@ class Figure:
 
 @dataclass(frozen=True)
 class _Block:
-    """A paragraph or a table: its offset and text, and what its section names."""
+    """A paragraph or a table: its offset and text, what its section names, its comments."""
 
     start: int
     text: str
     table: bool
-    named: bool
+    named: str
     comments: tuple[str, ...]
 
 
@@ -106,7 +107,11 @@ def examine(page: str, text: str) -> tuple[list[Figure], list[str]]:
     figures: list[Figure] = []
     wrong: list[str] = []
     for block in _blocks(page, text, wrong):
-        figures += (_of_table if block.table else _of_text)(page, block, wrong)
+        found = (_of_table if block.table else _of_text)(page, block, wrong)
+        for kind, needed in (("test", "tests/"), ("command", "")):
+            if needed not in block.named or not block.named:
+                wrong += [f"{each}: no {kind} is named" for each in found if each.kind == kind]
+        figures += found
     return figures, list(dict.fromkeys(wrong))
 
 
@@ -137,7 +142,7 @@ def _blocks(page: str, text: str, wrong: list[str]) -> Iterator[_Block]:
             r"(?:^[ ]*\|.*\n?)+|(?:^(?![ ]*\|).*\S.*\n?)+", seen[first:last], re.MULTILINE
         )
         spans = [(first + m.start(), m[0], m[0].lstrip().startswith("|")) for m in parts]
-        named = bool(names) or _COMMAND.search(seen[first:last]) is not None
+        named = " ".join([*names, *_COMMAND.findall(seen[first:last])])
         for start, part, table in spans:
             later = [s for s, _, is_table in spans if s > start and not is_table]
             until = min(later, default=last)
@@ -158,7 +163,7 @@ def _blocks(page: str, text: str, wrong: list[str]) -> Iterator[_Block]:
 def _of_text(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
     found = numbers_in(block.text)
     printed = [_offsets(match[0], block.start + match.start()) for match in found]
-    unsaid = "command" if block.named else "bare"
+    unsaid = _unsaid(block.named, block.text)
     if not block.comments:
         return [
             Figure(page, m[0], tuple(n), unsaid, True) for m, n in zip(found, printed, strict=True)
@@ -182,6 +187,7 @@ def _of_text(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
 def _of_table(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
     figures = []
     specs = [_columns(words) for words in block.comments]
+    wrong += [f"{page}: a table's comment without a column" for _, each in specs if 0 in each]
     at = block.start
     for line in block.text.splitlines(keepends=True):
         start, at = at, at + len(line)
@@ -195,7 +201,7 @@ def _of_table(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
             cell, inside = line[a:b], numbers_in(line[a:b])
             alternatives = mine[0][1].get(column) if mine else None
             if alternatives is None:
-                kind = "command" if block.named else "bare"
+                kind = _unsaid(block.named, line)
                 figures += [
                     Figure(page, m[0], tuple(_offsets(m[0], start + a + m.start())), kind, True)
                     for m in inside
@@ -204,6 +210,8 @@ def _of_table(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
             numbers = _offsets(cell, start + a)
             if not numbers:
                 continue
+            if alternatives in ([[("", f"{why}*")]] for why in WHY):
+                alternatives = [[("", alternatives[0][0][1][:-1])] * len(numbers)]
             wanted = next((each for each in alternatives if len(each) == len(numbers)), None)
             if wanted is None and len(alternatives) == 1 and len(alternatives[0]) > len(numbers):
                 wanted = alternatives[0][: len(numbers)]
@@ -216,6 +224,13 @@ def _of_table(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
     return figures
 
 
+def _unsaid(named: str, text: str) -> str:
+    """Why what has no comment is compared with no file."""
+    if "tests/" in text:
+        return "test"
+    return "command" if named else "bare"
+
+
 _Wanted = tuple[str, str]
 """A source and an expression, or "" and why there is none."""
 
@@ -226,7 +241,7 @@ def _wanted(tokens: list[str], source: str = "") -> list[_Wanted]:
         if is_source(token):
             source = token
         else:
-            found.append(("", token[1:]) if token[1:] in WHY else (source, token))
+            found.append(("", token[1:]) if token[1:].rstrip("*") in WHY else (source, token))
     return found
 
 
@@ -243,9 +258,9 @@ def _columns(words: str) -> tuple[str, dict[int, list[list[_Wanted]]]]:
             column = int(token[:-1])
             columns[column] = [[]]
         elif token == "|":
-            columns[column].append([])
+            columns.setdefault(column, [[]]).append([])
         else:
-            columns[column][-1] += _wanted([token], source)
+            columns.setdefault(column, [[]])[-1] += _wanted([token], source)
     return first, columns
 
 
@@ -301,11 +316,25 @@ def _figure(
 ) -> Figure:
     why = [each for each in results if isinstance(each, str)]
     held = [(n, v) for n, v in zip(numbers, results, strict=True) if not isinstance(v, str)]
-    if not held or not set(why) <= {"setting", "paper"}:
+    if not held or not set(why) <= {"setting", "published"}:
         return Figure(page, text, tuple(numbers), why[0], unit)
     return Figure(
         page, text, tuple(n for n, _ in held), "compared", unit, tuple(v for _, v in held)
     )
+
+
+def _unmapped(text: str) -> int:
+    """Cells of a page that begin with a number, but are no measurement and in no mapped column."""
+    count = 0
+    for block in _blocks("", text, []):
+        if not block.table:
+            continue
+        mapped = {column for words in block.comments for column in _columns(words)[1]}
+        for line in block.text.splitlines():
+            for column, cell in enumerate(line.split("|")[1:-1], 1):
+                begins = re.match(r"\s*[-+]?\d", cell) is not None
+                count += begins and column not in mapped and not numbers_in(cell)
+    return count
 
 
 def prints(value: float, number: str) -> bool:
@@ -336,6 +365,9 @@ def main() -> None:
         print(f"{count} of {len(measured)} measurements: {WHY.get(kind, 'compared with a file')}")
     cells = sum(len(f.numbers) for f in every if f.kind == "compared" and not f.unit)
     print(f"{cells} further numbers of tables: compared with a file")
+    others = Counter({path.name: _unmapped(path.read_text()) for path in pages()})
+    told = ", ".join(f"{page} {count}" for page, count in others.most_common() if count)
+    print(f"cells with a number and neither unit nor comment: {told}")
     if options.write:
         bare = sorted({str(figure) for figure in every if figure.kind == "bare"})
         ALLOWED.write_text("".join(f"{line}\n" for line in bare))

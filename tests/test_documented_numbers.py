@@ -142,11 +142,23 @@ def test_sources_have_to_be_there_and_to_choose_rows_that_agree() -> None:
         (f"{REPORT}[task=cable-shape]", "different numbers"),
         (f"{REPORT}[nothing=1]", "no such rows"),
         ("", "of no file"),
+        ("-test", "1 numbers: 3"),
     ):
         (wrong,) = numbers.examine("page", f"3 %\n<!-- from: {source} table_percent -->")[1]
         assert why in wrong
     assert "of another kind" in numbers.examine("page", "3 ms\n<!-- form: a.csv x -->")[1][0]
     assert "belong to no paragraph" in numbers.examine("page", "<!-- from: a.csv x -->")[1][0]
+
+
+def test_a_reason_has_to_be_true_of_its_section() -> None:
+    for reason, named in (("test", "tests/test_suite.py"), ("command", "benchmarks/physics.py")):
+        text = f"3 ms\n<!-- from: -{reason} -->\n\n"
+        assert kinds(f"{text}See `{named}`.") == [reason]
+        for other in ("", "See `learning/__init__.py`.") if reason == "test" else ("",):
+            assert f"no {reason} is named" in numbers.examine("page", text + other)[1][0]
+    table = "<!-- table: 2: -setting* -->\n\n| a | b |\n|---|---|\n| c | 3 %, 4 m, 5 |\n"
+    assert kinds(table) == ["setting"]
+    assert kinds("| a | 3 %, `tests/test_suite.py` |") == ["test"]
 
 
 def test_tables_are_compared_row_by_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,6 +175,8 @@ def test_tables_are_compared_row_by_row(tmp_path: Path, monkeypatch: pytest.Monk
     joined = "{} times\n<!--from: rows.csv+paper.jsonl[part=0]\n100*share-paper\n-->"
     assert numbers.examine("page", joined.format(10))[1] == []
     assert numbers.examine("page", joined.format(80))[1]
+    nowhere = comment.replace("2: ", "")
+    assert "without a column" in numbers.examine("page", nowhere + head + good)[1][0]
     twice = comment + comment + head + good
     assert "2 comments are for the row" in numbers.examine("page", twice)[1][0]
 
