@@ -35,7 +35,7 @@ from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
 from learning.training.schedules import SCHEDULES
 from learning.training.train import train
-from warp_deform.collect import CollectConfig, collect
+from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.quiet import quiet_warp
 from warp_deform.tasks.registry import task as find_task
 

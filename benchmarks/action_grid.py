@@ -23,13 +23,13 @@ from pathlib import Path
 import numpy as np
 
 from learning.models.transporter import PRESETS, TransporterConfig
-from warp_deform.demonstrators import demonstrator
-from warp_deform.episode_loop import SOLVED, Act, Run, play, worlds_for
+from warp_deform.collecting.workers import single_threaded
+from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.quiet import quiet_warp
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Task
-from warp_deform.workers import single_threaded
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import SOLVED, Act, Run, play, worlds_for
 
 TASKS = ("cable-line-notarget", "cable-shape", "fabric-flat-notarget", "block-notarget")
 GRIDS = {"none": "as it is", "paper": "grid of `paper`", "fast": "grid of `fast`"}

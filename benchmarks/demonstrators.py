@@ -35,17 +35,17 @@ from bag_scenes import pierced
 from cloth_scenes import edges_of
 
 from learning.refinement.refine import RefineConfig, refine
-from warp_deform.collect import CollectConfig, collect
-from warp_deform.demonstrators import DEMONSTRATORS, demonstrator, planner
-from warp_deform.episode_loop import SOLVED, play, worlds_for
+from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.recording import observe
+from warp_deform.collecting.workers import single_threaded
 from warp_deform.episodes import EpisodeReader, Step
 from warp_deform.objects import Bag, Cloth
 from warp_deform.planning import METHODS, SearchConfig
+from warp_deform.planning.demonstrators import DEMONSTRATORS, demonstrator, planner
 from warp_deform.quiet import quiet_warp
-from warp_deform.recording import observe
 from warp_deform.tasks.registry import TASKS
-from warp_deform.workers import single_threaded
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import SOLVED, play, worlds_for
 
 WARM_UP = 999_000  # seed
 ORDER = ("scripted", "visible", "mpc")

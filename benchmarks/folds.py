@@ -22,10 +22,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from cloth_scenes import cloth_solver, edge_ratios, edges_of, fold_path, piercing
 
+from warp_deform.collecting.workers import single_threaded
 from warp_deform.objects import ClothConfig
 from warp_deform.quiet import quiet_warp
 from warp_deform.rollout import rollout
-from warp_deform.workers import single_threaded
 
 SHEETS = {10: 16, 25: 8}
 """Rows of a sheet, and how many sheets are folded."""

@@ -24,8 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 import identify_cable
 import straighten_cable
 
+from warp_deform.collecting.workers import single_threaded
 from warp_deform.quiet import quiet_warp
-from warp_deform.workers import single_threaded
 
 GENERATION, ELITES = 20, 5
 """Draws of the cross-entropy method a generation, and how many of them the next is drawn around."""

@@ -22,7 +22,6 @@ from dataclasses import asdict, dataclass
 import newton
 import numpy as np
 
-from warp_deform.differentiable import DifferentiableRollout
 from warp_deform.objects import (
     BagConfig,
     BoxConfig,
@@ -39,7 +38,7 @@ from warp_deform.objects import (
     l_block,
 )
 from warp_deform.quiet import quiet_warp
-from warp_deform.rollout import rollout
+from warp_deform.rollout import DifferentiableRollout, rollout
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.bag_physics import BAG_SOLVER
 from warp_deform.tasks.cloth_physics import CLOTH_SOLVER

@@ -29,7 +29,7 @@ import numpy as np
 from warp_deform.bench import SCENES, run
 from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
-from warp_deform.solver.lanes import LANES as LANE_COUNTS
+from warp_deform.xpbd.lanes.algebra import LANES as LANE_COUNTS
 
 PEERS = {
     "cable": ("pybullet", "newton-vbd", "newton-xpbd"),

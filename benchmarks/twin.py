@@ -36,9 +36,9 @@ from hardware.recordings.scoring import MAX_ACTIONS
 from hardware.rig.config import RigConfig
 from hardware.rig.rig import open_rig
 from learning.evaluation.clustered import clustered_mean, clustered_rate
+from warp_deform.collecting.workers import single_threaded
 from warp_deform.quiet import quiet_warp
-from warp_deform.solver.guards import PhysicsError
-from warp_deform.workers import single_threaded
+from warp_deform.xpbd.guards import PhysicsError
 
 GOAL_SEED, TOSS_SEED = 700_000, 800_000
 PAPER = "7 of 10, mean 7 actions of the solved"

@@ -17,8 +17,8 @@ from warp_deform.rendering.pixels import SHAPE, world_to_pixel
 from warp_deform.rendering.scene_view import SceneView
 from warp_deform.rendering.topdown import TopDown
 from warp_deform.rendering.video import write_png
-from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 
 TILE = 300  # [pixels]
 HALF = 48  # [pixels] of the picture from above, which is enlarged

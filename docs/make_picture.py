@@ -14,8 +14,8 @@ from warp_deform.rendering.camera import look_at
 from warp_deform.rendering.caption import annotate
 from warp_deform.rendering.scene_view import ArmMeshes, SceneView
 from warp_deform.rendering.video import write_png
-from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 
 SEED, ACTION, SHARE = 0, 2, 0.62
 SIZE = (600, 1200)

@@ -12,14 +12,14 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from warp_deform.demonstrators import demonstrator
-from warp_deform.episode_loop import play
 from warp_deform.objects import ClothConfig, add_cloth_mesh
+from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.quiet import quiet_warp
 from warp_deform.tasks.cloth_physics import CLOTH_SOLVER, FABRIC_PRIMITIVE
 from warp_deform.tasks.demonstrators import pick_place
 from warp_deform.tasks.task import Layout, Stage, Task
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import play
 
 CELL, NEAR = 0.0125, 0.02  # [m]
 FRICTION = 2.0  # a smooth table would let the shirt slide along with its sleeve

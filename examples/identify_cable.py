@@ -10,10 +10,9 @@ import newton
 import numpy as np
 from scipy.optimize import minimize
 
-from warp_deform.differentiable import DifferentiableRollout
 from warp_deform.objects import CableConfig, add_cable
 from warp_deform.quiet import quiet_warp
-from warp_deform.rollout import GripPath, rollout
+from warp_deform.rollout import DifferentiableRollout, GripPath, rollout
 from warp_deform.solver import SolverFusedXPBD
 
 CORD = CableConfig(mass=0.01, link_stiffness=600.0, fold_stiffness=300.0, bend_stiffness=1.0)

@@ -13,7 +13,7 @@ import tempfile
 import numpy as np
 
 from warp_deform import register_task
-from warp_deform.cli import main as warp_deform
+from warp_deform.command.main import main as warp_deform
 from warp_deform.objects import CableConfig, add_cable, cable_line, ring_zone
 from warp_deform.tasks.demonstrators import pick_place
 from warp_deform.tasks.ground_truth import Row

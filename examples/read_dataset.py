@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_deform.collecting.inspection import contact_sheet, statistics
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
-from warp_deform.inspection import contact_sheet, statistics
 
 
 def training_pairs(reader: EpisodeReader) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -9,10 +9,9 @@ import newton
 import numpy as np
 import torch
 
-from warp_deform.differentiable import DifferentiableRollout
 from warp_deform.objects import CableConfig, add_cable, cable_line
 from warp_deform.quiet import quiet_warp
-from warp_deform.rollout import GripPath
+from warp_deform.rollout import DifferentiableRollout, GripPath
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 
 CABLE = CableConfig(bend_stiffness=2.0)

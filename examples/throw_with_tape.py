@@ -11,9 +11,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from warp_deform.differentiable import DifferentiableRollout
 from warp_deform.objects import CableConfig, add_cable, cable_line
 from warp_deform.quiet import quiet_warp
+from warp_deform.rollout import DifferentiableRollout
 from warp_deform.solver import SolverFusedXPBD
 
 CABLE = CableConfig(beads=8)

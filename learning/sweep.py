@@ -28,14 +28,14 @@ from typing import Any, Literal
 
 import joblib
 
-from warp_deform.collect import CollectConfig, collect
-from warp_deform.demonstrators import demonstrator
+from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.progress import progress_bar
+from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.robots import robot as find_robot
+from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.workers import Workers, worker_count
 
 from .evaluation.run import evaluate_run
 from .models.transporter import Transporter

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hardware.emulator import Contact, Hand, TableWorld
-from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
+from warp_deform.xpbd.guards import PhysicsError, Problem, ProblemKind
 
 TABLE_Z = 0.10
 

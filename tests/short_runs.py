@@ -12,7 +12,7 @@ from learning.runs.folder import RunFolder, read_json, write_json
 from learning.training.config import TrainConfig
 from learning.training.schedules import Schedule
 from learning.training.train import train
-from warp_deform.cli import main
+from warp_deform.command.main import main
 
 TASK = "block-notarget"
 SHORT = ["--episodes", "1", "--validation-episodes", "1", "--workers", "1"]

@@ -11,7 +11,7 @@ import numpy as np
 from warp_deform.objects import BoxConfig, add_box
 from warp_deform.objects.attributes import SpringMode, attribute
 from warp_deform.solver import GuardLimits, SolverConfig, SolverFusedXPBD
-from warp_deform.solver.topology import WorldTopology
+from warp_deform.xpbd.packing.topology import WorldTopology
 
 LOOSE = GuardLimits(stretch=1e9, depth=1e9, box_depth=1e9, box_overlap=1e9, clamped_steps=10**9)
 IDEAL = SolverConfig(damping=0.0, max_speed=1e3, limits=LOOSE)

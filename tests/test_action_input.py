@@ -9,9 +9,9 @@ from gymnasium.wrappers import RescaleAction
 from gymnasium.wrappers.vector import RescaleAction as VectorRescaleAction
 
 from warp_deform import PickPlaceEnv, PickPlaceVectorEnv
-from warp_deform.checked import real_array
 from warp_deform.errors import InputError
-from warp_deform.spaces import action_space, check_action
+from warp_deform.support.checked import real_array
+from warp_deform.worlds.spaces import action_space, check_action
 
 BLOCK = "block-notarget"
 SPACE = action_space()

@@ -10,11 +10,10 @@ import pytest
 from cloth_scenes import two_sheets_and_a_cable
 from solver_scenes import LOOSE, G, add_particles, box_solver, finalize, ideal, new_builder
 
-from warp_deform.differentiable import DifferentiableRollout, Gradients, substep_vjp
 from warp_deform.errors import InputError
 from warp_deform.objects import BoxConfig, CableConfig, add_box, add_cable, cable_line
 from warp_deform.objects.push import Push
-from warp_deform.rollout import GripPath, rollout
+from warp_deform.rollout import DifferentiableRollout, Gradients, GripPath, rollout, substep_vjp
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 

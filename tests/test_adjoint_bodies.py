@@ -18,9 +18,8 @@ from solver_scenes import (
     new_builder,
 )
 
-from warp_deform.differentiable import DifferentiableRollout, Gradients
 from warp_deform.objects import BoxConfig, add_box
-from warp_deform.rollout import GripPath
+from warp_deform.rollout import DifferentiableRollout, Gradients, GripPath
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 

@@ -14,11 +14,10 @@ import pytest
 from scipy.special import ellipj, ellipk
 from solver_scenes import G, add_particles, box_solver, finalize, ideal, new_builder
 
-from warp_deform.differentiable import DifferentiableRollout, Gradients
 from warp_deform.objects import BoxConfig, add_box
 from warp_deform.objects.box import BoxPart
-from warp_deform.rollout import GripPath
-from warp_deform.solver.rigid import SLEEP_SPEED
+from warp_deform.rollout import DifferentiableRollout, Gradients, GripPath
+from warp_deform.xpbd.bodies.rigid_body import SLEEP_SPEED
 
 DT = 1 / 1200
 MU = 0.4

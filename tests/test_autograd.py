@@ -13,11 +13,15 @@ import pytest
 import torch
 from solver_scenes import LOOSE, box_solver, ideal, new_builder
 
-from warp_deform.autograd import TensorRollout, rollout_tensors
-from warp_deform.differentiable import DifferentiableRollout
 from warp_deform.errors import InputError
 from warp_deform.objects import BoxConfig, CableConfig, add_cable, cable_line
-from warp_deform.rollout import GripPath, rollout
+from warp_deform.rollout import (
+    DifferentiableRollout,
+    GripPath,
+    TensorRollout,
+    rollout,
+    rollout_tensors,
+)
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 
 DT = 1 / 1200

@@ -8,19 +8,18 @@ import numpy as np
 import pytest
 from test_bag_tasks import delivered, snapshot, start
 
-from warp_deform import demonstrators
-from warp_deform.env import PickPlaceEnv
-from warp_deform.episode_loop import play
-from warp_deform.planning import Lookahead, Outlook, SearchConfig, search
-from warp_deform.registration import env_id
+from warp_deform.envs.env import PickPlaceEnv
+from warp_deform.envs.vector_env import PickPlaceVectorEnv
+from warp_deform.planning import Lookahead, Outlook, SearchConfig, demonstrators, search
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.bag_items import BagItems1, BagItems2
 from warp_deform.tasks.bag_physics import CARRY, INSERT, OPEN
 from warp_deform.tasks.past import Aloft, PastAction
+from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import TASKS
 from warp_deform.tasks.task import Layout, Snapshot
-from warp_deform.vector_env import PickPlaceVectorEnv
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import play
 
 ITEMS = (BagItems1, BagItems2)
 each_items = pytest.mark.parametrize("cls", ITEMS)

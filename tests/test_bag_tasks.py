@@ -14,7 +14,6 @@ from warp_deform.rendering.pixels import BOUNDS
 from warp_deform.rendering.topdown import TopDown
 from warp_deform.robots.primitive import Outcome
 from warp_deform.rollout import GripPath, rollout
-from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.tasks.bag_alone_open import BagAloneOpen
 from warp_deform.tasks.bag_color_goal import COLORS, BagColorGoal
 from warp_deform.tasks.bag_items import BagItems1, BagItems2
@@ -24,6 +23,7 @@ from warp_deform.tasks.free_space import FreeSpace, NoFreeSpace
 from warp_deform.tasks.past import PastAction
 from warp_deform.tasks.task import Layout, Snapshot, Task
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 
 BAGS = (BagAloneOpen, BagItems1, BagItems2, BagColorGoal)
 ITEMS = (BagItems1, BagItems2)

@@ -14,21 +14,21 @@ from hypothesis import strategies as st
 
 import warp_deform  # noqa: F401  registers the ids
 from learning.data.augmentation import RigidTransform, draw_transform, move_actions, move_states
-from warp_deform.demonstrators import demonstrator
-from warp_deform.episode_loop import SOLVED, play
+from warp_deform.collecting.recording import observe, record
 from warp_deform.episodes import EpisodeReader, EpisodeWriter
-from warp_deform.recording import observe, record
-from warp_deform.registration import env_id
+from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.rendering.pixels import SHAPE, TABLE_GRID
 from warp_deform.rendering.strand_mask import MaskLook, strand_mask
 from warp_deform.robots.primitive import Outcome
-from warp_deform.spaces import action_space, information, observation, observation_space
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.chain_shapes import straight_chain
 from warp_deform.tasks.metrics import mask_iou
+from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import FURTHER_TASKS, TASKS
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import SOLVED, play
+from warp_deform.worlds.spaces import action_space, information, observation, observation_space
 
 TASK = CableMaskGoal()
 NAME = TASK.name

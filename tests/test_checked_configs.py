@@ -7,7 +7,6 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from warp_deform.checked import Interval, check_number
 from warp_deform.errors import InputError
 from warp_deform.objects import (
     BagConfig,
@@ -19,6 +18,7 @@ from warp_deform.objects import (
     Zone,
 )
 from warp_deform.solver import GuardLimits, SolverConfig
+from warp_deform.support.checked import Interval, check_number
 
 CONFIGS = (CableConfig, RingConfig, ClothConfig, BagConfig, BoxConfig, SolverConfig, GuardLimits)
 NUMBERS = [

@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 from episode_samples import make_episode
 
-from warp_deform import __version__, cli, doctor
-from warp_deform.cli import CommandOptions, Outcome, Verb, main
+from warp_deform import __version__
+from warp_deform.command import doctor
+from warp_deform.command import main as cli
+from warp_deform.command.main import CommandOptions, Outcome, Verb, main
 from warp_deform.episodes import EpisodeWriter
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.tasks.registry import FURTHER_TASKS, TASKS

@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_deform import collect as collecting
-from warp_deform.collect import CollectConfig, CollectReport, collect, most_attempts
-from warp_deform.collection import Attempt, Collection
-from warp_deform.demonstrators import demonstrator
-from warp_deform.episode_loop import SOLVED, play
+from warp_deform.collecting import collect as collecting
+from warp_deform.collecting.collect import CollectConfig, CollectReport, collect, most_attempts
+from warp_deform.collecting.folder import Attempt, Collection
+from warp_deform.collecting.video import check_video
+from warp_deform.collecting.workers import worker_count
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
-from warp_deform.filming import check_video
-from warp_deform.workers import worker_count
+from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import SOLVED, play
 
 TASK = "cable-line-notarget"
 SEED = 7

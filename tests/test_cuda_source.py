@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from warp_deform.solver.adjoint import adjoint_kernel
-from warp_deform.solver.forward import forward_kernel
+from warp_deform.xpbd.kernels.adjoint import adjoint_kernel
+from warp_deform.xpbd.kernels.forward import forward_kernel
 
 
 def compiled(kernel: wp.Kernel, folder: Path, name: str) -> str:

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 from warp_deform import PickPlaceEnv
-from warp_deform import demonstrators as demonstrating
-from warp_deform.cli import main
-from warp_deform.collect import CollectConfig, collect
-from warp_deform.demonstrators import CANDIDATES, DEMONSTRATORS, demonstrator
-from warp_deform.episode_loop import SOLVED, Run, play
+from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.replay import verify
+from warp_deform.collecting.workers import single_threaded
+from warp_deform.command.main import main
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
 from warp_deform.planning import Outlook
-from warp_deform.replay import verify
-from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
+from warp_deform.planning import demonstrators as demonstrating
+from warp_deform.planning.demonstrators import CANDIDATES, DEMONSTRATORS, demonstrator
 from warp_deform.tasks.demonstrators import met_particle
 from warp_deform.tasks.registry import TASKS
-from warp_deform.workers import single_threaded
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
+from warp_deform.worlds.loop import SOLVED, Run, play
 
 LINE, BLOCK, RING = "cable-line-notarget", "block-notarget", "cable-ring"
 SAMPLES = [name for name in (RING, BLOCK, "fabric-flat", "bag-items-2") if name in TASKS]

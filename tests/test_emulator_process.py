@@ -24,7 +24,7 @@ from hardware.emulator import EmulatorFailed, EmulatorProcess, TableWorld
 from hardware.emulator.model_library import model_library
 from hardware.emulator.server import AddressTaken, EmulatorConfig, FciServer
 from warp_deform.errors import InputError
-from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
+from warp_deform.xpbd.guards import PhysicsError, Problem, ProblemKind
 
 ROOT = Path(__file__).resolve().parent.parent
 pytestmark = [

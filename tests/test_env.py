@@ -16,8 +16,8 @@ from warp_deform import PickPlaceEnv
 from warp_deform.episodes import EpisodeWriter, Goal
 from warp_deform.errors import InputError
 from warp_deform.robots.primitive import Outcome
-from warp_deform.solver.guards import Problem, ProblemKind
-from warp_deform.spaces import action_space, check_action
+from warp_deform.worlds.spaces import action_space, check_action
+from warp_deform.xpbd.guards import Problem, ProblemKind
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SPACE = action_space()

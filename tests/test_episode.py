@@ -52,9 +52,9 @@ from hardware.recordings.scoring import StartAtGoal, score_recording
 from hardware.rig.config import RigConfig
 from hardware.twin.camera import SimCamera, sim_calibration
 from hardware.twin.twin import CableTwin, TwinConfig
-from warp_deform.cli import main as command
+from warp_deform.command.main import main as command
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
+from warp_deform.xpbd.guards import PhysicsError, Problem, ProblemKind
 
 FAR = PickPlaceAction((0.45, 0.5), 0.0, (0.5, 0.0), 0.0)
 TESTS = Path(__file__).resolve().parent

@@ -32,13 +32,14 @@ from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
 from learning.training.schedules import Schedule
 from learning.training.train import train
-from warp_deform.cli import main
-from warp_deform.episode_loop import Run
+from warp_deform.collecting.goals import load_goals
+from warp_deform.collecting.make_goals import make_goals
+from warp_deform.command.main import main
 from warp_deform.episodes import EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
-from warp_deform.goals import load_goals, make_goals
 from warp_deform.tasks.bag_items import BagItems1
 from warp_deform.tasks.cable_line import CableLineNotarget
+from warp_deform.worlds.loop import Run
 
 TASK = "cable-line-notarget"
 SCHEDULE = Schedule(steps=2, batch=4, lr=1e-3, snapshots=2)

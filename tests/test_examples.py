@@ -18,7 +18,7 @@ IN_A_PROCESS = {"own_task", "vector_env"}
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from warp_deform.collect import CollectConfig, collect
+    from warp_deform.collecting.collect import CollectConfig, collect
 
     folder = tmp_path_factory.mktemp("examples") / "block"
     collect(CollectConfig(task="block-notarget", episodes=2, seed=0, out=folder, workers=1))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from warp_deform.differentiable import DifferentiableRollout, Gradients
+from warp_deform.rollout import DifferentiableRollout, Gradients
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 

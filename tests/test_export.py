@@ -22,7 +22,7 @@ from learning.interchange.conversion import ConversionReport, new_folder
 from learning.interchange.lerobot import ACTION_NAMES, SIDECAR, export_lerobot
 from learning.interchange.robomimic import STATE_PARTS, export_robomimic
 from learning.interchange.running_statistics import RunningStatistics
-from warp_deform.cli import main
+from warp_deform.command.main import main
 from warp_deform.episodes import Episode, EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
 

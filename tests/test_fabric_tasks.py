@@ -15,7 +15,6 @@ from warp_deform.rendering.drawables import Drawables
 from warp_deform.rendering.pixels import BOUNDS
 from warp_deform.rendering.topdown import TopDown
 from warp_deform.robots.primitive import Outcome
-from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.tasks.fabric_cover import FabricCover
 from warp_deform.tasks.fabric_flat import FabricFlat, FabricFlatNotarget
 from warp_deform.tasks.fabric_pull import beyond, corners, on_table, takes
@@ -24,6 +23,7 @@ from warp_deform.tasks.free_space import FreeSpace, NoFreeSpace
 from warp_deform.tasks.past import PastAction
 from warp_deform.tasks.task import Layout, Snapshot, Task
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 
 FABRICS = (FabricCover, FabricFlat, FabricFlatNotarget)
 FLAT = FABRICS[1:]

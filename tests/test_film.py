@@ -20,12 +20,12 @@ from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
 from learning.training.schedules import Schedule
 from learning.training.train import train
-from warp_deform import filming
-from warp_deform.cli import main
+from warp_deform.collecting import video as filming
+from warp_deform.collecting.workers import single_threaded
+from warp_deform.command.main import main
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.rendering.pixels import SHAPE, TABLE_GRID
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.workers import single_threaded
 
 TASK = "block-notarget"
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from warp_deform.cli import VERBS, CommandOptions, main
+from warp_deform.command.main import VERBS, CommandOptions, main
 
 
 def options() -> Iterator[tuple[str, type]]:

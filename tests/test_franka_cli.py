@@ -23,9 +23,9 @@ from hardware.recordings.scoring import StartAtGoal
 from hardware.twin.look_server import LookServer, remote_look
 from hardware.twin.twin import TwinLook
 from hardware.vision.top_down_view import TopDownView
-from warp_deform.cli import main
+from warp_deform.command.main import main
 from warp_deform.errors import InputError
-from warp_deform.revision import running_revision
+from warp_deform.support.revision import running_revision
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_deform.collect import CollectConfig, collect
+from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.goals import load_goal, load_goals
+from warp_deform.collecting.make_goals import GOAL_SEED, make_goals
+from warp_deform.collecting.replay import verify
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
-from warp_deform.goals import GOAL_SEED, load_goal, load_goals, make_goals
-from warp_deform.replay import verify
 from warp_deform.worlds import Worlds
 
 TASK = "cable-line-notarget"

@@ -10,16 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_deform.cli import main
-from warp_deform.differentiable import DifferentiableRollout, Gradients
+from warp_deform.command.main import main
 from warp_deform.gradcheck import GradcheckConfig, Row, check
 from warp_deform.gradcheck.branches import taken
 from warp_deform.gradcheck.differences import DEEPEST, RUNGS, WORLDS, Sample, _depths, compare
 from warp_deform.gradcheck.draws import Draw, draw_states
 from warp_deform.gradcheck.limits import RATIO, central, kink
-from warp_deform.rollout import rollout
-from warp_deform.solver.tape import Kind
+from warp_deform.rollout import DifferentiableRollout, Gradients, rollout
 from warp_deform.worlds import Worlds
+from warp_deform.xpbd.lanes.tape import Kind
 
 LINE = "cable-line-notarget"
 FEW = GradcheckConfig(levels=("substep",), states=4)

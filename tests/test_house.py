@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import warp_deform
-from warp_deform.doctor import DEPENDENCIES
+from warp_deform.command.doctor import DEPENDENCIES
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("warp_deform", "learning", "hardware", "tests", "examples", "benchmarks")

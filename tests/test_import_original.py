@@ -25,10 +25,10 @@ from original_recordings import (
 from learning.interchange import deformable_ravens
 from learning.interchange.deformable_ravens import import_deformable_ravens, read_recording
 from learning.runs.folder import RunFolder, read_snapshot
-from warp_deform.cli import main
+from warp_deform.collecting.goals import load_goals
+from warp_deform.command.main import main
 from warp_deform.episodes import HEIGHT_UNIT, EpisodeReader
 from warp_deform.errors import InputError
-from warp_deform.goals import load_goals
 from warp_deform.tasks.registry import TASKS
 
 ARCHIVE = Path(__file__).resolve().parent / "data" / "original_insertion-goal.tar.xz"

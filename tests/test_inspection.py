@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from episode_samples import make_episode, with_info, with_step
 
+from warp_deform.collecting.inspection import contact_sheet, statistics
 from warp_deform.episodes import EpisodeReader, EpisodeWriter, combine_hashes
 from warp_deform.errors import InputError
-from warp_deform.inspection import contact_sheet, statistics
 
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "read_dataset.py"
 SIZE = (320, 160)

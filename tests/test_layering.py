@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import pytest
 
-from warp_deform.cli import VERBS
+from warp_deform.command.main import VERBS
 
 ROOT = Path(__file__).resolve().parent.parent
 MAY_IMPORT = {
@@ -28,6 +28,21 @@ MAY_IMPORT = {
 OURS = {*MAY_IMPORT, "tests", "examples", "benchmarks"}
 LAZY_EXCEPTION = ("hardware", "learning.policy")
 FLOORS = {
+    "warp_deform": [
+        "__main__",
+        "command envs",
+        "gradcheck collecting",
+        "planning",
+        "worlds bench",
+        "tasks",
+        "robots solver",
+        "rollout",
+        "rendering xpbd peers",
+        "objects",
+        "quiet episodes",
+        "support",
+        "errors",
+    ],
     "learning": [
         "command",
         "sweep",
@@ -56,9 +71,8 @@ OPTIONAL = {
     "franky", "frankapy", "pyk4a", "pyrealsense2",
 }  # fmt: skip
 COMPUTED_IMPORTS = {
-    "warp_deform/__init__.py",
-    "warp_deform/cli.py",
-    "warp_deform/solver/__init__.py",
+    "warp_deform/command/main.py",
+    "warp_deform/support/handed_on.py",
     "warp_deform/tasks/elsewhere.py",
 }
 ADDS_TO_PATH = {"warp_deform/tasks/elsewhere.py"}
@@ -204,14 +218,14 @@ def test_a_circle_and_an_upward_import_are_found() -> None:
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("warp_deform.env", "import learning"),
-        ("warp_deform.env", "def f():\n    from learning.policy import load"),
-        ("warp_deform.env", "from hardware import safety"),
+        ("warp_deform.envs.env", "import learning"),
+        ("warp_deform.envs.env", "def f():\n    from learning.policy import load"),
+        ("warp_deform.envs.env", "from hardware import safety"),
         ("learning.policy", "import hardware.arm.safe_robot"),
         ("hardware.episodes.episode", "from learning.policy import load"),
         ("hardware.episodes.episode", "def f():\n    import learning.training"),
         ("hardware.backends.panda", "import panda_py"),
-        ("warp_deform.env", "import tests.test_cli"),
+        ("warp_deform.envs.env", "import tests.test_cli"),
     ],
 )
 def test_a_wrong_import_is_found(module: str, source: str) -> None:

@@ -15,7 +15,7 @@ from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
 from learning.training.schedules import SCHEDULES
 from learning.training.train import train
-from warp_deform.collect import CollectConfig, collect
+from warp_deform.collecting.collect import CollectConfig, collect
 
 TASK = "cable-shape"
 

@@ -19,7 +19,7 @@ from learning.training import train as training
 from learning.training.config import TrainConfig
 from learning.training.schedules import Schedule
 from learning.training.train import train
-from warp_deform.collection import Attempt, Collection, append_attempt
+from warp_deform.collecting.folder import Attempt, Collection, append_attempt
 from warp_deform.episodes import EpisodeWriter
 from warp_deform.errors import InputError, WarpDeformError
 

@@ -10,10 +10,9 @@ import pytest
 import warp as wp
 from solver_scenes import new_builder
 
-from warp_deform.differentiable import DifferentiableRollout
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.objects import BoxConfig, CableConfig, add_box, add_cable, cable_line
-from warp_deform.rollout import rollout
+from warp_deform.rollout import DifferentiableRollout, rollout
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.solver.stepping import substeps
 

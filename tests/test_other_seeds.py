@@ -20,10 +20,10 @@ from learning.policy.policy import load_policy
 from learning.report.report import write_report
 from learning.runs.folder import RunFolder, read_json
 from warp_deform import __version__
-from warp_deform.cli import main
-from warp_deform.episode_loop import worlds_for
+from warp_deform.command.main import main
 from warp_deform.errors import InputError
-from warp_deform.progress import PlainLines
+from warp_deform.support.progress import PlainLines
+from warp_deform.worlds.loop import worlds_for
 
 ONE = {"validation_episodes": 1, "workers": 1, "progress": False}
 

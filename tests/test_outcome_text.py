@@ -14,8 +14,8 @@ from learning.evaluation.evaluate import summarise
 from learning.evaluation.play import Played
 from learning.runs.folder import RunFolder
 from learning.training import train as training
-from warp_deform import cli
-from warp_deform.cli import main
+from warp_deform.command import main as cli
+from warp_deform.command.main import main
 
 TRAINED: dict[str, Any] = {
     "task": "cable-line-notarget", "agent": "goal-split", "preset": "fast", "demos": 10,

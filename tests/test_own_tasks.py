@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import warp_deform
-from warp_deform.cli import main
-from warp_deform.env import PickPlaceEnv
+from warp_deform.command.main import main
+from warp_deform.envs.env import PickPlaceEnv
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
 from warp_deform.robots.primitive import Stage
@@ -356,7 +356,7 @@ def test_an_installed_task_has_the_id_of_the_version_that_its_entry_point_says(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     install(tmp_path, "new", "box-away-v2 = second_tasks:BoxAway", second_tasks=second())
-    warp_deform.registration.register_environments()
+    warp_deform.tasks.registration.register_environments()
     assert "second_tasks" not in sys.modules and is_known("box-away")
     assert "WarpDeform/BoxAway-v2" in gymnasium.registry
     assert "WarpDeform/BoxAway-v1" not in gymnasium.registry

@@ -8,19 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from warp_deform.demonstrators import demonstrator
-from warp_deform.episode_loop import play
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.planning import METHODS, Lookahead, SearchConfig, places, search
+from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.planning.follow import Follow
 from warp_deform.planning.joint import move_both
 from warp_deform.planning.places import Places
 from warp_deform.planning.search import _Around
 from warp_deform.planning.slopes import Slopes, loss_and_slopes
-from warp_deform.planning.way_points import WayPointConfig, WayPoints, _Bend
+from warp_deform.planning.waypoints import WayPointConfig, WayPoints, _Bend
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.registry import task
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import play
 
 LINE = "cable-line-notarget"
 

@@ -8,8 +8,8 @@ import threading
 
 import pytest
 
-from warp_deform import progress
-from warp_deform.progress import Advance, PlainLines, duration, progress_bar
+from warp_deform.support import progress
+from warp_deform.support.progress import Advance, PlainLines, duration, progress_bar
 
 
 class Clock:

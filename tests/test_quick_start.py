@@ -17,7 +17,7 @@ from training_samples import write_demonstrations
 from learning.evaluation import evaluate as evaluation
 from learning.evaluation.play import Played
 from learning.runs.folder import RunFolder
-from warp_deform.cli import main
+from warp_deform.command.main import main
 
 ROOT = Path(__file__).resolve().parent.parent
 TASK = "cable-line-notarget"

@@ -17,16 +17,16 @@ from learning.refinement import refine as refinement
 from learning.refinement import waypoints as way_points
 from learning.refinement.refine import REFINED, REFINEMENT, RefineConfig, RefineReport, refine
 from learning.refinement.waypoints import WAY_POINTS, BendConfig, bend, read_path
-from warp_deform.cli import main
-from warp_deform.collect import CollectConfig, collect
-from warp_deform.episode_loop import SOLVED, Run, worlds_for
+from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.replay import Recording, verify
+from warp_deform.command.main import main
 from warp_deform.episodes import Episode, EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
 from warp_deform.planning import SearchConfig
-from warp_deform.planning.way_points import WayPointConfig, WayPoints
-from warp_deform.replay import Recording, verify
+from warp_deform.planning.waypoints import WayPointConfig, WayPoints
 from warp_deform.tasks.registry import TASKS
 from warp_deform.tasks.task import Task
+from warp_deform.worlds.loop import SOLVED, Run, worlds_for
 
 SEARCH = SearchConfig(method="cem", depth=1, budget=24, candidates=8)
 

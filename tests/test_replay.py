@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from episode_samples import make_episode
 
-from warp_deform import filming
-from warp_deform.collect import CollectConfig, collect
+from warp_deform.collecting import video as filming
+from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.replay import verify
+from warp_deform.collecting.video import film
 from warp_deform.episodes import Episode, EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.filming import film
-from warp_deform.replay import verify
 
 TASK = "cable-line-notarget"
 SEED = 300

@@ -22,7 +22,7 @@ from learning.report.curves import draw_curves
 from learning.report.read import read_runs
 from learning.report.report import write_report
 from learning.report.tables import compared
-from warp_deform.cli import main
+from warp_deform.command.main import main
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import TASKS
 

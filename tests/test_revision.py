@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from warp_deform import __version__
-from warp_deform.revision import Revision, running_revision
+from warp_deform.support.revision import Revision, running_revision
 
 
 def git(folder: Path, *arguments: str) -> str:

@@ -17,12 +17,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_deform  # noqa: F401  registers the ids
-from warp_deform.registration import env_id
 from warp_deform.robots.primitive import Outcome
-from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
-from warp_deform.spaces import action_space, information, observation, observation_space
+from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import TASKS
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
+from warp_deform.worlds.spaces import action_space, information, observation, observation_space
 
 STRESS = Path(__file__).resolve().parent.parent / "benchmarks" / "stress.py"
 SLOTS = 20

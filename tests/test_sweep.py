@@ -13,7 +13,7 @@ from training_samples import block_episode, write_demonstrations
 from learning import sweep
 from learning.runs.folder import RunFolder
 from learning.sweep import Collecting, Evaluating, read_sweep, run_sweep
-from warp_deform.cli import main
+from warp_deform.command.main import main
 from warp_deform.episodes import EpisodeWriter
 from warp_deform.errors import InputError, WarpDeformError
 

@@ -26,7 +26,7 @@ from hardware.measuring.with_points import click_point, measure_points, points_f
 from hardware.rig.config import RigConfig
 from hardware.rig.rig import read_calibration
 from hardware.support.json_file import write_json
-from warp_deform.cli import main
+from warp_deform.command.main import main
 from warp_deform.errors import InputError
 
 CAMERA = camera_above(height=0.75, yaw=np.pi / 2 + 0.1)  # the long side along the rows

@@ -21,7 +21,7 @@ from learning.runs.folder import RunFolder, read_snapshot
 from learning.training.config import TrainConfig
 from learning.training.schedules import Schedule
 from learning.training.train import TrainReport, train
-from warp_deform.cli import main
+from warp_deform.command.main import main
 from warp_deform.episodes import Episode, EpisodeWriter
 from warp_deform.errors import InputError
 from warp_deform.tasks.cable_line import CableLineNotarget

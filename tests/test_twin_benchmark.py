@@ -18,7 +18,7 @@ from test_episode import Arm
 from hardware.arm.safe_robot import SafeRobot
 from hardware.cameras.camera import CameraError, Frame
 from hardware.vision.top_down_view import TopDownView
-from warp_deform.solver.guards import PhysicsError, Problem, ProblemKind
+from warp_deform.xpbd.guards import PhysicsError, Problem, ProblemKind
 
 ROOT = Path(__file__).resolve().parent.parent
 

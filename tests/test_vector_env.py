@@ -9,11 +9,11 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from warp_deform import PickPlaceEnv, PickPlaceVectorEnv, PrivilegedStage
+from warp_deform.envs.wrappers import VectorPrivilegedStage
 from warp_deform.errors import InputError
-from warp_deform.spaces import action_space
 from warp_deform.tasks.block import BlockNotarget
 from warp_deform.tasks.task import Stage
-from warp_deform.wrappers import VectorPrivilegedStage
+from warp_deform.worlds.spaces import action_space
 
 SPACE = action_space()
 MIDDLE = (SPACE.low + SPACE.high) / 2

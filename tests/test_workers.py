@@ -11,7 +11,7 @@ from pathlib import Path
 
 WAITING = """
 import os, time
-from warp_deform.workers import Workers
+from warp_deform.collecting.workers import Workers
 
 def say(chunk):
     return [os.getpid()]

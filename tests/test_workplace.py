@@ -32,7 +32,7 @@ from hardware.rig.workplace import workplace_of
 from hardware.twin.camera import SimCameraConfig, sim_calibration
 from hardware.twin.twin import TwinConfig
 from hardware.vision.task_frame import fits_task, to_base, to_task
-from warp_deform.cli import main
+from warp_deform.command.main import main
 from warp_deform.errors import InputError
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 

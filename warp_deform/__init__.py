@@ -12,34 +12,25 @@ The public names below load their modules on first use.
 
 from __future__ import annotations
 
-import importlib
-
-from .registration import register_environments, register_task
-
-__version__ = "0.1.0"
+from .support.handed_on import hand_on
+from .support.version import __version__
+from .tasks.registration import register_environments, register_task
 
 _HOME = {
-    "Episode": "episodes",
-    "EpisodeReader": "episodes",
-    "EpisodeWriter": "episodes",
-    "InputError": "errors",
-    "PickPlaceEnv": "env",
-    "PickPlaceVectorEnv": "vector_env",
-    "PrivilegedStage": "wrappers",
-    "TASKS": "tasks.registry",
-    "WarpDeformError": "errors",
+    "Episode": ".episodes",
+    "EpisodeReader": ".episodes",
+    "EpisodeWriter": ".episodes",
+    "InputError": ".errors",
+    "PickPlaceEnv": ".envs.env",
+    "PickPlaceVectorEnv": ".envs.vector_env",
+    "PrivilegedStage": ".envs.wrappers",
+    "TASKS": ".tasks.registry",
+    "WarpDeformError": ".errors",
 }
 
 __all__ = ["__version__", *_HOME, "register_task"]
 
-
-def __getattr__(name: str) -> object:
-    """Load a public name's module when the name is first asked for (PEP 562)."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
-    globals()[name] = value
-    return value
+__getattr__ = hand_on(__name__, _HOME)
 
 
 def __dir__() -> list[str]:

@@ -24,7 +24,7 @@ from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.free_space import FreeSpace
 from warp_deform.tasks.metrics import mask_iou
 from warp_deform.tasks.task import Layout, Snapshot
-from warp_deform.worlds import Worlds
+from warp_deform.worlds.worlds import Worlds
 
 from ..arm.pick_place import PickPlaceAction
 from ..episodes.episode import Observation

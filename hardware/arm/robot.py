@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.extras import install_extra
+from warp_deform.support.extras import install_extra
 
 from ..support.closing import Closing
 from .panda import GRIPPER_MAX_WIDTH, Q_MAX, Q_MIN

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from warp_deform.errors import InputError
-from warp_deform.extras import install_extra
+from warp_deform.support.extras import install_extra
 
 from ..arm.panda import DQ_MAX, GRIPPER_MAX_WIDTH
 from ..arm.robot import (

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_deform.extras import install_extra
+from warp_deform.support.extras import install_extra
 
 from .camera import CameraError, CameraIntrinsics
 from .streaming import StreamConfig, StreamingCamera

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from warp_deform.cli import CommandOptions, Outcome
-from warp_deform.flag_range import FlagRange
+from warp_deform.command.flag_range import FlagRange
+from warp_deform.command.main import CommandOptions, Outcome
 
 from ..rig.config import CameraName, RigConfig, RobotName
 

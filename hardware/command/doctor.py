@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from warp_deform.errors import InputError
-from warp_deform.extras import install_extra
+from warp_deform.support.extras import install_extra
 
 from ..rig.config import RobotName
 

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg, subcommand
 
-from warp_deform.cli import CommandOptions, Outcome
+from warp_deform.command.flag_range import SEED, FlagRange
+from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
-from warp_deform.flag_range import SEED, FlagRange
 from warp_deform.quiet import quiet_warp
 
 from ..rig.config import AgentName, CameraName, RigConfig, RobotName
@@ -219,7 +219,7 @@ def _why_not(result: EpisodeResult) -> str:
 
 
 def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> EpisodeResult:
-    from warp_deform.revision import running_revision
+    from warp_deform.support.revision import running_revision
 
     from ..agents.human import Terminal
     from ..agents.make import make_chooser

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from warp_deform.cli import CommandOptions, Outcome
+from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
 
 __all__ = ["ReplayOptions", "ScoreOptions", "replay", "score"]

@@ -30,7 +30,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.solver.guards import PhysicsError
+from warp_deform.xpbd.guards import PhysicsError
 
 from ..arm.pick_place import (
     PickPlaceAction,

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from warp_deform.command.flag_range import check_seed
 from warp_deform.errors import InputError
-from warp_deform.flag_range import check_seed
 from warp_deform.rendering.strand_mask import draw_line
 
 from ..arm.panda import PandaKinematics

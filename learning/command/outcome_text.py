@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from warp_deform.progress import duration
+from warp_deform.support.progress import duration
 
 __all__ = ["evaluated", "interrupted", "trained"]
 

@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from warp_deform.cli import CommandOptions, Outcome
+from warp_deform.command.flag_range import COUNT
+from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
-from warp_deform.flag_range import COUNT
 from warp_deform.quiet import quiet_warp
 
 __all__ = ["RefineOptions", "refine"]
@@ -79,7 +79,7 @@ def refine(options: RefineOptions) -> Outcome:
 def _bend(options: RefineOptions) -> Outcome:
     """Bend the paths of a folder's actions."""
     from warp_deform.planning.search import SLOPE_COST
-    from warp_deform.planning.way_points import WayPointConfig
+    from warp_deform.planning.waypoints import WayPointConfig
 
     from ..refinement.waypoints import BendConfig, bend
 

@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from warp_deform.cli import CommandOptions, Outcome
+from warp_deform.command.flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
+from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError, Interrupted
-from warp_deform.flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
 from warp_deform.quiet import quiet_warp
 from warp_deform.robots import RobotName
 from warp_deform.tasks.registry import task as find_task

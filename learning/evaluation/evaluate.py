@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from warp_deform.episode_loop import SLOTS, worlds_for
+from warp_deform.collecting.workers import Workers
 from warp_deform.episodes import EpisodeReader, combine_hashes, versions
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.workers import Workers
+from warp_deform.worlds.loop import SLOTS, worlds_for
 
 from ..policy.policy import ImagePolicy, StatePolicy, load_policy
 from ..runs.folder import Fields, RunFolder, check_fields, read_json, read_record, write_json

@@ -24,11 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from warp_deform.episode_loop import SOLVED, Run
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.bag_opening import BagTask
 from warp_deform.tasks.bag_physics import CARRY, OPEN
-from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import SOLVED, Run
+from warp_deform.worlds.worlds import Worlds
 
 __all__ = ["FAILURES", "bag_holds_items", "bag_opening", "closed", "failure", "puts_back",
            "took_nothing"]  # fmt: skip

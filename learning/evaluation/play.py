@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warp_deform.episode_loop import SOLVED, Run, play
+from warp_deform.envs.wrappers import stage_at
 from warp_deform.episodes import Goal
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.task import Stage
-from warp_deform.worlds import Worlds
-from warp_deform.wrappers import stage_at
+from warp_deform.worlds.loop import SOLVED, Run, play
+from warp_deform.worlds.worlds import Worlds
 
 from ..policy.policy import ImagePolicy, Policy, RetryingPolicy, StatePolicy
 from .failures import bag_opening, failure

@@ -14,11 +14,12 @@ from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
-from warp_deform.collect import most_attempts
-from warp_deform.collection import check_seeds
+from warp_deform.collecting.collect import most_attempts
+from warp_deform.collecting.folder import check_seeds
+from warp_deform.collecting.goals import load_goal, load_goals
+from warp_deform.collecting.make_goals import GOAL_SEED, make_goals
 from warp_deform.episodes import EpisodeReader, Goal
 from warp_deform.errors import InputError
-from warp_deform.goals import GOAL_SEED, load_goal, load_goals, make_goals
 from warp_deform.tasks.registry import task as find_task
 
 from ..runs.folder import RunFolder

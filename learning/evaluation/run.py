@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 import joblib
 
+from warp_deform.collecting.workers import worker_count
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
-from warp_deform.progress import progress_bar
-from warp_deform.revision import running_revision
-from warp_deform.workers import worker_count
+from warp_deform.support.progress import progress_bar
+from warp_deform.support.revision import running_revision
 
 from ..policy.policy import load_policy
 from ..runs.folder import RunFolder, write_json
@@ -52,7 +52,7 @@ def evaluate_run(
     goals: folder of goals for the test episodes; None: constructed from goal seeds
     first_seed: of other test episodes; their results are kept apart
     video: folder for videos of the first `videos` test episodes
-    progress: tell of it on stderr, see `warp_deform.progress`
+    progress: tell of it on stderr, see `warp_deform.support.progress`
 
     Writes `eval_info.json` into the run's folder and returns what it says: task, agent, preset,
     steps (planned), trained_steps (fewer where training stopped early), demos, seed, stage_rule,

@@ -16,15 +16,15 @@ import cv2
 import numpy as np
 import torch
 
-from warp_deform.episode_loop import Run, worlds_for
+from warp_deform.collecting.video import Take, TakeRow, film_takes, seen
+from warp_deform.collecting.workers import single_threaded
 from warp_deform.episodes import Goal
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.filming import Take, TakeRow, film_takes, seen
 from warp_deform.rendering.pixels import PixelGrid
 from warp_deform.rendering.video import VideoWriter
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.workers import single_threaded
-from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import Run, worlds_for
+from warp_deform.worlds.worlds import Worlds
 
 from ..policy.policy import ImagePolicy, load_policy
 from ..runs.folder import RunFolder

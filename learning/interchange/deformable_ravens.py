@@ -23,6 +23,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warp_deform import __version__
+from warp_deform.collecting.recording import GOAL_TARGETS
+from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import (
     Episode,
     EpisodeInfo,
@@ -37,14 +39,12 @@ from warp_deform.episodes import (
     versions,
 )
 from warp_deform.errors import InputError
-from warp_deform.progress import progress_bar
-from warp_deform.recording import GOAL_TARGETS
 from warp_deform.rendering.camera import Camera
 from warp_deform.rendering.fusion import fuse
+from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.ground_truth import quaternion_yaw
 from warp_deform.tasks.registry import TASKS
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.workers import Workers, worker_count
 
 from .conversion import ConversionReport, new_folder, size_of
 from .restricted_pickle import read_pickles

@@ -29,7 +29,7 @@ import pyarrow.parquet as pq
 from warp_deform import __version__
 from warp_deform.episodes import Episode, EpisodeReader
 from warp_deform.errors import InputError
-from warp_deform.progress import progress_bar
+from warp_deform.support.progress import progress_bar
 
 from .conversion import ConversionReport, new_folder, size_of
 from .running_statistics import RunningStatistics

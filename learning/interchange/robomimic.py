@@ -22,9 +22,9 @@ import numpy as np
 from warp_deform import __version__
 from warp_deform.episodes import Episode, EpisodeReader, Step
 from warp_deform.errors import InputError
-from warp_deform.extras import install_extra
-from warp_deform.progress import progress_bar
-from warp_deform.registration import env_id
+from warp_deform.support.extras import install_extra
+from warp_deform.support.progress import progress_bar
+from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import is_known
 
 from .conversion import ConversionReport, new_file, size_of

@@ -17,9 +17,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from warp_deform.collection import Attempt, Collection, append_attempt
-from warp_deform.enclosed import ENCLOSED
-from warp_deform.episode_loop import SOLVED, Run, play, worlds_for
+from warp_deform.collecting.folder import Attempt, Collection, append_attempt
+from warp_deform.collecting.goals import CONSTRUCTED
+from warp_deform.collecting.recording import observe, record
+from warp_deform.collecting.replay import Recording
+from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import (
     Episode,
     EpisodeInfo,
@@ -29,17 +31,15 @@ from warp_deform.episodes import (
     combine_hashes,
     rebuild_index,
 )
+from warp_deform.episodes.enclosed import ENCLOSED
 from warp_deform.errors import InputError
-from warp_deform.goals import CONSTRUCTED
 from warp_deform.planning import SearchConfig, lookahead_for, search
-from warp_deform.progress import progress_bar
-from warp_deform.recording import observe, record
-from warp_deform.replay import Recording
 from warp_deform.robots import robot as find_robot
+from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Action, Task
-from warp_deform.workers import Workers, worker_count
-from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import SOLVED, Run, play, worlds_for
+from warp_deform.worlds.worlds import Worlds
 
 __all__ = ["ACCEPT", "RECORDED", "REFINED", "REFINEMENT", "RefineConfig", "RefineReport", "refine",
            "seeds_by_task"]  # fmt: skip

@@ -22,18 +22,18 @@ from typing import Any
 
 import numpy as np
 
-from warp_deform.episode_loop import Run, play, worlds_for
+from warp_deform.collecting.replay import Recording
+from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
-from warp_deform.planning.way_points import Bent, WayPointConfig, WayPoints
-from warp_deform.progress import progress_bar
-from warp_deform.replay import Recording
-from warp_deform.rollout import GripPath
+from warp_deform.planning.waypoints import Bent, WayPointConfig, WayPoints
+from warp_deform.rollout.launch import GripPath
+from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Action, Task
-from warp_deform.workers import Workers, worker_count
-from warp_deform.world_state import WorldState
-from warp_deform.worlds import Worlds
+from warp_deform.worlds.loop import Run, play, worlds_for
+from warp_deform.worlds.state import WorldState
+from warp_deform.worlds.worlds import Worlds
 
 from .refine import seeds_by_task
 

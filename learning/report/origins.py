@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from warp_deform.progress import duration
-from warp_deform.revision import Revision
+from warp_deform.support.progress import duration
+from warp_deform.support.revision import Revision
 
 from .cells import RunResult
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.extras import install_extra
+from warp_deform.support.extras import install_extra
 
 from .folder import TENSORBOARD, RunFolder, check_fields
 

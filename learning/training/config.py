@@ -35,7 +35,7 @@ class TrainConfig:
         `hold_out`, which is for where nothing can be played
     patience: stop as well when so many snapshots in a row brought no better validation
     untrained: also a snapshot of the initial weights, step 0, where a learning curve begins
-    progress: tell of it on stderr, see `warp_deform.progress`
+    progress: tell of it on stderr, see `warp_deform.support.progress`
     """
 
     task: str

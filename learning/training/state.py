@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from warp_deform.episodes import EpisodeReader, versions
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.revision import running_revision
+from warp_deform.support.revision import running_revision
 
 from ..data.dataset import Demonstrations
 from ..models.adam import KerasAdam

@@ -25,7 +25,7 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from warp_deform.progress import progress_bar
+from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.ground_truth import yaw_columns
 
 from ..data.batches import check_lifts, check_view, image_batch, state_batch, task_lifts

@@ -95,7 +95,7 @@ def cpu_fingerprint() -> str:
 @functools.cache
 def _versions() -> tuple[tuple[str, str], ...]:
     # The code that runs says its own version: it may be a checkout that was never installed.
-    from .. import __version__
+    from ..support.version import __version__
 
     found = [("python", platform.python_version()), ("warp-deform", __version__)]
     for package in _PACKAGES:

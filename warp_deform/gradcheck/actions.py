@@ -9,8 +9,8 @@ import numpy as np
 from ..planning.search import MOST_GROWTH
 from ..planning.slopes import LANES, slopes_for
 from ..tasks.task import Task
-from ..world_state import WorldState
-from ..worlds import Worlds
+from ..worlds.state import WorldState
+from ..worlds.worlds import Worlds
 from .draws import actions_of_episodes
 
 __all__ = ["STEP", "ActionSample", "compare_actions"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..differentiable import DifferentiableRollout
-from ..solver.tape import Kind
+from ..rollout.differentiable import DifferentiableRollout
+from ..xpbd.lanes.tape import Kind
 
 __all__ = ["SMOOTH", "counted", "taken"]
 

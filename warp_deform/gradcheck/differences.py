@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
-from ..rollout import GripPath
-from ..worlds import Worlds
+from ..rollout.differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
+from ..rollout.launch import GripPath
+from ..worlds.worlds import Worlds
 from .branches import counted, taken
 from .draws import Draw, touching_of
 from .limits import RATIO, central, kink

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..rollout import GripPath, rollout
-from ..running import DEMONSTRATOR_STREAM, episode_rng
+from ..rollout.launch import GripPath, rollout
 from ..tasks.task import Action
-from ..world_state import WorldState
-from ..worlds import Worlds
+from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
+from ..worlds.state import WorldState
+from ..worlds.worlds import Worlds
 
 __all__ = ["Draw", "Start", "actions_of_episodes", "draw_states", "touching_of"]
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..differentiable import DifferentiableRollout
 from ..errors import InputError, WarpDeformError
-from ..progress import progress_bar
-from ..solver.tape import Kind
+from ..rollout.differentiable import DifferentiableRollout
+from ..support.progress import progress_bar
 from ..tasks.registry import TASKS
 from ..tasks.registry import task as find_task
-from ..worlds import Worlds
+from ..worlds.worlds import Worlds
+from ..xpbd.lanes.tape import Kind
 from .actions import ActionSample, compare_actions
 from .differences import PARAMETERS, WORLDS, Sample, compare, fired
 from .draws import Draw, draw_states

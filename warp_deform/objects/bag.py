@@ -14,15 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checked import (
-    BELOW_ONE,
-    NOT_NEGATIVE,
-    POSITIVE,
-    SHARE,
-    Interval,
-    check_fields,
-)
 from ..errors import InputError
+from ..support.checked import BELOW_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Interval, check_fields
 from .attributes import SpringMode
 from .colors import BLUE, YELLOW, Color
 from .sheet import Spring, add_sheet

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checked import NOT_NEGATIVE, POSITIVE, check_fields, real_array
 from ..errors import InputError
+from ..support.checked import NOT_NEGATIVE, POSITIVE, check_fields, real_array
 from .attributes import register_attributes
 from .colors import RED, Color
 

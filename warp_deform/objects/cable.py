@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checked import NOT_NEGATIVE, POSITIVE, Interval, check_fields
 from ..errors import InputError
+from ..support.checked import NOT_NEGATIVE, POSITIVE, Interval, check_fields
 from .attributes import SpringMode, attribute, next_object, register_attributes
 from .colors import BLUE, WHITE, YELLOW, Color
 

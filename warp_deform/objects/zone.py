@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checked import real_array
+from ..support.checked import real_array
 from .colors import TARGET, Color
 
 __all__: list[str] = []  # `warp_deform.objects` is the import path of what is here

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..extras import install_extra
 from ..objects.box import l_block
+from ..support.extras import install_extra
 from .scene import PeerScene
 from .timing import FRAME_RATE, PeerTiming, measure
 

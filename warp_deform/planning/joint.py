@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..tasks.task import Task
-from ..world_state import WorldState
+from ..worlds.state import WorldState
 from .descent import Descent
 from .follow import Follow
 from .lookahead import Lookahead, Outlook

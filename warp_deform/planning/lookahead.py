@@ -11,10 +11,10 @@ import numpy as np
 
 from ..errors import WarpDeformError
 from ..robots.primitive import Outcome
-from ..spaces import action_space
 from ..tasks.task import Action, Task
-from ..world_state import WorldState
-from ..worlds import Worlds
+from ..worlds.spaces import action_space
+from ..worlds.state import WorldState
+from ..worlds.worlds import Worlds
 from .slopes import LANES, Slopes, slopes_for
 
 LOOKAHEAD_REST = 1.0

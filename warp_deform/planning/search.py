@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..tasks.task import Action, Task
-from ..world_state import WorldState
+from ..worlds.state import WorldState
 from .descent import Descent
 from .joint import JOINT_COST, Pair, move_both
 from .lookahead import Lookahead, Outlook

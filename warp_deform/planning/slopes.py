@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..differentiable import DifferentiableRollout, Gradients
-from ..rollout import GripPath
-from ..running import Carry, RunningEpisode
+from ..rollout.differentiable import DifferentiableRollout, Gradients
+from ..rollout.launch import GripPath
 from ..tasks.task import Action, Task
-from ..world_state import WorldState
-from ..worlds import Worlds
+from ..worlds.episode import Carry, RunningEpisode
+from ..worlds.state import WorldState
+from ..worlds.worlds import Worlds
 from .follow import Follow
 
 __all__ = ["KnotSlope", "Slope", "Slopes", "loss_and_slopes", "slopes_for"]

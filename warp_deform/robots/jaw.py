@@ -19,7 +19,7 @@ from ..errors import InputError
 
 if TYPE_CHECKING:
     from ..objects.cable import Cable
-    from ..solver.solver import SolverFusedXPBD
+    from ..xpbd.launches import FusedXPBD
 
 __all__ = ["Jaw", "JawConfig", "JawContact", "between", "squeezed_width"]
 
@@ -125,7 +125,7 @@ class Jaw:
 
     def __init__(
         self,
-        solver: SolverFusedXPBD,
+        solver: FusedXPBD,
         world: int,
         chain: Cable,
         config: JawConfig | None = None,

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..rollout import Frames, Rollout
+from ..rollout.launch import Frames, Rollout
 from .jaw import Jaw, JawConfig, JawContact
 from .primitive import Motion, Outcome
 
 if TYPE_CHECKING:
-    from ..solver.guards import WatchValues
-    from ..solver.solver import SolverFusedXPBD
+    from ..xpbd.guards import WatchValues
+    from ..xpbd.launches import FusedXPBD
 
 __all__ = ["JawActionConfig", "JawCommand", "hand_pose", "jaw_motion", "jaw_script", "run_scripts"]
 
@@ -222,7 +222,7 @@ def _moved(
 
 
 def run_scripts(
-    solver: SolverFusedXPBD,
+    solver: FusedXPBD,
     jaws: Mapping[int, Jaw],
     scripts: Mapping[int, Script],
     config: JawActionConfig,

@@ -22,7 +22,7 @@ from ..objects.bag import Bag
 from ..objects.box import Box
 from ..objects.cable import Cable
 from ..objects.cloth import Cloth
-from ..rollout import GripPath
+from ..rollout.launch import GripPath
 
 if TYPE_CHECKING:
     from ..objects.scene_object import SceneObject

@@ -1,30 +1,24 @@
-"""The fused XPBD solver: one launch is many substeps, one thread is L worlds in SIMD lanes.
+"""The solver behind every task, as a Newton solver, with what it needs to be used.
 
 The public names load on first use, so that reading a configuration loads neither Warp nor Newton.
+The engine below it is `warp_deform.xpbd`.
 """
 
 from __future__ import annotations
 
-import importlib
+from ..support.handed_on import hand_on
 
 _HOME = {
-    "GuardLimits": "guards",
-    "PhysicsError": "guards",
-    "Problem": "guards",
-    "ProblemKind": "guards",
-    "SolverConfig": "config",
-    "SolverFusedXPBD": "solver",
-    "WatchValues": "guards",
-    "replay_bundle": "bundle",
+    "GuardLimits": "..xpbd.guards",
+    "PhysicsError": "..xpbd.guards",
+    "Problem": "..xpbd.guards",
+    "ProblemKind": "..xpbd.guards",
+    "SolverConfig": "..xpbd.config",
+    "SolverFusedXPBD": ".solver",
+    "WatchValues": "..xpbd.guards",
+    "replay_bundle": "..xpbd.bundle",
 }
 
 __all__ = list(_HOME)
 
-
-def __getattr__(name: str) -> object:
-    """Load a public name's module when the name is first asked for (PEP 562)."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
-    globals()[name] = value
-    return value
+__getattr__ = hand_on(__name__, _HOME)

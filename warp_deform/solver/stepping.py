@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..checked import POSITIVE, check_number
 from ..errors import InputError
-from .data import SolverData
+from ..support.checked import POSITIVE, check_number
+from ..xpbd.packing.data import SolverData
 
 __all__ = ["grip_from_control", "substeps"]
 

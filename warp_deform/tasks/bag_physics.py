@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ..robots.primitive import PrimitiveConfig
-from ..solver.config import SolverConfig
-from ..solver.guards import GuardLimits
+from ..xpbd.config import SolverConfig
+from ..xpbd.guards import GuardLimits
 from .task import Stage
 
 __all__ = ["BAG_PRIMITIVE", "BAG_SOLVER", "CARRY", "INSERT", "OPEN"]

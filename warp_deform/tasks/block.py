@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from ..objects.box import Box, BoxConfig, add_box, l_block
-from ..solver.config import SolverConfig
+from ..xpbd.config import SolverConfig
 from .demonstrators import pick_place_pose, visible_point
 from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows, quaternion_yaw

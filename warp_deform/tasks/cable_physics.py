@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..solver.config import SolverConfig
+from ..xpbd.config import SolverConfig
 from .task import Stage
 
 __all__ = ["CABLE_SLOPE_DAMPING", "CABLE_SOLVER", "CABLE_STAGE"]

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from ..objects.cable import CableConfig
 from ..objects.colors import WHITE
-from ..solver.config import SolverConfig
-from ..solver.guards import GuardLimits
+from ..xpbd.config import SolverConfig
+from ..xpbd.guards import GuardLimits
 
 __all__ = ["BEAD_CHAIN", "CHAIN_SOLVER", "FOAM_STIFFNESS"]
 

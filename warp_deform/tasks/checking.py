@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import InputError
 from ..rendering.pixels import PixelGrid
 from ..robots.primitive import LIFT, PrimitiveConfig, Stage
-from ..solver.config import SolverConfig
+from ..xpbd.config import SolverConfig
 from .ground_truth import row_count
 from .task import Task
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from ..objects.cloth import ClothConfig
 from ..robots.primitive import PrimitiveConfig
-from ..solver.config import SolverConfig
+from ..xpbd.config import SolverConfig
 
 __all__ = ["CLOTH_SOLVER", "FABRIC", "FABRIC_PRIMITIVE", "FABRIC_SOLVER", "FABRIC_SPEED"]
 

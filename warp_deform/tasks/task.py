@@ -16,7 +16,7 @@ import numpy as np
 
 from ..rendering.pixels import TABLE_GRID, PixelGrid
 from ..robots.primitive import PrimitiveConfig, Stage
-from ..solver.config import SolverConfig
+from ..xpbd.config import SolverConfig
 from .ground_truth import Rows, row_count
 from .past import PastAction
 

@@ -1,0 +1,1 @@
+"""Episodes by the thousand: collected, replayed, filmed and looked into, over processes."""

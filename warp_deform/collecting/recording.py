@@ -1,0 +1,134 @@
+"""From running worlds to the records of the dataset format."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..episodes import Episode, EpisodeInfo, Step, combine_hashes, cpu_fingerprint, versions
+from ..episodes.enclosed import ENCLOSED
+from ..tasks.registry import FURTHER_TASKS, TASKS, task_name
+from ..tasks.registry import task as find_task
+from ..tasks.task import Task
+from ..worlds.loop import SOLVED, Run
+from ..worlds.worlds import Worlds
+
+__all__ = ["GOAL_TARGETS", "observe", "origin", "record", "recorded_task", "task_config"]
+
+GOAL_TARGETS = "goal_targets"
+"""Where an episode of a goal-conditioned task keeps what its last state stands for as a goal."""
+
+_TASK_CLASS = "task_class"
+"""Where an episode of a task from elsewhere says which class that was."""
+
+
+def observe(worlds: Worlds, slot: int) -> Step:
+    """The row of a slot's present state, its images included; `record` fills in the action."""
+    episode = worlds.episodes[slot]
+    snapshot = episode.snapshot
+    images = snapshot.images
+    return Step(
+        color=images.color,
+        height=images.height,
+        action=None,
+        score=float(worlds.score(slot)),
+        success=worlds.solved(slot),
+        physics_ok=episode.physics_ok,
+        sim_seconds=float(episode.sim_seconds),
+        state_hash=worlds.hash(slot),
+        outcome=None,
+        particle_q=snapshot.particle_q,
+        particle_qd=snapshot.particle_qd,
+        body_q=snapshot.body_q,
+        body_qd=snapshot.body_qd,
+        ground_truth=np.asarray(
+            worlds.task.ground_truth(episode.layout, snapshot), dtype=np.float32
+        ),
+    )
+
+
+def record(worlds: Worlds, slot: int, run: Run[Step], *, demonstrator: str) -> Episode:
+    """The episode that has just ended in a slot; `run` holds a row for every state."""
+    rows = [
+        replace(row, action=action, outcome=outcome)
+        for row, action, outcome in zip(run.rows, run.actions, run.outcomes, strict=False)
+    ]
+    episode, last = worlds.episodes[slot], run.rows[-1]
+    info = EpisodeInfo(
+        task=worlds.task.name,
+        seed=run.seed,
+        success=run.ended == SOLVED,
+        score=last.score,
+        actions=len(run.actions),
+        demonstrator=demonstrator,
+        robot=worlds.robot.name,
+        state_hash=combine_hashes(row.state_hash for row in run.rows),
+        physics_ok=episode.physics_ok,
+        sim_seconds=float(episode.sim_seconds),
+        discarded_starts=episode.discarded_starts,
+        config=task_config(worlds.task),
+        versions=versions(),
+        cpu=cpu_fingerprint(),
+        goal=None,
+        extra={**origin(worlds.task), **_as_goal(worlds, slot), **_enclosed(worlds, slot)},
+    )
+    return Episode(info, (*rows, last), episode.goal)
+
+
+def _as_goal(worlds: Worlds, slot: int) -> dict[str, Any]:
+    """What the last state of an episode stands for as a goal, where the task has goals."""
+    if not worlds.task.goal_conditioned:
+        return {}
+    return {GOAL_TARGETS: worlds.as_goal(slot, kind="demonstrated").targets.tolist()}
+
+
+def origin(task: Task) -> dict[str, Any]:
+    """What an episode says of where its task is from: its class, unless that is this package's."""
+    return {} if task.name in TASKS | FURTHER_TASKS else {_TASK_CLASS: task_name(type(task))}
+
+
+def recorded_task(info: EpisodeInfo) -> Task:
+    """The task of an episode.
+
+    Raises:
+        InputError: there is none of that name here. A task from elsewhere is not imported because
+            a file names it: the message says which class to register.
+    """
+    named = info.extra.get(_TASK_CLASS)
+    return find_task(info.task, recorded=named if isinstance(named, str) else None)
+
+
+def _enclosed(worlds: Worlds, slot: int) -> dict[str, Any]:
+    """Whether the bag enclosed its items, where there are any."""
+    enclosed = worlds.enclosed(slot)
+    return {} if enclosed is None else {ENCLOSED: enclosed}
+
+
+def task_config(task: Task) -> dict[str, Any]:
+    """A task's full configuration as JSON types: every public constant of its class by name."""
+    names = sorted({name for cls in type(task).__mro__ for name in vars(cls)})
+    return {
+        name: _json(value)
+        for name in names
+        if not name.startswith("_") and _is_constant(value := getattr(type(task), name))
+    }
+
+
+def _is_constant(value: object) -> bool:
+    if isinstance(value, tuple):
+        return all(map(_is_constant, value))
+    return isinstance(value, bool | int | float | str) or (
+        is_dataclass(value) and not isinstance(value, type)
+    )
+
+
+def _json(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return _json(asdict(value))
+    if isinstance(value, dict):
+        return {key: _json(inner) for key, inner in value.items()}
+    if isinstance(value, tuple | list):
+        return [_json(inner) for inner in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

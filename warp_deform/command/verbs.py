@@ -1,0 +1,378 @@
+"""The verbs of the `warp-deform` command that need the simulator alone."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from ..errors import InputError
+from ..quiet import quiet_warp
+from ..robots import RobotName
+from ..tasks.registration import env_id
+from ..tasks.registry import TASKS, all_tasks
+from ..tasks.registry import task as find_task
+from .flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
+from .main import CommandOptions, Outcome
+
+__all__ = [
+    "BenchOptions",
+    "DemoOptions",
+    "DoctorOptions",
+    "GoalsOptions",
+    "GradcheckOptions",
+    "InspectOptions",
+    "ListOptions",
+    "ReplayOptions",
+    "bench",
+    "demo",
+    "doctor",
+    "goals",
+    "gradcheck",
+    "inspect",
+    "list_tasks",
+    "replay",
+]
+
+_Task = Annotated[Positional[str], arg(metavar="TASK")]
+_Folder = Annotated[Positional[Path], arg(metavar="DIR")]
+_Count = Annotated[int, arg(aliases=["-n"], metavar="N"), COUNT]
+_Workers = Annotated[int | None, arg(metavar="W"), COUNT]
+_Demonstrator = Literal["scripted", "visible", "mpc", "planner"]
+_File = Annotated[Path | None, arg(metavar="FILE")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListOptions(CommandOptions):
+    """List the tasks: Gymnasium id, whether a goal image is given, actions allowed, objects.
+
+    The benchmark's first, then further ones, of this package, of installed distributions and of
+    --task-module.
+    """
+
+
+def list_tasks(options: ListOptions) -> Outcome:
+    """The benchmark's tasks, in the paper's order, then the others."""
+    known, wrong = all_tasks()
+    tasks: list[dict[str, Any]] = [
+        {
+            "name": name,
+            "env_id": env_id(name),
+            "goal_conditioned": task.goal_conditioned,
+            "max_actions": task.max_actions,
+            "objects": list(task.objects),
+            "benchmark": name in TASKS,
+        }
+        for name, task in known.items()
+    ]
+    rows = [("task", "Gymnasium id", "benchmark", "goal", "actions", "objects")]
+    for task in tasks:
+        goal = "image" if task["goal_conditioned"] else "-"
+        rows.append(
+            (
+                task["name"],
+                task["env_id"],
+                "yes" if task["benchmark"] else "-",
+                goal,
+                str(task["max_actions"]),
+                ", ".join(task["objects"]),
+            )
+        )
+    for line in wrong:
+        print(f"warp-deform: warning: {line}", file=sys.stderr)
+    return Outcome(data={"tasks": tasks, "warnings": wrong}, text=_table(rows))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(CommandOptions):
+    """Collect successful demonstrations of a task; attempts that fail are counted, not kept."""
+
+    task: _Task
+    """Name of the task, see `warp-deform list`."""
+    episodes: _Count = 10
+    """Successes to keep: the first N in the order of their seeds."""
+    seed: Annotated[int, SEED] = 0
+    """First seed. Training 0.., test 10,000.., validation 50,000.., goals 100,000.. ."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder for the episodes; complete ones that are there already are kept."""
+    demonstrator: _Demonstrator = "scripted"
+    """Who acts: "scripted", the paper's; "visible", which picks only what the tip would really
+    meet; "mpc", which simulates eight candidates and takes the best; "planner", which searches two
+    actions ahead. All see the state."""
+    workers: _Workers = None
+    """Processes; left out, one per core, fewer for few episodes. The result is the same."""
+    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Address of a Ray cluster to work on (needs the extra `ray`)."""
+    video: _File = None
+    """MP4 of the first two kept episodes."""
+    robot: RobotName = "ur5"
+    """The arm."""
+
+
+def demo(options: DemoOptions) -> Outcome:
+    """Collect demonstrations into a folder."""
+    find_task(options.task)
+    from ..collecting.collect import CollectConfig, collect
+
+    quiet_warp()
+    report = asdict(
+        collect(
+            CollectConfig(
+                task=options.task,
+                episodes=options.episodes,
+                seed=options.seed,
+                out=options.out,
+                demonstrator=options.demonstrator,
+                workers=options.workers,
+                ray=options.ray,
+                video=options.video,
+                robot=options.robot,
+            )
+        )
+    )
+    if report["enclosed"] is None:  # there are no items to enclose
+        del report["enclosed"]
+    failure = None
+    if report["successes"] < options.episodes:
+        failure = (
+            f"{report['successes']} of {options.episodes} demonstrations succeeded in "
+            f"{report['attempts']} attempts; ask for fewer or try another --seed"
+        )
+    return Outcome(data=report, text=_lines(report), failure=failure)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalsOptions(CommandOptions):
+    """Make the goals that a goal-conditioned task is evaluated on."""
+
+    task: _Task
+    """Name of a goal-conditioned task."""
+    count: Annotated[int, arg(name="goals", aliases=["-n"], metavar="N"), COUNT] = 20
+    """Goals to make; the paper evaluates on 20."""
+    seed: Annotated[int, SEED] = 100_000
+    """First seed; goals have seeds of their own."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder for the goals."""
+    kind: Literal["demonstrated", "constructed"] = "demonstrated"
+    """Last states of demonstrations (the paper), or objects placed at the goal and settled."""
+    demonstrator: _Demonstrator = "scripted"
+    """Whose demonstrations, see `warp-deform demo`."""
+    workers: _Workers = None
+    """Processes; one per core when left out."""
+    robot: RobotName = "ur5"
+    """The arm."""
+
+
+def goals(options: GoalsOptions) -> Outcome:
+    """Make a set of goals."""
+    find_task(options.task)
+    from ..collecting.make_goals import make_goals
+
+    quiet_warp()
+    report = make_goals(
+        options.task,
+        options.out,
+        count=options.count,
+        seed=options.seed,
+        kind=options.kind,
+        demonstrator=options.demonstrator,
+        robot=options.robot,
+        workers=options.workers,
+    )
+    failure = None
+    if report["goals"] < options.count:
+        failure = f"{report['goals']} of {options.count} goals were made; try another --seed"
+    return Outcome(data=report, text=_lines(report), failure=failure)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions(CommandOptions):
+    """Simulate recorded episodes again and compare every step's state hash."""
+
+    folder: _Folder
+    """Folder of episodes."""
+    verify: bool = False
+    """Fail (exit code 1) unless every state is the recorded one, bit for bit."""
+    tolerance: Annotated[float | None, arg(metavar="M"), FlagRange(0.0, 1e3)] = None
+    """Compare positions within this distance [m] instead of bits, for another kind of processor."""
+    workers: _Workers = None
+    """Processes; left out, one per core, fewer for few episodes."""
+
+
+def replay(options: ReplayOptions) -> Outcome:
+    """Simulate a folder's episodes again."""
+    _check_folder(options.folder)
+    from ..collecting.replay import verify
+
+    quiet_warp()
+    report = verify(options.folder, tolerance=options.tolerance, workers=options.workers)
+    failure = None
+    if options.verify and report["mismatches"]:
+        failure = (
+            f"{report['mismatches']} of {report['steps']} steps differ from the recording; on "
+            "another kind of processor or version, compare with --tolerance 0.001"
+        )
+    return Outcome(data=report, text=_lines(report), failure=failure)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectOptions(CommandOptions):
+    """Statistics of a folder of episodes, and a PNG for each with its steps."""
+
+    folder: _Folder
+    """Folder of episodes."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for the contact sheets; `DIR/sheets` when left out."""
+    sheets: Annotated[int, arg(metavar="N"), COUNT_OR_NONE] = 20
+    """Contact sheets at most; 0 for statistics alone."""
+
+
+def inspect(options: InspectOptions) -> Outcome:
+    """Look into a folder of episodes."""
+    _check_folder(options.folder)
+    from ..collecting.inspection import contact_sheet, statistics
+    from ..episodes import EpisodeReader
+
+    report = statistics(options.folder)
+    reader = EpisodeReader(options.folder)
+    out = options.out or options.folder / "sheets"
+    paths = [
+        out / reader.path(seed).with_suffix(".png").name for seed in reader.seeds[: options.sheets]
+    ]
+    if paths:
+        _make_folder("--out", out)
+    for seed, path in zip(reader.seeds, paths, strict=False):
+        contact_sheet(reader.read(seed), path)
+    shown = f"{len(paths)} of {len(reader)} episodes, in {out}"
+    return Outcome(
+        data={**report, "sheets": paths},
+        text=_lines({**report, "sheets": shown}),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions(CommandOptions):
+    """Time one simulated second of a scene; compiling is timed apart."""
+
+    scene: Literal[
+        "cable", "heap", "ring", "block", "cloth10", "cloth25", "cloth50",
+        "cloth10-edges", "cloth25-edges", "cloth50-edges", "bag", "bag-cube",
+    ] = "cable"  # fmt: skip
+    """What is simulated."""
+    peer: Literal["pybullet", "newton-vbd", "newton-vbd-bodies", "newton-xpbd"] | None = None
+    """Another simulator to time on the same scene."""
+
+
+def bench(options: BenchOptions) -> Outcome:
+    """Time the simulator."""
+    from ..bench import run
+
+    quiet_warp()
+    report = run(scene=options.scene, peer=options.peer)
+    return Outcome(data=report, text=_lines(report))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradcheckOptions(CommandOptions):
+    """Compare derivatives of the solver with finite differences, in states of real episodes."""
+
+    task: Annotated[Positional[str | None], arg(metavar="[TASK]")] = None
+    """Name of a task; left out, all."""
+    levels: tuple[Literal["substep", "window", "action"], ...] = ("substep", "window", "action")
+    """One substep; 0.1 s; whole actions."""
+    states: Annotated[int, arg(metavar="N"), COUNT] = 200
+    """States whose next substep is differentiated."""
+    windows: Annotated[int, arg(metavar="N"), COUNT] = 30
+    """States from which 0.1 s are differentiated."""
+    actions: Annotated[int, arg(metavar="N"), COUNT] = 16
+    """Whole actions that are differentiated."""
+    seed: Annotated[int, SEED] = 0
+    """First episode, and the random directions."""
+    summary: bool = False
+    """One line per task and level instead of all rows."""
+
+
+def gradcheck(options: GradcheckOptions) -> Outcome:
+    """Check the adjoint."""
+    if options.task is not None:
+        find_task(options.task)
+    from ..gradcheck import GradcheckConfig, check, summarise
+
+    quiet_warp()
+    rows, notes = check(
+        options.task,
+        GradcheckConfig(
+            levels=options.levels,
+            states=options.states,
+            windows=options.windows,
+            actions=options.actions,
+            seed=options.seed,
+        ),
+    )
+    found = [asdict(row) for row in (summarise(rows) if options.summary else rows)]
+    head = tuple(key.replace("_", " ") for key in found[0]) if found else ()
+    cells = [
+        tuple(
+            "-" if v is None else ", ".join(v) or "-" if isinstance(v, tuple) else _number(v)
+            for v in row.values()
+        )
+        for row in found
+    ]
+    failure = None if rows else "nothing was checked, see the notes"
+    return Outcome(
+        data={"summary" if options.summary else "rows": found, "notes": notes},
+        text="\n".join([*([_table([head, *cells])] if rows else []), *notes]),
+        failure=failure,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorOptions(CommandOptions):
+    """Show versions, devices, caches, optional parts, and what keeps this machine from working."""
+
+
+def doctor(options: DoctorOptions) -> Outcome:
+    """Examine this machine and installation."""
+    from .doctor import render, report
+
+    quiet_warp()
+    found = report()
+    count = len(found["problems"])
+    failure = None if found["healthy"] else f"{count} problem{'s' * (count > 1)} found, see above"
+    return Outcome(data=found, text=render(found), failure=failure)
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        raise InputError(f"no folder {str(folder)!r}; `warp-deform demo` makes one")
+
+
+def _make_folder(flag: str, folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{flag} {folder} cannot be made: {error.strerror}") from error
+
+
+def _lines(data: Mapping[str, Any]) -> str:
+    """One `key  value` line an entry."""
+    return _table([(key.replace("_", " "), _number(value)) for key, value in data.items()])
+
+
+def _number(value: object) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_number(inner)}" for key, inner in value.items())
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _table(rows: Sequence[tuple[str, ...]]) -> str:
+    """Rows of cells, in columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    )

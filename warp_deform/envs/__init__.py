@@ -1,0 +1,1 @@
+"""The Gymnasium environments over a task, alone and side by side, and their wrappers."""

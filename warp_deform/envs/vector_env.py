@@ -1,0 +1,238 @@
+"""The vector environment: episodes of one task side by side in the lanes of one simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from ..planning.demonstrators import demonstrator as find_demonstrator
+from ..support.checked import real_array
+from ..tasks.task import Action, Task
+from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
+from ..worlds.loop import Run
+from ..worlds.spaces import action_space, check_action, information, observation, observation_space
+from ..worlds.worlds import Worlds
+from .env import WorldsView, check_render_mode, ending
+from .reset_options import GoalOption, check_options, goal_for, next_seed
+
+__all__ = ["PickPlaceVectorEnv"]
+
+Seeds = int | Sequence[int | None] | None
+Batch = dict[str, np.ndarray]
+
+
+class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
+    """`num_envs` episodes of a task, simulated together: the fast way to gather experience.
+
+        envs = gymnasium.make_vec("WarpDeform/CableRing-v1", num_envs=16)
+        observations, infos = envs.reset(seed=0)          # episodes 0 to 15
+        observations, rewards, terminations, truncations, infos = envs.step(actions)
+
+    An episode has the same bits as in `PickPlaceEnv` with the same seed, whatever the number of
+    environments and its place among them; so have the episodes that follow it by autoreset.
+
+    autoreset_mode: "NextStep" (Gymnasium's default: the step after an episode's end ignores the
+        action and resets), "SameStep" (the last observation is in infos["final_obs"], its info in
+        infos["final_info"]) or "Disabled" (reset ended ones with options={"reset_mask": mask})
+    task, robot, render_mode: see `PickPlaceEnv`; infos are dictionaries of arrays, as Gymnasium's.
+    """
+
+    metadata: dict[str, Any] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 2,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        task: str | Task,
+        num_envs: int = 1,
+        *,
+        robot: str = "ur5",
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        if num_envs < 1:
+            raise InputError(f"num_envs must be at least 1, got {num_envs}")
+        self.render_mode = check_render_mode(render_mode, self.metadata)
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.num_envs = num_envs
+        self.worlds = Worlds(task, num_envs, robot=robot)
+        self.single_observation_space = observation_space(self.task)
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.ended = np.zeros(num_envs, bool)
+        """(num_envs,) bool: which episodes are over and wait for their reset."""
+        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._scores = np.zeros(num_envs)
+        self._runs: dict[int, Run[Any]] = {}
+        self._view = WorldsView(self.worlds)
+
+    @property
+    def task(self) -> Task:
+        """The task that is played."""
+        return self.worlds.task
+
+    def reset(
+        self, *, seed: Seeds = None, options: dict[str, Any] | None = None
+    ) -> tuple[Batch, dict[str, Any]]:
+        """Start an episode in every environment.
+
+        seed: one seed an environment, or a number s for s, s + 1, ...; None goes on with every
+            environment's own sequence
+        options: "goal" as for `PickPlaceEnv`, or a list of one an environment (None: constructed);
+            "reset_mask" (num_envs,) bool: which environments to reset, all others go on
+
+        Raises:
+            InputError: a wrong number of seeds or goals, an unknown option, a goal of another task.
+        """
+        given = check_options(options, "goal", "reset_mask")
+        seeds = self._seeds(seed)
+        slots = self._masked(given.get("reset_mask"))
+        goals = given.get("goal")
+        if not isinstance(goals, list | tuple):
+            goals = [goals] * self.num_envs
+        if len(goals) != self.num_envs:
+            raise InputError(f"{self.num_envs} environments need as many goals, got {len(goals)}")
+        for i in slots:
+            if seeds[i] is not None:
+                self._rngs[i] = seeding.np_random(seeds[i])[0]
+        self._start({i: seeds[i] for i in slots}, {i: goals[i] for i in slots if goals[i]})
+        infos: dict[str, Any] = {}
+        for i in slots:
+            self._add_info(infos, information(self.worlds, i, outcome=None), i)
+        return self._observations(), infos
+
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[Batch, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Pick and place once in every environment, all at the same time.
+
+        actions: (num_envs, 7), see `PickPlaceEnv`
+
+        Raises:
+            InputError: an action is not in the action space; nothing has been moved then.
+            gymnasium.error.ResetNeeded: there is no episode yet, or one that is over and no
+                autoreset.
+        """
+        if len(self.worlds.episodes) < self.num_envs:
+            raise ResetNeeded("no episodes run: call reset() first")
+        if self.autoreset_mode is AutoresetMode.DISABLED and self.ended.any():
+            over = ", ".join(map(str, np.flatnonzero(self.ended)))
+            raise ResetNeeded(f"the episodes of environments {over} are over: reset them")
+        rows = real_array(actions, (self.num_envs, 7), name="actions")
+        waiting = [int(i) for i in np.flatnonzero(self.ended)]
+        acting = {
+            i: check_action(action, name=f"action of environment {i}")
+            for i, action in enumerate(rows)
+            if i not in waiting
+        }
+        reports = self.worlds.step(acting) if acting else {}
+        rewards = np.zeros(self.num_envs)
+        terminations, truncations = np.zeros((2, self.num_envs), bool)
+        infos: dict[str, Any] = {}
+        for i, report in reports.items():
+            info = information(self.worlds, i, outcome=report.outcome)
+            rewards[i] = info["score"] - self._scores[i]
+            self._scores[i] = info["score"]
+            terminations[i], truncations[i] = ending(self.worlds, i, info)
+            if (
+                terminations[i] or truncations[i]
+            ) and self.autoreset_mode is AutoresetMode.SAME_STEP:
+                waiting.append(i)
+                last = {"final_obs": observation(self.worlds, i), "final_info": info}
+                self._add_info(infos, last, i)
+            else:
+                self._add_info(infos, info, i)
+        self.ended = terminations | truncations
+        self._start(dict.fromkeys(waiting), {})
+        for i in waiting:
+            self._add_info(infos, information(self.worlds, i, outcome=None), i)
+        return self._observations(), rewards, terminations, truncations, infos
+
+    def demonstrate(self, demonstrator: str = "scripted") -> list[Action | None]:
+        """What a demonstrator would do now in every environment, as in `PickPlaceEnv`.
+
+        None where the episode is over, and where `PickPlaceEnv` has None.
+
+        Raises:
+            InputError: there is no such demonstrator.
+            gymnasium.error.ResetNeeded: there is no episode yet.
+        """
+        if len(self.worlds.episodes) < self.num_envs:
+            raise ResetNeeded("no episodes run: call reset() first")
+        running = {i: run for i, run in self._runs.items() if not self.ended[i]}
+        chosen = find_demonstrator(demonstrator)(self.worlds, running)
+        space = self.single_action_space
+        actions = [chosen.get(i) for i in range(self.num_envs)]
+        return [
+            action if action is not None and space.contains(action) else None for action in actions
+        ]
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One frame (360, 640, 3) uint8 an environment; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        if len(self.worlds.episodes) < self.num_envs:
+            raise ResetNeeded("nothing to draw: call reset() first")
+        return tuple(self._view.frame(i) for i in range(self.num_envs))
+
+    def _start(self, seeds: Mapping[int, int | None], goals: Mapping[int, GoalOption]) -> None:
+        """Start episodes; a seed of None is drawn from the environment's own generator."""
+        if not seeds:
+            return
+        numbers = {i: self._draw(i) if s is None else s for i, s in seeds.items()}
+        made = {i: goal_for(self.task, goal, seed=numbers[i]) for i, goal in goals.items()}
+        self.worlds.reset(numbers, goals=made)
+        for i, number in numbers.items():
+            self._runs[i] = Run(number, episode_rng(number, DEMONSTRATOR_STREAM))
+            self._scores[i] = self.worlds.score(i)
+            self.ended[i] = False
+
+    def _draw(self, i: int) -> int:
+        rng = self._rngs[i]
+        if rng is None:
+            rng = self._rngs[i] = seeding.np_random()[0]
+        return next_seed(rng)
+
+    def _seeds(self, seed: Seeds) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=int(seed))
+            return [int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise InputError(f"{self.num_envs} environments need as many seeds, got {len(seed)}")
+        return [None if s is None else int(s) for s in seed]
+
+    def _masked(self, mask: Any) -> list[int]:
+        if mask is None:
+            return list(range(self.num_envs))
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise InputError(f"reset_mask must be ({self.num_envs},) bool with one True at least")
+        if len(self.worlds.episodes) < self.num_envs:
+            raise ResetNeeded("the first reset() is of all environments, without a mask")
+        return [int(i) for i in np.flatnonzero(mask)]
+
+    def _observations(self) -> Batch:
+        seen = [observation(self.worlds, i) for i in range(self.num_envs)]
+        return {name: np.stack([one[name] for one in seen]) for name in seen[0]}
+
+
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError as error:
+        known = ", ".join(known.value for known in AutoresetMode)
+        raise InputError(f"autoreset_mode is one of {known}, not {mode!r}") from error

@@ -1,0 +1,25 @@
+"""Grip paths in, trajectories out; and derivatives of trajectories.
+
+The public names load on first use, so that reading a task loads neither Warp nor torch.
+"""
+
+from __future__ import annotations
+
+from ..support.handed_on import hand_on
+
+_HOME = {
+    "DifferentiableRollout": ".differentiable",
+    "Frames": ".launch",
+    "Gradients": ".differentiable",
+    "GripPath": ".launch",
+    "Rollout": ".launch",
+    "TensorRollout": ".autograd",
+    "prepare": ".launch",
+    "rollout": ".launch",
+    "rollout_tensors": ".autograd",
+    "substep_vjp": ".differentiable",
+}
+
+__all__ = list(_HOME)
+
+__getattr__ = hand_on(__name__, _HOME)

@@ -1,0 +1,352 @@
+"""Derivatives of where a rollout ends by how it starts, what it is made of, and how it is led."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..support.checked import POSITIVE, check_number
+from ..xpbd.lanes.tape import Kind
+from ..xpbd.recording.recorder import Recorder
+from .launch import GripPath, prepare
+
+if TYPE_CHECKING:
+    from ..objects.push import Push
+    from ..xpbd.guards import WatchValues
+    from ..xpbd.launches import FusedXPBD
+
+__all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
+
+WORLD_PARAMETERS = ("damping", "table_friction", "contact_friction", "stiffness")
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """Derivatives of a loss, world by world (W) in the order in which the worlds were given.
+
+    positions, velocities (W, P, 3): by the particles at the start
+    inverse_masses (W, P): by those of free particles; what is pinned, or while it is held, has none
+    damping, table_friction, contact_friction, stiffness (W,): by the parameters of the worlds
+    body_poses (W, B, 7): by the poses of the bodies' frames at the start, position and quat_xyzw;
+    the last four along the sphere of unit quaternions
+    body_velocities (W, B, 6): by the twists there
+    body_inverse_masses (W, B): by those of free bodies at the same inertia
+    way_points, knot_times, knot_rotations: by world number, by the knots of its path (K, 3), (K,),
+    (K, 4)
+    fired (W, kinds): how often constraints of each `Kind` acted, and contacts in which branch
+    """
+
+    positions: np.ndarray
+    velocities: np.ndarray
+    inverse_masses: np.ndarray
+    damping: np.ndarray
+    table_friction: np.ndarray
+    contact_friction: np.ndarray
+    stiffness: np.ndarray
+    body_poses: np.ndarray
+    body_velocities: np.ndarray
+    body_inverse_masses: np.ndarray
+    way_points: dict[int, np.ndarray]
+    knot_times: dict[int, np.ndarray]
+    knot_rotations: dict[int, np.ndarray]
+    fired: np.ndarray
+
+    def counts(self) -> dict[str, int]:
+        """How often constraints of each kind acted in all worlds together, without those at 0."""
+        total = self.fired.sum(axis=0)
+        return {kind.name.lower(): int(total[kind]) for kind in Kind if total[kind]}
+
+
+class DifferentiableRollout:
+    """Rollouts of worlds of one topology, and derivatives back through them.
+
+    What is simulated is what `rollout` simulates, bit for bit. Contact on or off, its side, clamps,
+    release and the like are those of the rollout, so a derivative is that of the smooth piece that
+    it ran on; a derivative over many contacts may be as large as the rollout is chaotic.
+
+    storage, memory, sleep, dt: see `Recorder`. `sleep` False lets fabrics creep, not sleep.
+    """
+
+    def __init__(
+        self,
+        solver: FusedXPBD,
+        *,
+        storage: str = "replay",
+        memory: int = 2**30,
+        sleep: bool = True,
+        dt: float | None = None,
+    ) -> None:
+        self.solver = solver
+        self.recorder = Recorder(solver, storage=storage, memory=memory, sleep=sleep, dt=dt)
+        self.watch: list[WatchValues] = []
+        self._worlds: list[int] = []
+        self.times = np.zeros(0)
+        self.velocities = np.zeros((0, 0, 0, 3))
+        self.body_poses = np.zeros((0, 0, 0, 7))
+        self.body_velocities = np.zeros((0, 0, 0, 6))
+
+    def forward(
+        self,
+        worlds: Sequence[int],
+        times: Sequence[float],
+        *,
+        paths: Mapping[int, GripPath] | None = None,
+        pushes: Mapping[int, Sequence[Push]] | None = None,
+        positions: np.ndarray | None = None,
+        velocities: np.ndarray | None = None,
+        body_poses: np.ndarray | None = None,
+        body_velocities: np.ndarray | None = None,
+        parameters: Mapping[str, np.ndarray] | None = None,
+        until_rest: bool = False,
+        calm: float | Mapping[int, float] = 0.0,
+        calm_after: float = 0.0,
+    ) -> np.ndarray:
+        """Positions (W, T, P, 3) [m] at `times` [s] from the start, ascending: at the nearest
+        whole numbers of substeps, whose times are then in `times` (T,) [s].
+
+        At these times `velocities` (W, T, P, 3) [m/s] are then those of the particles, `body_poses`
+        (W, T, B, 7) the poses of the bodies' frames, position and quat_xyzw, and `body_velocities`
+        (W, T, B, 6) their twists.
+
+        positions (W, P, 3) [m], velocities (W, P, 3) [m/s]: the start; None: as the worlds are
+        body_poses (W, B, 7), body_velocities (W, B, 6: linear at the centre of mass, angular):
+        likewise
+        parameters: by name "damping", "table_friction", "contact_friction", "stiffness" (W,) or
+        "inverse_masses" (W, P) [1/kg]; they stay set
+        until_rest: worlds freeze once they rest, as in `rollout`; otherwise they run on
+
+        Raises:
+            InputError: worlds of several topologies, times that do not ascend, too little memory.
+        """
+        data, dt = self.solver.data, self.recorder.dt
+        self._worlds = [int(w) for w in worlds]
+        if len({int(data.world_topology[w]) for w in self._worlds}) != 1:
+            raise InputError(
+                "derivatives are taken of worlds of one topology at a time, at least one"
+            )
+        marks = [round(check_number(t, "times", POSITIVE) / dt) for t in times]
+        self._marks = marks
+        self.times = np.array(marks) * dt
+        for name, value in (parameters or {}).items():
+            self._set(name, np.asarray(value, dtype=float))
+        for name, start in (("particles.x", positions), ("particles.v", velocities)):
+            for k, w in enumerate(self._worlds) if start is not None else ():
+                data.lane(name, w)[:] = np.asarray(start)[k]
+        if body_poses is not None or body_velocities is not None:
+            for k, w in enumerate(self._worlds):
+                poses, twists = data.body_poses(w)
+                data.set_bodies(
+                    w, poses if body_poses is None else np.asarray(body_poses)[k],
+                    twists if body_velocities is None else np.asarray(body_velocities)[k],
+                )  # fmt: skip
+        turns = data.arrays["bodies.q"].view
+        self._turns = [turns[data.body_rows(w)].copy() for w in self._worlds]
+        end = marks[-1] * dt if marks else 0.0
+        prepare(
+            self.solver, self._worlds, paths=paths, pushes=pushes, most=2 * end,
+            least=0.0 if until_rest else 2 * end, calm=calm, calm_after=calm_after, dt=dt,
+        )  # fmt: skip
+        knot, end_knot = (data.arrays[f"grips.{n}"].view for n in ("knot", "knot_end"))
+        self._knots = {
+            w: slice(int(knot[s]), int(end_knot[s]))
+            for w, s in ((w, data.slot[w]) for w in self._worlds)
+            if w in (paths or {})
+        }
+        self._flips = {w: self._flipped(paths[w], rows) for w, rows in self._knots.items() if paths}
+        self.watch = self.recorder.forward(marks)
+        self.body_poses = np.stack([self._poses(m) for m in marks], axis=1)
+        self.body_velocities = np.stack([self._twists(m) for m in marks], axis=1)
+        at, speed = (
+            np.stack([self._worldwise(self.recorder.states[m][name]) for m in marks], axis=1)
+            for name in ("particles.x", "particles.v")
+        )
+        self.velocities = speed
+        return at
+
+    def _flipped(self, path: GripPath, rows: slice) -> np.ndarray:
+        """-1 for knots (K, 1) whose quaternion was flipped to interpolate the short way round."""
+        used = self.solver.data.arrays["grips.rotation"].view[rows]
+        given = used if path.rotations is None else np.asarray(path.rotations)
+        return np.where((used * given).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+
+    def _set(self, name: str, values: np.ndarray) -> None:
+        data = self.solver.data
+        if name not in (*WORLD_PARAMETERS, "inverse_masses") or len(values) != len(self._worlds):
+            raise InputError(
+                f"no parameter {name!r} of shape {values.shape} for {len(self._worlds)} worlds"
+            )
+        for k, w in enumerate(self._worlds):
+            if name == "inverse_masses":
+                data.lane("particles.w0", w)[:] = values[k]
+                data.lane("particles.w", w)[:] = values[k]
+            else:
+                self.solver.set_world(w, **{name: float(values[k])})
+
+    def backward(
+        self,
+        positions: np.ndarray | None = None,
+        velocities: np.ndarray | None = None,
+        *,
+        bodies: np.ndarray | None = None,
+        body_velocities: np.ndarray | None = None,
+    ) -> Gradients:
+        """Derivatives of a loss from those by the positions (W, T, P, 3) and the velocities at the
+        times of `forward`. May be called again with others.
+
+        bodies (W, T, B, 7), body_velocities (W, T, B, 6): the same by `body_poses` and by twists;
+        what is across the sphere of unit quaternions does not count
+        """
+        given = {"particles.x": positions, "particles.v": velocities}
+        cotangents: dict[int, dict[str, np.ndarray]] = {}
+        for t, mark in enumerate(self._marks):
+            cotangents[mark] = {
+                name: self._lanewise(name, np.asarray(values)[:, t])
+                for name, values in given.items()
+                if values is not None
+            }
+            self._body_cotangents(cotangents[mark], t, mark, bodies, body_velocities)
+        out = self.recorder.backward(cotangents)
+        knots = {
+            name: {w: out[name][rows] for w, rows in self._knots.items()}
+            for name in ("position", "time", "rotation")
+        }
+        return Gradients(
+            positions=self._worldwise(out["x"]),
+            velocities=self._worldwise(out["v"]),
+            inverse_masses=self._worldwise(out["mass"]),
+            **{name: self._of_groups(out[name]) for name in WORLD_PARAMETERS},
+            body_poses=self._by_frames(out["body.x"], out["body.q"]),
+            body_velocities=np.concatenate(
+                [self._of_bodies(out["body.v"]), self._of_bodies(out["body.omega"])], axis=-1
+            ),
+            body_inverse_masses=self._of_bodies(out["body.w"]),
+            way_points=knots["position"],
+            knot_times=knots["time"],
+            knot_rotations={w: g * self._flips[w] for w, g in knots["rotation"].items()},
+            fired=self._of_groups(out["fired"]),
+        )
+
+    def _poses(self, mark: int) -> np.ndarray:
+        """Poses (W, B, 7) of the bodies' frames at a mark."""
+        data, state = self.solver.data, self.recorder.states[mark]
+        x, q = self._of_bodies(state["bodies.x"]), self._of_bodies(state["bodies.q"])
+        if x.shape[1] == 0:
+            return np.concatenate([x, q], axis=-1)
+        com = data.topologies[data.world_topology[self._worlds[0]]].body_com
+        return np.stack([data.frame_poses(xw, qw, com) for xw, qw in zip(x, q, strict=True)])
+
+    def _twists(self, mark: int) -> np.ndarray:
+        """Twists (W, B, 6) of the bodies at a mark."""
+        state = self.recorder.states[mark]
+        return np.concatenate(
+            [self._of_bodies(state["bodies.v"]), self._of_bodies(state["bodies.omega"])], axis=-1
+        )
+
+    def _of_bodies(self, rows: np.ndarray) -> np.ndarray:
+        """An array by row of bodies -> (W, B, ...)."""
+        return np.stack([rows[self.solver.data.body_rows(w)] for w in self._worlds])
+
+    def _body_cotangents(
+        self,
+        cotangent: dict[str, np.ndarray],
+        t: int,
+        mark: int,
+        bodies: np.ndarray | None,
+        twists: np.ndarray | None,
+    ) -> None:
+        """Add derivatives by poses of frames and twists as those by centres of mass."""
+        data, state = self.solver.data, self.recorder.states[mark]
+        com = data.topologies[data.world_topology[self._worlds[0]]].body_com
+        if not len(com):
+            return
+        for names, given in ((("x", "q"), bodies), (("v", "omega"), twists)):
+            if given is None:
+                continue
+            for name in names:
+                key = f"bodies.{name}"
+                cotangent[key] = np.zeros_like(data.arrays[key].view)
+            for k, w in enumerate(self._worlds):
+                rows, g = data.body_rows(w), np.asarray(given, dtype=float)[k, t]
+                cotangent[f"bodies.{names[0]}"][rows] = g[:, :3]
+                rest = g[:, 3:]
+                if names[1] == "q":
+                    turn = state["bodies.q"][rows]
+                    rest = _on_sphere(turn, rest - _turned_by(com, turn, g[:, :3]))
+                cotangent[f"bodies.{names[1]}"][rows] = rest
+
+    def _by_frames(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Derivatives (W, B, 7) by the frames of the bodies at the start."""
+        data = self.solver.data
+        com = data.topologies[data.world_topology[self._worlds[0]]].body_com
+        by_x, by_q = self._of_bodies(x), self._of_bodies(q)
+        if by_x.shape[1]:
+            turned = zip(self._turns, by_x, by_q, strict=True)
+            by_q = np.stack([_on_sphere(t, gq + _turned_by(com, t, gx)) for t, gx, gq in turned])
+        return np.concatenate([by_x, by_q], axis=-1)
+
+    def _worldwise(self, lanes: np.ndarray) -> np.ndarray:
+        """An array of particles in lanes (P..., 3, L) or (P..., L) -> (W, P, 3) or (W, P)."""
+        data, rows = self.solver.data, []
+        for w in self._worlds:
+            group, lane = divmod(int(data.slot[w]), data.lanes)
+            first, last = data.group_particle[group : group + 2]
+            rows.append(lanes[first:last, ..., lane])
+        return np.stack(rows)
+
+    def _lanewise(self, name: str, values: np.ndarray) -> np.ndarray:
+        data = self.solver.data
+        out = np.zeros_like(data.arrays[name].view)
+        for k, w in enumerate(self._worlds):
+            group, lane = divmod(int(data.slot[w]), data.lanes)
+            first, last = data.group_particle[group : group + 2]
+            out[first:last, ..., lane] = values[k]
+        return out
+
+    def _of_groups(self, lanes: np.ndarray) -> np.ndarray:
+        """An array (groups, ..., L) -> (W, ...)."""
+        data = self.solver.data
+        slots = [divmod(int(data.slot[w]), data.lanes) for w in self._worlds]
+        return np.stack([lanes[group, ..., lane] for group, lane in slots])
+
+
+def _turned_by(offset: np.ndarray, turn: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Derivatives (B, 4) by quaternions of g . (offsets turned by them)."""
+    v, w = turn[:, :3], turn[:, 3:]
+    dot = functools.partial(np.einsum, "bi,bi->b")
+    by_v = 2 * w * np.cross(offset, g) + 2 * g * dot(v, offset)[:, None]
+    by_v += 2 * offset * dot(v, g)[:, None] - 4 * v * dot(g, offset)[:, None]
+    return np.column_stack([by_v, 2 * dot(g, np.cross(v, offset))])
+
+
+def _on_sphere(turn: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Derivatives by unit quaternions without their share along these."""
+    return g - turn * (turn * g).sum(axis=-1, keepdims=True)
+
+
+def substep_vjp(
+    solver: FusedXPBD,
+    worlds: Sequence[int],
+    positions: np.ndarray,
+    velocities: np.ndarray | None = None,
+    *,
+    sleep: bool = True,
+    **options: Any,
+) -> Gradients:
+    """One substep of `worlds` as they are, and derivatives back through it.
+
+    positions, velocities (W, P, 3): derivatives of a loss by those after the substep
+    options: as in `DifferentiableRollout.forward`, for example paths
+
+    The worlds are left after the substep.
+    """
+    run = DifferentiableRollout(solver, storage="full", sleep=sleep)
+    run.forward(worlds, [solver.config.dt], **options)
+    return run.backward(
+        np.asarray(positions)[:, None],
+        None if velocities is None else np.asarray(velocities)[:, None],
+    )

@@ -1,0 +1,69 @@
+"""One action of tasks whose robot has a parallel jaw: what `Worlds.step` does for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..objects.cable import Cable
+from ..robots.jaw import Jaw
+from ..robots.jaw_primitive import jaw_motion, jaw_script, run_scripts
+from ..robots.primitive import Motion, Outcome
+from ..rollout.launch import rollout
+from ..tasks.task import Task
+from ..xpbd.launches import FusedXPBD
+from .episode import Plan, episode_rng
+
+__all__ = ["jaw_step"]
+
+_STREAM = 100
+"""Random streams of what goes wrong in an action start here, one an action."""
+_REST = 0.2
+"""A world runs at least so long after the hand has gone up [s]."""
+
+
+class JawWorlds(Protocol):
+    """What `jaw_step` needs of `worlds.Worlds`."""
+
+    task: Task
+    objects: Any
+    episodes: Any
+    rest_limit: float
+
+    @property
+    def solver(self) -> FusedXPBD:
+        """What runs them."""
+
+    def reachable(self, plans: Mapping[int, Plan], motions: Mapping[int, Motion]) -> list[int]:
+        """Slots whose arm gets along its motion; notes the others' outcome."""
+
+
+def jaw_step(worlds: JawWorlds, plans: Mapping[int, Plan], record: float) -> None:
+    """Run the plans' actions; notes outcomes, runs and motions in them."""
+    config, chain = worlds.task.jaw, worlds.objects[0]
+    assert config is not None and isinstance(chain, Cable), "a jaw takes a chain"
+    episodes, solver = worlds.episodes, worlds.solver
+    motions = {
+        slot: jaw_motion(episodes[slot].tip, plan.action, config) for slot, plan in plans.items()
+    }
+    moving = worlds.reachable(plans, motions)
+    jaws, scripts = {}, {}
+    for slot in moving:
+        rng = episode_rng(episodes[slot].seed, _STREAM + len(episodes[slot].actions))
+        action = config.disturbed(plans[slot].action, rng)
+        jaws[slot] = Jaw(solver, slot, chain, config.fingers, rng=rng)
+        scripts[slot] = jaw_script(jaws[slot], action, config)
+    for slot, (outcome, run) in run_scripts(solver, jaws, scripts, config, record=record).items():
+        jaws[slot].reset()
+        plans[slot].outcome = outcome
+        plans[slot].held = 0 if outcome is Outcome.PLACED else None  # the chain
+        plans[slot].runs.append(run)
+    if not moving:
+        return
+    runs = rollout(solver, moving, least=_REST, most=_REST + worlds.rest_limit, record=record)
+    for slot in moving:
+        plans[slot].runs.append(runs[slot])
+        episodes[slot].at_rest = runs[slot].at_rest
+        episodes[slot].tip = np.array(motions[slot].way_points[-1])

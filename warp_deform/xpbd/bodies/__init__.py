@@ -1,0 +1,1 @@
+"""Rigid bodies made of boxes: motion, and contact with everything, with their adjoints."""

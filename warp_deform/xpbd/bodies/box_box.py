@@ -1,0 +1,195 @@
+"""Where boxes touch each other.
+
+The axis of least overlap among the 15 candidates of two boxes (separating axis theorem) is the
+contact normal. For a face axis the contact points are the corners of the area that the face and the
+other box's facing side have in common. For an edge axis they are the two edges' closest points.
+Source: Ericson, Real-Time Collision Detection, sections 4.4 and 5.5.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ..lanes.structures import structures
+from .body_contact import AHEAD, body_contact
+from .box_axes import box_axes
+
+__all__ = ["POINTS", "box_box"]
+
+POINTS = 12
+"""Most contacts of two boxes: 8 ends of edges and 4 corners."""
+
+
+@functools.cache
+def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
+    """`list_boxes(c, sa, a, sb, b, ...)`: adds the contacts of shape sa of body a with shape sb of
+    body b to the list, from number c on, and returns the next number.
+    `noted`: with the axis, edge and end in `Contacts.code`.
+    """
+    t = structures(scalar, lanes)
+    S, R3, M33 = t.S, t.R3, t.M33
+    Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
+    contact, box = body_contact(scalar, lanes, noted), box_axes(scalar, lanes)
+    list_contact, share_load = contact.list_contact, contact.share_load
+    center, axes, column, reach, candidate = (
+        box.center, box.axes, box.column, box.reach, box.candidate
+    )  # fmt: skip
+
+    @wp.func
+    def list_face(
+        c: int, a: int, b: int, axis: int, n: R3, ca: R3, aa: M33, ha: R3, cb: R3, ab: M33, hb: R3,
+        mu: S, push: S, bodies: Bodies, contacts: Contacts,
+    ):  # fmt: skip
+        """Contacts between the face of box a with outward normal n (its axis `axis`) and the side
+        of box b that faces it: the corners of their common area. Returns the next number.
+        """
+        u = column(aa, (axis + 1) % 3)
+        v = column(aa, (axis + 2) % 3)
+        hu = ha[(axis + 1) % 3]
+        hv = ha[(axis + 2) % 3]
+        # side of b most opposed to n
+        k = int(0)
+        best = S(0.0)
+        for e in range(3):
+            opposed = wp.abs(wp.dot(column(ab, e), n))
+            if opposed > best:
+                best = opposed
+                k = e
+        m = column(ab, k) * wp.sign(wp.dot(column(ab, k), n))
+        bu = column(ab, (k + 1) % 3)
+        bv = column(ab, (k + 2) % 3)
+        eu = bu * hb[(k + 1) % 3]
+        ev = bv * hb[(k + 2) % 3]
+        side = cb - m * hb[k]
+        face = wp.dot(ca, n) + ha[axis]
+        for edge in range(4):
+            s0 = S(1.0)
+            if edge == 1 or edge == 2:
+                s0 = S(-1.0)
+            s1 = S(1.0)
+            if edge >= 2:
+                s1 = S(-1.0)
+            # corners of b's side in order around it, its edges cut off at a's face
+            p = side + eu * s0 + ev * s1
+            d = eu * (S(-2.0) * s0)
+            if edge == 1 or edge == 3:
+                d = ev * (S(-2.0) * s1)
+            lo = S(0.0)
+            hi = S(1.0)
+            pu = wp.dot(p - ca, u)
+            pv = wp.dot(p - ca, v)
+            du = wp.dot(d, u)
+            dv = wp.dot(d, v)
+            if wp.abs(du) > S(1.0e-9):
+                lo = wp.max(lo, wp.min((-hu - pu) / du, (hu - pu) / du))
+                hi = wp.min(hi, wp.max((-hu - pu) / du, (hu - pu) / du))
+            elif wp.abs(pu) > hu:
+                hi = S(-1.0)
+            if wp.abs(dv) > S(1.0e-9):
+                lo = wp.max(lo, wp.min((-hv - pv) / dv, (hv - pv) / dv))
+                hi = wp.min(hi, wp.max((-hv - pv) / dv, (hv - pv) / dv))
+            elif wp.abs(pv) > hv:
+                hi = S(-1.0)
+            if lo <= hi:
+                for end in range(2):
+                    # the far end of an edge that is not cut off is the near end of the next one
+                    if end == 0 or hi < S(1.0):
+                        at = p + d * wp.where(end == 0, lo, hi)
+                        gap = wp.dot(at, n) - face
+                        if gap < S(AHEAD):
+                            list_contact(c, a, b, at - n * gap, at, n, mu, push, bodies, contacts)
+                            if wp.static(noted):
+                                contacts.code[c] = wp.vec4i(axis, k, edge * 4 + end, 0)
+                            c += 1
+            # corner of a's face inside b's side
+            q = ca + n * ha[axis] + u * (hu * s0) + v * (hv * s1)
+            if (
+                wp.abs(wp.dot(q - cb, bu)) < hb[(k + 1) % 3]
+                and wp.abs(wp.dot(q - cb, bv)) < hb[(k + 2) % 3]
+            ):
+                gap = wp.dot(side - q, m) / wp.dot(m, n)
+                if gap < S(AHEAD):
+                    list_contact(c, a, b, q, q + n * gap, n, mu, push, bodies, contacts)
+                    if wp.static(noted):
+                        contacts.code[c] = wp.vec4i(axis, k, edge * 4 + 2, 0)
+                    c += 1
+        return c
+
+    @wp.func
+    def list_boxes(
+        c: int, sa: int, a: int, sb: int, b: int, mu: S, push: S, shapes: Shapes, bodies: Bodies,
+        contacts: Contacts,
+    ):  # fmt: skip
+        start = int(c)
+        ha = shapes.half[sa]
+        hb = shapes.half[sb]
+        ca = center(sa, a, shapes, bodies)
+        cb = center(sb, b, shapes, bodies)
+        d = cb - ca
+        if wp.dot(d, d) < (wp.length(ha) + wp.length(hb)) * (wp.length(ha) + wp.length(hb)):
+            aa = axes(sa, a, shapes, bodies)
+            ab = axes(sb, b, shapes, bodies)
+            least = S(1.0e9)
+            kind = int(-1)
+            normal = R3()
+            for k in range(15):
+                n = candidate(aa, ab, k)
+                # edge axes must win clearly: near-parallel edges would otherwise flicker
+                bias = wp.where(k < 6, S(1.0), S(1.05))
+                l = wp.length(n)
+                if l > S(1.0e-3) and least > S(0.0):
+                    n = n / l
+                    overlap = reach(aa, ha, n) + reach(ab, hb, n) - wp.abs(wp.dot(d, n)) + S(AHEAD)
+                    if overlap <= S(0.0):
+                        least = S(-1.0)
+                    elif overlap * bias < least:
+                        least = overlap * bias
+                        kind = k
+                        normal = n * wp.where(wp.dot(d, n) < S(0.0), S(-1.0), S(1.0))
+            if least > S(0.0) and kind >= 0:
+                if kind < 3:
+                    c = list_face(
+                        c, a, b, kind, normal, ca, aa, ha, cb, ab, hb, mu, push, bodies, contacts
+                    )
+                elif kind < 6:
+                    c = list_face(
+                        c, b, a, kind - 3, -normal, cb, ab, hb, ca, aa, ha, mu, push, bodies,
+                        contacts,
+                    )  # fmt: skip
+                else:
+                    ea = (kind - 6) // 3
+                    eb = (kind - 6) % 3
+                    pa = ca
+                    pb = cb
+                    for k in range(3):
+                        if k != ea:
+                            pa += column(aa, k) * (wp.sign(wp.dot(column(aa, k), normal)) * ha[k])
+                        if k != eb:
+                            pb -= column(ab, k) * (wp.sign(wp.dot(column(ab, k), normal)) * hb[k])
+                    u = column(aa, ea)
+                    v = column(ab, eb)
+                    uv = wp.dot(u, v)
+                    w = pb - pa
+                    bottom = S(1.0) - uv * uv
+                    su = (wp.dot(w, u) - uv * wp.dot(w, v)) / bottom
+                    sv = (uv * wp.dot(w, u) - wp.dot(w, v)) / bottom
+                    pa += u * su
+                    pb += v * sv
+                    list_contact(c, a, b, pa, pb, normal, mu, push, bodies, contacts)
+                    if wp.static(noted):
+                        contacts.code[c] = wp.vec4i(ea, eb, 16, 0)
+                    c += 1
+        if wp.static(noted):
+            # the axis and the faces stay; shapes in the order of the contact's bodies
+            for k in range(start, c):
+                code = contacts.code[k]
+                if contacts.a[k] == a:
+                    contacts.code[k] = wp.vec4i(sa, sb, code[2] * 16 + code[0] * 4 + code[1], 0)
+                else:
+                    contacts.code[k] = wp.vec4i(sb, sa, code[2] * 16 + code[0] * 4 + code[1], 0)
+        share_load(start, c, bodies, contacts)
+        return c
+
+    return SimpleNamespace(list_boxes=list_boxes)

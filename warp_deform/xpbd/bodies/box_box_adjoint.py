@@ -1,0 +1,126 @@
+"""Where boxes touch each other, and how that moves with them, see `box_box`."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ..lanes.structures import structures
+
+__all__ = ["box_box_adjoint"]
+
+
+@functools.cache
+def box_box_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`sweep_boxes` gives the derivatives by both points of a contact and its normal to the poses.
+
+    Branches, all noted with the contact: the axis; which edge of the one box is cut off where, or
+    which corner of the other box's face it is.
+    """
+    t = structures(scalar, lanes)
+    S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
+    Shapes, Bodies, BodyAdjoint = t.Shapes, t.Bodies, t.BodyAdjoint
+
+    @wp.func
+    def column(m: M33, k: int):
+        return R3(m[0, k], m[1, k], m[2, k])
+
+    @wp.func
+    def points(
+        xa: R3, qa: Q, xb: R3, qb: Q, ra: Q, rb: Q, oa: R3, ob: R3, ha: R3, hb: R3, how: int,
+        axis: int, k: int,
+    ):  # fmt: skip
+        """Rows: point of a, point of b, normal."""
+        ca = xa + wp.quat_rotate(qa, oa)
+        cb = xb + wp.quat_rotate(qb, ob)
+        aa = wp.quat_to_matrix(qa * ra)
+        ab = wp.quat_to_matrix(qb * rb)
+        n = R3()
+        pa = R3()
+        pb = R3()
+        if how == 16:
+            ua = column(aa, axis)
+            ub = column(ab, k)
+            nu = wp.normalize(wp.cross(ua, ub))
+            n = nu * wp.where(wp.dot(cb - ca, nu) < S(0.0), S(-1.0), S(1.0))
+            a0 = wp.sign(wp.dot(column(aa, 0), n)) * ha[0] * wp.where(axis == 0, S(0.0), S(1.0))
+            a1 = wp.sign(wp.dot(column(aa, 1), n)) * ha[1] * wp.where(axis == 1, S(0.0), S(1.0))
+            a2 = wp.sign(wp.dot(column(aa, 2), n)) * ha[2] * wp.where(axis == 2, S(0.0), S(1.0))
+            b0 = wp.sign(wp.dot(column(ab, 0), n)) * hb[0] * wp.where(k == 0, S(0.0), S(1.0))
+            b1 = wp.sign(wp.dot(column(ab, 1), n)) * hb[1] * wp.where(k == 1, S(0.0), S(1.0))
+            b2 = wp.sign(wp.dot(column(ab, 2), n)) * hb[2] * wp.where(k == 2, S(0.0), S(1.0))
+            ea = ca + column(aa, 0) * a0 + column(aa, 1) * a1 + column(aa, 2) * a2
+            eb = cb - column(ab, 0) * b0 - column(ab, 1) * b1 - column(ab, 2) * b2
+            uv = wp.dot(ua, ub)
+            w = eb - ea
+            bottom = S(1.0) - uv * uv
+            pa = ea + ua * ((wp.dot(w, ua) - uv * wp.dot(w, ub)) / bottom)
+            pb = eb + ub * ((uv * wp.dot(w, ua) - wp.dot(w, ub)) / bottom)
+        else:
+            face_axis = wp.normalize(column(aa, axis))
+            n = face_axis * wp.where(wp.dot(cb - ca, face_axis) < S(0.0), S(-1.0), S(1.0))
+            u = column(aa, (axis + 1) % 3)
+            v = column(aa, (axis + 2) % 3)
+            hu = ha[(axis + 1) % 3]
+            hv = ha[(axis + 2) % 3]
+            m = column(ab, k) * wp.sign(wp.dot(column(ab, k), n))
+            eu = column(ab, (k + 1) % 3) * hb[(k + 1) % 3]
+            ev = column(ab, (k + 2) % 3) * hb[(k + 2) % 3]
+            side = cb - m * hb[k]
+            edge = how // 4
+            end = how % 4
+            s0 = wp.where(edge == 1 or edge == 2, S(-1.0), S(1.0))
+            s1 = wp.where(edge >= 2, S(-1.0), S(1.0))
+            if end == 2:
+                pa = ca + n * ha[axis] + u * (hu * s0) + v * (hv * s1)
+                pb = pa + n * (wp.dot(side - pa, m) / wp.dot(m, n))
+            else:
+                p = side + eu * s0 + ev * s1
+                d = eu * (S(-2.0) * s0 * wp.where(edge % 2 == 0, S(1.0), S(0.0))) + ev * (
+                    S(-2.0) * s1 * wp.where(edge % 2 == 0, S(0.0), S(1.0))
+                )
+                pu = wp.dot(p - ca, u)
+                pv = wp.dot(p - ca, v)
+                du = wp.dot(d, u)
+                dv = wp.dot(d, v)
+                lo_u = S(0.0)
+                hi_u = S(1.0)
+                if wp.abs(du) > S(1.0e-9):
+                    lo_u = wp.max(S(0.0), wp.min((-hu - pu) / du, (hu - pu) / du))
+                    hi_u = wp.min(S(1.0), wp.max((-hu - pu) / du, (hu - pu) / du))
+                lo = lo_u
+                hi = hi_u
+                if wp.abs(dv) > S(1.0e-9):
+                    lo = wp.max(lo_u, wp.min((-hv - pv) / dv, (hv - pv) / dv))
+                    hi = wp.min(hi_u, wp.max((-hv - pv) / dv, (hv - pv) / dv))
+                pb = p + d * wp.where(end == 0, lo, hi)
+                pa = pb - n * (wp.dot(pb, n) - wp.dot(ca, n) - ha[axis])
+        return pa, pb, n
+
+    @wp.func
+    def along(
+        xa: R3, qa: Q, xb: R3, qb: Q, ra: Q, rb: Q, oa: R3, ob: R3, ha: R3, hb: R3, how: int,
+        axis: int, k: int, ga: R3, gb: R3, gn: R3,
+    ) -> S:  # fmt: skip
+        pa, pb, n = points(xa, qa, xb, qb, ra, rb, oa, ob, ha, hb, how, axis, k)
+        return wp.dot(ga, pa) + wp.dot(gb, pb) + wp.dot(gn, n)
+
+    @wp.func
+    def sweep_boxes(
+        a: int, b: int, code: wp.vec4i, ga: R3, gb: R3, gn: R3, shapes: Shapes, bodies: Bodies,
+        ba: BodyAdjoint,
+    ):  # fmt: skip
+        sa = code[0]
+        sb = code[1]
+        gxa, gqa, gxb, gqb, _a, _b, _c, _d, _e, _f, _g, _h, _i, _j, _k, _l = wp.grad(along)(
+            bodies.x[a], bodies.q[a], bodies.x[b], bodies.q[b], shapes.rotation[sa],
+            shapes.rotation[sb], shapes.center[sa], shapes.center[sb], shapes.half[sa],
+            shapes.half[sb], code[2] // 16, (code[2] // 4) % 4, code[2] % 4, ga, gb, gn,
+        )  # fmt: skip
+        ba.x[a] = ba.x[a] + gxa
+        ba.q[a] = ba.q[a] + gqa
+        ba.x[b] = ba.x[b] + gxb
+        ba.q[b] = ba.q[b] + gqb
+
+    return SimpleNamespace(sweep_boxes=sweep_boxes)

@@ -1,0 +1,58 @@
+"""Boxes on the table: the corners of every box against the plane z = 0."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ..lanes.structures import structures
+from .body_contact import AHEAD, body_contact
+
+__all__ = ["box_table"]
+
+
+@functools.cache
+def box_table(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
+    """`list_table(c, b, local, first, last, ...)`: adds the corners of body b with shapes
+    first..last that may touch the table to the contacts, from number c on; returns the next number.
+    `noted`: with the number of the corner in `Contacts.code`.
+    """
+    t = structures(scalar, lanes)
+    S, R3 = t.S, t.R3
+    Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
+    contact = body_contact(scalar, lanes, noted)
+    list_contact, share_load = contact.list_contact, contact.share_load
+
+    @wp.func
+    def corner(shape: int, c: int, shapes: Shapes):
+        """Corner c (0..7) of a shape in the body's frame [m]."""
+        h = shapes.half[shape]
+        sign = R3(
+            S(2.0) * S(c & 1) - S(1.0), S((c & 2) - 1), S(2.0) * S((c & 4) >> 2) - S(1.0)
+        )  # fmt: skip
+        at = wp.quat_rotate(shapes.rotation[shape], wp.cw_mul(h, sign))
+        return shapes.center[shape] + at
+
+    @wp.func
+    def list_table(
+        c: int, b: int, local: int, first: int, last: int, mu: S, push: S, shapes: Shapes,
+        bodies: Bodies, contacts: Contacts,
+    ):  # fmt: skip
+        start = int(c)
+        up = R3(S(0.0), S(0.0), S(1.0))
+        for shape in range(first, last):
+            if shapes.body[shape] == local:
+                for k in range(8):
+                    p = bodies.x[b] + wp.quat_rotate(bodies.q[b], corner(shape, k, shapes))
+                    if p[2] < S(AHEAD):
+                        foot = R3(p[0], p[1], S(0.0))
+                        table_mu = mu * shapes.friction[shape]
+                        list_contact(c, -1, b, foot, p, up, table_mu, push, bodies, contacts)
+                        if wp.static(noted):
+                            contacts.code[c] = wp.vec4i(-1, shape, k, 0)
+                        c += 1
+        share_load(start, c, bodies, contacts)
+        return c
+
+    return SimpleNamespace(list_table=list_table, corner=corner)

@@ -1,0 +1,1 @@
+"""Contact and friction between particles, triangles, edges and the table, with their adjoints."""

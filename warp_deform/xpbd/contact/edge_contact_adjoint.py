@@ -1,0 +1,151 @@
+"""Adjoint of contact between edges of triangles, see `edge_contact`."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ..lanes.lane_access import lane_access
+from ..lanes.structures import structures
+from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind
+from .closest_point import closest_point_adjoint
+from .edge_contact import edge_contact
+from .triangle_contact_adjoint import triangle_contact_adjoint
+
+__all__ = ["edge_contact_adjoint"]
+
+
+@functools.cache
+def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`record_edges` solves the listed pairs of one lane, leaves those that acted on the tape and
+    returns their number; `sweep_edge` takes one back.
+
+    Branches: only pairs that meet inside both edges act, on the side on which they were listed;
+    depth is limited by the overlap or by `recovery`.
+    """
+    t = structures(scalar, lanes)
+    S, R3, L = t.S, t.R3, t.L
+    R2 = wp.types.vector(2, S)
+    Sheets, Cells, Tape, Adjoint = t.Sheets, t.Cells, t.Tape, t.Adjoint
+    access = lane_access(scalar, lanes)
+    count_one = access.count_one
+    get, get_mass = access.get, access.get_mass
+    edges_ = edge_contact(scalar, lanes)
+    nearest, project_edge = edges_.nearest, edges_.project_edge
+    along_two = closest_point_adjoint(scalar, lanes).along_two
+    tri_ = triangle_contact_adjoint(scalar, lanes)
+    push4, point, add_to, add_mass = tri_.push4, tri_.point, tri_.add_to, tri_.add_mass
+
+    @wp.func
+    def record_edges(
+        g: int, lane: int, p0: int, at_word: int, at_scalar: int, push: S, sheets: Sheets,
+        cells: Cells, tape: Tape,
+    ):  # fmt: skip
+        found = int(0)
+        start = cells.list_start[g] + lane * cells.capacity[g]
+        for k in range(start, start + cells.edge_count[g * wp.static(L) + lane]):
+            e = sheets.edge[cells.edge_a[k]]
+            f = sheets.edge[cells.edge_b[k]]
+            a = get(cells.x, p0 + e[0], lane)
+            b = get(cells.x, p0 + e[1], lane)
+            c = get(cells.x, p0 + f[0], lane)
+            d = get(cells.x, p0 + f[1], lane)
+            acts = project_edge(k, lane, p0, push, sheets, cells)
+            if acts:
+                word = at_word + found * wp.static(TRIANGLE_WORDS)
+                tape.k[word] = cells.edge_a[k]
+                tape.k[word + 1] = cells.edge_b[k]
+                at = at_scalar + found * wp.static(TRIANGLE_SCALARS)
+                push4(at, cells.edge_gap[k], a, b, c, d, tape)
+                found += 1
+        return found
+
+    @wp.func
+    def sweep_edge(
+        word: int, at: int, finished: int, lane: int, p0: int, push: S, counts: int,
+        sheets: Sheets, tape: Tape, adj: Adjoint,
+    ):  # fmt: skip
+        first = sheets.edge[tape.k[word]]
+        second = sheets.edge[tape.k[word + 1]]
+        signed = tape.s[at]
+        a = point(at + 1, tape)
+        b = point(at + 4, tape)
+        c = point(at + 7, tape)
+        d = point(at + 10, tape)
+        ia = p0 + first[0]
+        ib = p0 + first[1]
+        ic = p0 + second[0]
+        id = p0 + second[1]
+        kind = counts + wp.static(int(Kind.EDGE))
+        count_one(kind, lane, adj)
+        h = wp.abs(signed)
+        side = wp.sign(signed)
+        e = b - a
+        f = d - c
+        n = wp.cross(e, f) * side
+        size = wp.length(n)
+        n = n / size
+        at_both = nearest(a, b, c, d)
+        u = at_both[0]
+        v = at_both[1]
+        nu = S(1.0) - u
+        nv = S(1.0) - v
+        wa = get_mass(adj.w_flat, ia, lane)
+        wb = get_mass(adj.w_flat, ib, lane)
+        wc = get_mass(adj.w_flat, ic, lane)
+        wd = get_mass(adj.w_flat, id, lane)
+        w = wa * nu * nu + wb * u * u + wc * nv * nv + wd * v * v
+        sa = a - get(tape.x_flat, finished + 3 * first[0] + 1, lane)
+        sb = b - get(tape.x_flat, finished + 3 * first[1] + 1, lane)
+        sc = c - get(tape.x_flat, finished + 3 * second[0] + 1, lane)
+        sd = d - get(tape.x_flat, finished + 3 * second[1] + 1, lane)
+        moved = sa * nu + sb * u - sc * nv - sd * v
+        r = a + e * u - c - f * v
+        overlap = h - wp.dot(r, n)
+        allowed = wp.max(push - wp.dot(moved, n), S(0.0))
+        depth = wp.min(overlap, allowed)
+        step = n * (depth / w)
+
+        ga = get(adj.x_flat, ia, lane)
+        gb = get(adj.x_flat, ib, lane)
+        gc = get(adj.x_flat, ic, lane)
+        gd = get(adj.x_flat, id, lane)
+        g_step = ga * (wa * nu) + gb * (wb * u) - gc * (wc * nv) - gd * (wd * v)
+        ya = wp.dot(ga, step)
+        yb = wp.dot(gb, step)
+        yc = -wp.dot(gc, step)
+        yd = -wp.dot(gd, step)
+        gw = -wp.dot(g_step, step) / w
+        add_mass(ia, lane, wa, nu * (ya + gw * nu), adj)
+        add_mass(ib, lane, wb, u * (yb + gw * u), adj)
+        add_mass(ic, lane, wc, nv * (yc + gw * nv), adj)
+        add_mass(id, lane, wd, v * (yd + gw * v), adj)
+        g_depth = wp.dot(g_step, n) / w
+        gn = g_step * (depth / w)
+        g_moved = R3()
+        gr = R3()
+        if allowed < overlap:
+            if allowed > S(0.0):
+                gn -= moved * g_depth
+                g_moved = n * (-g_depth)
+        else:
+            gn -= r * g_depth
+            gr = n * (-g_depth)
+        gu = yb * wb - ya * wa + S(2.0) * gw * (wb * u - wa * nu)
+        gu += wp.dot(g_moved, sb - sa) + wp.dot(gr, e)
+        gv = yd * wd - yc * wc + S(2.0) * gw * (wd * v - wc * nv)
+        gv -= wp.dot(g_moved, sd - sc) + wp.dot(gr, f)
+        gm = (gn - n * wp.dot(n, gn)) * (side / size)
+        # shares: from a along e, and from there to c against f
+        y = along_two(-r, R2(u, v), e, -f, R2(gu, gv))
+        across = R3(y[0, 0], y[0, 1], y[0, 2])
+        ge = wp.cross(f, gm) + R3(y[1, 0], y[1, 1], y[1, 2])
+        gf = wp.cross(gm, e) - R3(y[2, 0], y[2, 1], y[2, 2])
+        g = gr + g_moved
+        add_to(adj.x_flat, adj.xp_flat, ia, lane, g * nu - across - ge, g_moved * (-nu))
+        add_to(adj.x_flat, adj.xp_flat, ib, lane, g * u + ge, g_moved * (-u))
+        add_to(adj.x_flat, adj.xp_flat, ic, lane, across - g * nv - gf, g_moved * nv)
+        add_to(adj.x_flat, adj.xp_flat, id, lane, gf - g * v, g_moved * v)
+
+    return SimpleNamespace(record_edges=record_edges, sweep_edge=sweep_edge)

@@ -1,0 +1,207 @@
+"""Particles on the table (the plane z = 0), and the velocity update that ends a substep."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ..lanes.algebra import add, any_less, div, dot, less, mul, root, select, sub  # noqa: F401
+from ..lanes.structures import structures
+from ..lanes.tape import Kind
+from ..springs.internal_friction import internal_friction_adjoint
+from .friction import friction, friction_adjoint
+
+__all__ = ["table_contact", "table_contact_adjoint"]
+
+
+@functools.cache
+def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`predict` begins a substep for a particle, `finish` ends it.
+
+    `finish` pushes the particle out of the table, applies Coulomb friction to its horizontal step,
+    and derives the velocity. It returns the squared length of the whole step [m^2] before clamping.
+
+    `stepped` is the whole step: the predicted one and what constraints have changed since. It is
+    not taken as the difference of two positions, which far from the origin is as coarse as they
+    are: the predicted position is rounded the same way twice, so what nothing touched keeps its
+    velocity.
+    """
+    t = structures(scalar, lanes)
+    S, V, V3, Particles = t.S, t.V, t.V3, t.Particles
+    coulomb = friction(scalar, lanes).coulomb
+
+    @wp.func
+    def predict(i: int, share: V, fall: V3, q: Particles):
+        x = q.x[i]
+        q.xp[i] = x
+        q.x[i] = x + (q.v[i] + fall) * select(q.w[i], share, V(S(0.0)))
+
+    @wp.func
+    def finish(
+        i: int, radius: S, inverse_dt: S, share: V, fall: V3, mu: V, fastest: V, all_on: bool,
+        on: V, q: Particles,
+    ):  # fmt: skip
+        x = q.x[i]
+        o = q.xp[i]
+        zero = V(S(0.0))
+        # as `stepped` says, and written out, for what is no longer inlined costs half as much again
+        d = (q.v[i] + fall) * select(q.w[i], share, zero)
+        d = d + (x - (o + d))
+        if any_less(x.z, radius):
+            depth = select(q.w[i], wp.max(V(radius) - x.z, zero), zero)
+            f = coulomb(d.x * d.x + d.y * d.y, depth * mu)
+            back = V3(zero - d.x * f, zero - d.y * f, depth)
+            x = x + back
+            d = d + back
+        moved2 = dot(d, d)
+        v = d * inverse_dt
+        # divide only where the clamp may act; fastest [m] is the longest step allowed
+        if any_less(fastest * fastest - moved2, S(0.0)):
+            v = v * wp.min(V(S(1.0)), fastest / wp.max(root(moved2), V(S(1.0e-12))))
+        if not all_on:
+            u = q.v[i]
+            x = V3(select(on, x.x, o.x), select(on, x.y, o.y), select(on, x.z, o.z))
+            v = V3(select(on, v.x, u.x), select(on, v.y, u.y), select(on, v.z, u.z))
+            moved2 = moved2 * on
+        q.x[i] = x
+        q.v[i] = v
+        return moved2
+
+    @wp.func
+    def stepped(x: V3, o: V3, w: V, v: V3, share: V, fall: V3):
+        """Step from o to x of a particle whose velocity was v before."""
+        d = (v + fall) * select(w, share, V(S(0.0)))
+        return d + (x - (o + d))
+
+    return SimpleNamespace(predict=predict, stepped=stepped, finish=finish)
+
+
+@functools.cache
+def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) -> SimpleNamespace:
+    """`record_finish` ends a substep and leaves a particle's step and height on the tape (with
+    fabrics: its position, that at the start of the substep, and its old velocity).
+
+    `sweep_finish` takes that back, and with it the prediction of the next substep (`again`), whose
+    velocity it finds; with fabrics, dry friction and sleep. Returns the derivatives by friction and
+    by the share of velocity that air damping keeps. `sweep_predict` takes back a prediction alone.
+
+    Branches: above or on the table (its push acts on z only, friction across), the speed clamp, and
+    lanes that are frozen. Sticking is the smooth end of friction, no branch.
+    """
+    t = structures(scalar, lanes)
+    S, V, V3 = t.S, t.V, t.V3
+    Particles, Tape, Adjoint = t.Particles, t.Tape, t.Adjoint
+    finish, stepped = table_contact(scalar, lanes).finish, table_contact(scalar, lanes).stepped
+    coulomb_slopes = friction_adjoint(scalar, lanes).coulomb_slopes
+    sweep_calm = internal_friction_adjoint(scalar, lanes).sweep_calm
+
+    @wp.func
+    def record_finish(
+        i: int, at: int, at_height: int, radius: S, inverse_dt: S, share: V, fall: V3, mu: V,
+        fastest: V, all_on: bool, on: V, q: Particles, tape: Tape,
+    ):  # fmt: skip
+        if wp.static(with_sheets):
+            tape.x[at] = q.x[i]
+            tape.x[at + 1] = q.xp[i]
+            tape.x[at + 2] = q.v[i]
+        else:
+            x = q.x[i]
+            tape.x[at] = stepped(x, q.xp[i], q.w[i], q.v[i], share, fall)
+            tape.v[at_height] = x.z
+        return finish(i, radius, inverse_dt, share, fall, mu, fastest, all_on, on, q)
+
+    @wp.func
+    def sweep_finish(
+        i: int, d: V3, z: V, radius: S, inverse_dt: S, mu: V, fastest: V, on: V, all_on: bool,
+        again: bool, dt: S, kept: V, fall: V3, dry: S, sleep: V, counts: int, adj: Adjoint,
+    ):  # fmt: skip
+        zero = V(S(0.0))
+        one = V(S(1.0))
+        w = adj.w[i]
+        g = adj.x[i]
+        gv = adj.v[i]
+        go = adj.xp[i]
+        # the step as it ended
+        touches = any_less(z, radius)
+        depth = zero
+        share = zero
+        by_budget = zero
+        by_d2 = zero
+        e = d
+        if touches:
+            depth = select(w, wp.max(V(radius) - z, zero), zero)
+            share, by_budget, by_d2 = coulomb_slopes(d.x * d.x + d.y * d.y, depth * mu)
+            e = V3(d.x - d.x * share, d.y - d.y * share, d.z + depth)
+        moved2 = dot(e, e)
+        slower = one
+        bent = zero
+        if any_less(fastest * fastest - moved2, S(0.0)):
+            l = wp.max(root(moved2), V(S(1.0e-12)))
+            slower = wp.min(one, fastest / l)
+            over = less(fastest, l)
+            bent = over * slower / (l * l)
+            kind = counts + wp.static(int(Kind.SPEED_CLAMP))
+            adj.fired[kind] = adj.fired[kind] + over * on
+        by_kept = zero
+        if wp.static(not with_sheets):
+            if again:
+                free = select(w, V(dt), zero)
+                by_kept = dot(g, e * (slower * inverse_dt) + fall) * free
+                gv = gv + g * (kept * free)
+                g = g + go
+                go = V3(zero, zero, zero)
+        # what is frozen ends where it began
+        frozen = V3(zero, zero, zero)
+        if not all_on:
+            frozen = gv * (one - on)
+            gv = gv * on
+            back = g * (one - on)
+            g = g * on
+            go = go + back
+        adj.v[i] = frozen
+        if wp.static(with_sheets):
+            if dry > S(0.0) or any_less(zero - sleep, S(0.0)):
+                adj.x[i] = g
+                adj.xp[i] = go
+                gv = sweep_calm(i, e * (slower * inverse_dt), gv, dry, sleep, on, counts, adj)
+                g = adj.x[i]
+                go = adj.xp[i]
+        gd = gv * inverse_dt
+        gd = gd * slower - e * (bent * dot(gd, e))
+        g = g + gd
+        go = go - gd
+        by_mu = zero
+        if touches:
+            down = less(zero, depth)
+            kind = counts + wp.static(int(Kind.TABLE))
+            adj.fired[kind] = adj.fired[kind] + down * on
+            kind = counts + wp.static(int(Kind.TABLE_SLIP))
+            adj.fired[kind] = adj.fired[kind] + less(share, V(S(0.5))) * down * on
+            g_share = zero - d.x * g.x - d.y * g.y
+            g_budget = g_share * by_budget
+            turn = g_share * by_d2 * S(2.0)
+            gx = d.x * turn - g.x * share
+            gy = d.y * turn - g.y * share
+            gz = down * (g.z + g_budget * mu)
+            by_mu = g_budget * depth
+            g = V3(g.x + gx, g.y + gy, g.z - gz)
+            go = V3(go.x - gx, go.y - gy, go.z)
+        adj.x[i] = g
+        adj.xp[i] = go
+        return by_mu, by_kept
+
+    @wp.func
+    def sweep_predict(i: int, v: V3, dt: S, kept: V, fall: V3, adj: Adjoint):
+        g = adj.x[i]
+        zero = V(S(0.0))
+        free = select(adj.w[i], V(dt), zero)
+        adj.v[i] = adj.v[i] + g * (kept * free)
+        adj.x[i] = g + adj.xp[i]
+        adj.xp[i] = V3(zero, zero, zero)
+        return dot(g, v + fall) * free
+
+    return SimpleNamespace(
+        record_finish=record_finish, sweep_finish=sweep_finish, sweep_predict=sweep_predict,
+        stepped=stepped,
+    )  # fmt: skip

@@ -1,0 +1,116 @@
+"""Contact and friction between particles and triangles: fabric on itself, on fabric, on beads.
+
+Sources: Bridson, Fedkiw, Anderson, "Robust Treatment of Collisions, Contact and Friction for Cloth
+Animation", 2002 (a layer has a thickness and two sides); Macklin et al., "XPBD", 2016.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ..lanes.lane_access import lane_access
+from ..lanes.structures import structures
+from .closest_point import closest_point
+
+__all__ = ["ACTS", "CARRIES", "triangle_contact"]
+
+ACTS = 1
+CARRIES = 2
+
+
+@functools.cache
+def triangle_contact(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`project_triangles(...)`: solve the listed pairs of one lane, in the order of the list.
+
+    A particle stays on the side of a triangle on which it was listed. The normal is the triangle's
+    where the nearest point is inside, else from the nearest point to the particle. As between
+    particles, a correction separates at `recovery` at most, counting what already separates, so an
+    overlap that takes many substeps to undo does not gather speed.
+
+    Returns whether the particle `held` (local number, or -1) touched a triangle below it.
+    """
+    t = structures(scalar, lanes)
+    S, R3, L = t.S, t.R3, t.L
+    Sheets, Cells = t.Sheets, t.Cells
+    access = lane_access(scalar, lanes)
+    get, put, get_mass = access.get, access.put, access.get_mass
+    barycentric = closest_point(scalar, lanes).barycentric
+
+    @wp.func
+    def project_triangle(
+        k: int, lane: int, p0: int, held: int, mu: S, push: S, sheets: Sheets, cells: Cells
+    ):
+        """One pair; returns the sum of ACTS where it moved and CARRIES where `held` lies on it."""
+        result = int(0)
+        face = cells.face[k]
+        tri = sheets.triangle[face]
+        signed = cells.gap[k]
+        i = p0 + cells.particle[k]
+        ia = p0 + tri[0]
+        ib = p0 + tri[1]
+        ic = p0 + tri[2]
+        p = get(cells.x, i, lane)
+        a = get(cells.x, ia, lane)
+        b = get(cells.x, ib, lane)
+        c = get(cells.x, ic, lane)
+        h = wp.abs(signed)
+        m = wp.cross(b - a, c - a) * wp.sign(signed)
+        m2 = wp.dot(m, m)
+        above = wp.dot(p - a, m)
+        # most listed pairs are farther from the triangle's plane than they touch
+        if above <= S(0.0) or above * above < h * h * m2:
+            u = barycentric(p, a, b, c)
+            d = p - (a * u[0] + b * u[1] + c * u[2])
+            n = R3()
+            depth = S(0.0)
+            if wp.min(u[0], wp.min(u[1], u[2])) > S(1.0e-6):
+                n = m / wp.max(wp.sqrt(m2), S(1.0e-20))
+                depth = h - wp.dot(d, n)
+            else:
+                l = wp.length(d)
+                if l < h and l > S(1.0e-8) and wp.dot(d, m) > S(0.0):
+                    n = d / l
+                    depth = h - l
+            if depth > S(0.0):
+                # what hangs beside it does not carry it
+                if cells.particle[k] == held and n[2] > S(0.5):
+                    result = wp.static(CARRIES)
+                wi = get_mass(cells.w, i, lane)
+                wa = get_mass(cells.w, ia, lane) * u[0]
+                wb = get_mass(cells.w, ib, lane) * u[1]
+                wc = get_mass(cells.w, ic, lane) * u[2]
+                w = wi + wa * u[0] + wb * u[1] + wc * u[2]
+                moved = p - get(cells.xp, i, lane)
+                moved -= (a - get(cells.xp, ia, lane)) * u[0]
+                moved -= (b - get(cells.xp, ib, lane)) * u[1]
+                moved -= (c - get(cells.xp, ic, lane)) * u[2]
+                approach = wp.dot(moved, n)
+                depth = wp.min(depth, wp.max(push - approach, S(0.0)))
+                if depth > S(0.0) and w > S(0.0):
+                    slip = moved - n * approach
+                    budget = depth * mu * sheets.friction[face]
+                    share = budget / wp.max(
+                        wp.sqrt(wp.dot(slip, slip) + budget * budget), S(1.0e-12)
+                    )
+                    step = (n * depth - slip * share) / w
+                    put(cells.x, i, lane, p + step * wi)
+                    put(cells.x, ia, lane, a - step * wa)
+                    put(cells.x, ib, lane, b - step * wb)
+                    put(cells.x, ic, lane, c - step * wc)
+                    result += wp.static(ACTS)
+        return result
+
+    @wp.func
+    def project_triangles(
+        g: int, lane: int, p0: int, held: int, mu: S, push: S, sheets: Sheets, cells: Cells
+    ):
+        hit = bool(False)
+        start = cells.list_start[g] + lane * cells.capacity[g]
+        for k in range(start, start + cells.count[g * wp.static(L) + lane]):
+            result = project_triangle(k, lane, p0, held, mu, push, sheets, cells)
+            hit = hit or result >= wp.static(CARRIES)
+        return hit
+
+    return SimpleNamespace(project_triangles=project_triangles, project_triangle=project_triangle)

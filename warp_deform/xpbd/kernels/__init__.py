@@ -1,0 +1,1 @@
+"""The forward and the backward kernel, put together from contacts, bodies and springs."""

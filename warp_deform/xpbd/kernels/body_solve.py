@@ -1,0 +1,108 @@
+"""Contacts of a world's rigid bodies: with particles, triangles, each other and the table."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ..bodies.body_contact import body_contact
+from ..bodies.body_pairs import body_pairs
+from ..bodies.box_particle import box_particle
+from ..bodies.box_particle_adjoint import box_particle_adjoint
+from ..bodies.box_triangle import box_triangle
+from ..bodies.box_triangle_adjoint import box_triangle_adjoint
+from ..bodies.rigid_body_adjoint import rigid_adjoint
+from ..lanes.structures import structures
+from ..lanes.tape import BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS
+
+__all__ = ["body_solve"]
+
+
+@functools.cache
+def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) -> SimpleNamespace:
+    """`solve_bodies(g, lane, k, ...)`: the contacts of the bodies of one lane, in a fixed order.
+
+    `taped`, each that acts with a particle or a triangle leaves what its adjoint needs on the tape
+    from `tops` on, and bodies their poses before contacts with each other. Returns the tops after
+    that.
+    """
+    t = structures(scalar, lanes)
+    S, R3 = t.S, t.R3
+    Topology, Shapes, Group, Particles = t.Topology, t.Shapes, t.Group, t.Particles
+    Bodies, Contacts, Sheets, Cells = t.Bodies, t.Contacts, t.Sheets, t.Cells
+    Tape = t.Tape
+    project_box_particle = box_particle(scalar, lanes).project_box_particle
+    project_box_triangles = box_triangle(scalar, lanes).project_box_triangles
+    list_pairs = body_pairs(scalar, lanes).list_pairs
+    record_box_particle = box_particle_adjoint(scalar, lanes).record_box_particle
+    record_box_triangles = box_triangle_adjoint(scalar, lanes).record_box_triangles
+    push_pose = rigid_adjoint(scalar, lanes).push_pose
+    bodies_ = body_contact(scalar, lanes)
+    solve_contacts, end_body = bodies_.solve_contacts, bodies_.end_body
+
+    @wp.func
+    def solve_bodies(
+        g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
+        tops: wp.vec4i, q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets,
+        cells: Cells, tape: Tape,
+    ):  # fmt: skip
+        """Contacts of one lane's bodies with particles, each other and the table."""
+        p0 = group.particle_start[g]
+        count = top.body_count[k]
+        b0 = group.body_start[g] + lane * count
+        first = group.shape_start[g] + lane * top.shape_count[k]
+        last = first + top.shape_count[k]
+        mv = group.contact_friction[g]
+        mu = mv[lane]
+        radii = top.particle_start[k]
+        mark = int(tops[2])
+        for shape in range(first, last):
+            b = b0 + shapes.body[shape]
+            far = wp.length(shapes.half[shape])
+            center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
+            thickest = S(0.0)
+            for i in range(top.particle_count[k]):
+                radius = top.radius[radii + i]
+                thickest = wp.max(thickest, radius)
+                x = q.x[p0 + i]
+                d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
+                if wp.dot(d, d) < (far + radius) * (far + radius):
+                    if wp.static(taped):
+                        if record_box_particle(
+                            tops[3], p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies,
+                            tape,
+                        ):  # fmt: skip
+                            tape.k[tops[2]] = i
+                            tape.k[tops[2] + 1] = shape - first
+                            tops[2] += wp.static(BODY_WORDS)
+                            tops[3] += wp.static(BOX_PARTICLE_SCALARS)
+                    else:
+                        project_box_particle(
+                            p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
+                        )
+            if wp.static(with_sheets and taped):
+                found = record_box_triangles(
+                    tops[2], tops[3], lane, k, p0, radii, shape, shape - first, b, far + thickest,
+                    mu, push, top, shapes, bodies, sheets, cells, tape,
+                )  # fmt: skip
+                tops[2] += wp.static(BODY_WORDS) * found
+                tops[3] += wp.static(BOX_TRIANGLE_SCALARS) * found
+            elif wp.static(with_sheets):
+                project_box_triangles(
+                    lane, k, p0, radii, shape, b, far + thickest, mu, push, top, shapes, bodies,
+                    sheets, cells,
+                )  # fmt: skip
+        if wp.static(taped):
+            tape.k[tops[2]] = (tops[2] - mark) // wp.static(BODY_WORDS)
+            tops[2] += 1
+            for b in range(b0, b0 + count):
+                push_pose(tops[3], bodies.x[b], bodies.q[b], tape)
+                tops[3] += 7
+        end = list_pairs(g, lane, k, push, top, shapes, group, bodies, contacts)
+        solve_contacts(group.contact_start[g], end, bodies, contacts)
+        for b in range(b0, b0 + count):
+            end_body(b, bodies)
+        return tops
+
+    return SimpleNamespace(solve_bodies=solve_bodies)

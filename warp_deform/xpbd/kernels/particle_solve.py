@@ -1,0 +1,159 @@
+"""The constraints between particles, in the order of a substep: springs, tethers, contacts."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ...objects.attributes import SpringMode
+from ..contact.edge_contact import edge_contact
+from ..contact.edge_contact_adjoint import edge_contact_adjoint
+from ..contact.sphere_contact import sphere_contact, sphere_contact_adjoint
+from ..contact.triangle_contact import triangle_contact
+from ..contact.triangle_contact_adjoint import triangle_contact_adjoint
+from ..lanes.algebra import any_less, sub  # noqa: F401  (operators are found by name)
+from ..lanes.structures import structures
+from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS
+from ..springs.bending import bending, bending_adjoint
+from ..springs.distance import distance, distance_adjoint
+from ..springs.tether import tether, tether_adjoint
+
+__all__ = ["particle_solve"]
+
+
+@functools.cache
+def particle_solve(
+    scalar: Any, lanes: int, with_sheets: bool, with_edges: bool, taped: bool
+) -> SimpleNamespace:
+    """`solve_particles(g, ...)`: the constraints of a group once; `taped`, each leaves what its
+    adjoint needs on the tape from `tops` on. Returns the tops after that.
+    """
+    t = structures(scalar, lanes)
+    S, V, L = t.S, t.V, t.L
+    project_distance = distance(scalar, lanes, with_sheets).project_distance
+    record_distance = distance_adjoint(scalar, lanes, with_sheets).record_distance
+    project_bend = bending(scalar, lanes).project_bend
+    record_bend = bending_adjoint(scalar, lanes).record_bend
+    project_contact = sphere_contact(scalar, lanes).project_contact
+    record_contact = sphere_contact_adjoint(scalar, lanes).record_contact
+    project_tether = tether(scalar, lanes).project_tether
+    record_tether = tether_adjoint(scalar, lanes).record_tether
+    project_triangles = triangle_contact(scalar, lanes).project_triangles
+    record_triangles = triangle_contact_adjoint(scalar, lanes).record_triangles
+    project_edges = edge_contact(scalar, lanes).project_edges
+    record_edges = edge_contact_adjoint(scalar, lanes).record_edges
+    Particles, Springs, Pairs, Near = t.Particles, t.Springs, t.Pairs, t.Near
+    Grips, Sheets, Cells, Tape = t.Grips, t.Sheets, t.Cells, t.Tape
+
+    @wp.func
+    def solve_particles(
+        g: int, n: int, p0: int, s0: int, s1: int, near_start: int, near_count: int,
+        triangles: int, inverse_dt2: V, contact_mu: V, push: S, holding: V, on: V, tops: wp.vec4i,
+        q: Particles, springs: Springs, pairs: Pairs, near: Near, grips: Grips, sheets: Sheets,
+        cells: Cells, tape: Tape,
+    ):  # fmt: skip
+        zero = V(S(0.0))
+        w0 = g * wp.static(L)
+        tx = int(tops[0])
+        tv = int(tops[1])
+        tk = int(tops[2])
+        ts = int(tops[3])
+        mark = int(tk)
+        # always in the same order: sweeping backwards in every other substep makes tight heaps
+        # crawl for ever, and shells jitter
+        for s in range(s0, s1):
+            if wp.static(taped):
+                if springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                    record_bend(s, p0, tx, inverse_dt2, q, springs, tape)
+                    tx += 1
+                else:
+                    acted = record_distance(s, p0, tx, inverse_dt2, q, springs, tape)
+                    if acted:
+                        tx += 1
+                        if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
+                            tape.k[tk] = s
+                            tk += 1
+            elif springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                project_bend(s, p0, inverse_dt2, q, springs)
+            else:
+                project_distance(s, p0, inverse_dt2, q, springs)
+        if wp.static(taped):
+            tape.k[tk] = tk - mark
+            tk += 1
+        if wp.static(with_sheets):
+            if any_less(zero - holding, S(0.0)):
+                held = q.x[p0]
+                for lane in range(wp.static(L)):
+                    i = grips.particle[w0 + lane]
+                    if i >= 0:
+                        x = q.x[p0 + i]
+                        held.x[lane] = x.x[lane]
+                        held.y[lane] = x.y[lane]
+                        held.z[lane] = x.z[lane]
+                if wp.static(taped):
+                    mark = int(tk)
+                for i in range(n):
+                    if wp.static(taped):
+                        if record_tether(p0 + i, tx, holding, held, q, tape):
+                            tape.k[tk] = i
+                            tx += 1
+                            tk += 1
+                    else:
+                        project_tether(p0 + i, holding, held, q)
+                if wp.static(taped):
+                    tape.k[tk] = tk - mark
+                    tk += 1
+                    for lane in range(wp.static(L)):
+                        tape.k[tk] = grips.particle[w0 + lane]
+                        tk += 1
+        if wp.static(taped):
+            mark = int(tk)
+        for c in range(near_start, near_start + near_count):
+            if wp.static(taped):
+                if record_contact(
+                    c, p0, tx, tv, contact_mu, push, q, pairs, near, tape
+                ):  # fmt: skip
+                    tape.k[tk] = near.pair[c]
+                    tx += 2
+                    tv += 1
+                    tk += 1
+            else:
+                project_contact(c, p0, contact_mu, push, q, pairs, near)
+        if wp.static(taped):
+            tape.k[tk] = tk - mark
+            tk += 1
+        if wp.static(with_sheets):
+            if triangles > 0:
+                for lane in range(wp.static(L)):
+                    if on[lane] > S(0.0):
+                        if wp.static(taped):
+                            found = record_triangles(
+                                g, lane, p0, grips.particle[w0 + lane], tk, ts,
+                                contact_mu[lane], push, sheets, cells, tape,
+                            )  # fmt: skip
+                            cells.met[w0 + lane] = found % 2
+                            found = found // 2
+                            tk += wp.static(TRIANGLE_WORDS) * found
+                            ts += wp.static(TRIANGLE_SCALARS) * found
+                            tape.k[tk] = found
+                            tk += 1
+                            if wp.static(with_edges):
+                                found = record_edges(
+                                    g, lane, p0, tk, ts, push, sheets, cells, tape
+                                )  # fmt: skip
+                                tk += wp.static(TRIANGLE_WORDS) * found
+                                ts += wp.static(TRIANGLE_SCALARS) * found
+                                tape.k[tk] = found
+                                tk += 1
+                        else:
+                            hit = project_triangles(
+                                g, lane, p0, grips.particle[w0 + lane], contact_mu[lane],
+                                push, sheets, cells,
+                            )  # fmt: skip
+                            cells.met[w0 + lane] = wp.where(hit, 1, 0)
+                            if wp.static(with_edges):
+                                project_edges(g, lane, p0, push, sheets, cells)
+        return wp.vec4i(tx, tv, tk, ts)
+
+    return SimpleNamespace(solve_particles=solve_particles)

@@ -1,0 +1,350 @@
+"""The arrays that the fused kernel works on, bundled so that a launch takes a handful of arguments.
+
+Worlds with the same topology share one thread in groups of L. Arrays of V or V3 are indexed by
+group, arrays of scalars by world (``group * L + lane``; the last group is padded with worlds that
+never run). Indices inside a topology are local to its world.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from .algebra import lane_types
+
+__all__ = ["structures"]
+
+
+@functools.cache
+def structures(scalar: Any, lanes: int) -> SimpleNamespace:
+    """Struct types for one precision and width."""
+    t = lane_types(scalar, lanes)
+    S, V, V3, R3, Q, M33 = t.S, t.V, t.V3, t.R3, t.Q, t.M33
+    V4 = wp.types.vector(4, S)
+
+    @wp.struct
+    class Settings:
+        """What is the same for every world of a launch."""
+
+        dt: S  # [s]
+        max_steps: int  # substeps of this launch at most
+        recovery: S  # fastest separation of overlapping bodies [m/s]
+        max_speed: S  # clamp [m/s]
+        calm_speed: S  # clamp while a world is calmed [m/s]
+        margin: S  # pairs this much farther apart than touching are still listed [m]
+        rest_speed: S  # slower than this is at rest [m/s]
+        viscous: S  # share of their relative velocity that ends of a spring lose in a substep
+        dry: S  # speed that a particle of a fabric loses in a substep [m/s]
+        sleep: S  # slower particles of a fabric stay where they are [m/s]
+        sleep_ramp: S  # `sleep` grows by this factor from 1 s to 2 s after a release
+        rest_steps: S  # so many substeps at rest end a world's launch
+        check_every: int  # substeps between looks of the guards
+        record_every: int  # substeps between recorded frames; 0: record nothing
+        particle_stride: int  # particles of all groups: length of one recorded frame
+        body_stride: int  # bodies of all worlds: length of one recorded frame
+
+    # Small structs: a function that is not inlined copies those that it takes.
+    @wp.struct
+    class Topology:
+        """Where each topology's slice of the lists starts; (topologies,) or (topologies + 1,)."""
+
+        particle_count: wp.array(dtype=int)
+        particle_start: wp.array(dtype=int)  # in `Topology.radius`
+        radius: wp.array(dtype=S)  # of particles [m]
+        body_count: wp.array(dtype=int)
+        spring_start: wp.array(dtype=int)
+        pair_start: wp.array(dtype=int)
+        shape_count: wp.array(dtype=int)
+
+    @wp.struct
+    class Springs:
+        """Distance and bending constraints between particles, numbered inside their world."""
+
+        ij: wp.array(dtype=wp.vec2i)
+        length: wp.array(dtype=S)  # [m]
+        compliance: wp.array(dtype=S)  # [m/N]
+        limit: wp.array(dtype=S)  # longest allowed length [m]; 0: none
+        floor: wp.array(dtype=S)  # shortest allowed length [m]; 0: none
+        mode: wp.array(dtype=int)
+        watched: wp.array(dtype=int)  # 1: the stretch guard looks at it
+        middle: wp.array(dtype=int)  # of a bending spring: the particle between the two
+
+    @wp.struct
+    class Pairs:
+        """Particles of one world that may touch."""
+
+        ij: wp.array(dtype=wp.vec2i)
+        distance: wp.array(dtype=S)  # sum of their radii [m]
+
+    @wp.struct
+    class Shapes:
+        """Boxes of every world, by shape_start + lane * shape_count, with their body's number."""
+
+        body: wp.array(dtype=int)
+        center: wp.array(dtype=R3)  # in the frame of the body's centre of mass [m]
+        rotation: wp.array(dtype=Q)
+        half: wp.array(dtype=R3)  # half extents [m]
+        friction: wp.array(dtype=S)
+
+    @wp.struct
+    class Group:
+        """Per group: where its data start, and the parameters that may differ between worlds."""
+
+        topology: wp.array(dtype=int)
+        particle_start: wp.array(dtype=int)
+        body_start: wp.array(dtype=int)
+        near_start: wp.array(dtype=int)
+        near_capacity: wp.array(dtype=int)
+        contact_start: wp.array(dtype=int)
+        shape_start: wp.array(dtype=int)
+        active: wp.array(dtype=V)  # 1: simulate this world, 0: leave it alone
+        gravity: wp.array(dtype=V3)  # [m/s^2]
+        damping: wp.array(dtype=V)  # [1/s]
+        table_friction: wp.array(dtype=V)
+        contact_friction: wp.array(dtype=V)
+        stiffness: wp.array(dtype=V)  # factor on every spring's stiffness
+        calm_steps: wp.array(dtype=V)  # substeps to begin with that are clamped to calm_speed
+        calm_after: wp.array(dtype=V)  # and again so many after a release
+        least_steps: wp.array(dtype=V)  # a world runs at least this long after its grip path
+        most_steps: wp.array(dtype=V)  # and in all at most this long
+
+    @wp.struct
+    class Particles:
+        """State of all particles in lanes."""
+
+        x: wp.array(dtype=V3)  # position [m]
+        v: wp.array(dtype=V3)  # velocity [m/s]
+        xp: wp.array(dtype=V3)  # position at the start of the substep
+        xr: wp.array(dtype=V3)  # position when the contact list was last made
+        w: wp.array(dtype=V)  # inverse mass [1/kg], 0 while gripped
+        w0: wp.array(dtype=V)  # inverse mass when free
+        tether: wp.array(dtype=V)  # farthest from what is held [m], see `tether`
+
+    @wp.struct
+    class Near:
+        """Pairs close enough to touch soon, per group, in the order of the topology's pairs."""
+
+        pair: wp.array(dtype=int)
+        mask: wp.array(dtype=V)  # 1 where the pair is listed for the lane's own sake
+
+    @wp.struct
+    class Sheets:
+        """Triangles of fabrics, numbered inside their world, and their particles at rest.
+
+        Per topology: first (topologies + 1,), grid, cell, widest. Per particle as
+        `Topology.radius`: skin, rest, owner, edge_gap, exempt_first (particles + 1,).
+        """
+
+        first: wp.array(dtype=int)
+        grid: wp.array(dtype=int)  # cells of the list along a side
+        cell: wp.array(dtype=S)  # least side of a cell [m]
+        widest: wp.array(dtype=S)  # largest skin [m]
+        triangle: wp.array(dtype=wp.vec3i)
+        friction: wp.array(dtype=S)  # of a triangle, factor on the contact friction
+        skin: wp.array(dtype=S)  # a particle's share of the distance at which things touch [m]
+        rest: wp.array(dtype=R3)  # [m]
+        owner: wp.array(dtype=int)  # number of the object
+        exempt_first: wp.array(dtype=int)  # where the particle's own slice of `exempt` starts
+        exempt: wp.array(dtype=int)  # particles that never touch triangles with this corner
+        edge_first: wp.array(dtype=int)  # per topology, as `first`
+        edge: wp.array(dtype=wp.vec2i)
+        edge_gap: wp.array(dtype=S)  # per particle: distance at which its edges touch others [m]
+        edge_widest: wp.array(dtype=S)  # per topology: largest edge_gap [m]
+
+    @wp.struct
+    class Cells:
+        """Particles near triangles, per group and lane, and the cells that find them.
+
+        A lane's own slice of `key`, `place`, ... begins at particle_start * L + lane * particles;
+        that of edges at link_start + lane * edges.
+        """
+
+        head_start: wp.array(dtype=int)
+        list_start: wp.array(dtype=int)
+        capacity: wp.array(dtype=int)  # pairs of one lane at most
+        head: wp.array(dtype=int)  # where each cell starts
+        count: wp.array(dtype=int)  # pairs, by group * L + lane
+        particle: wp.array(dtype=int)
+        face: wp.array(dtype=int)
+        gap: wp.array(dtype=S)  # distance at which they touch, negative below the triangle [m]
+        link_start: wp.array(dtype=int)
+        edge_moved: wp.array(dtype=int)  # as `moved`
+        edge_key: wp.array(dtype=int)
+        edge_sorted: wp.array(dtype=V4)
+        edge_count: wp.array(dtype=int)  # pairs of edges, as `count`
+        edge_a: wp.array(dtype=int)
+        edge_b: wp.array(dtype=int)
+        edge_ball: wp.array(dtype=V4)  # midpoint in `place`; half the length and the slack [m]
+        edge_gap: wp.array(dtype=S)  # as `gap`
+        met: wp.array(dtype=int)  # whether what the grip holds touched a triangle, as `count`
+        xr: wp.array(dtype=V3)  # positions to which the lists refer
+        slack: wp.array(dtype=V)  # a particle may go so far from there before it is listed anew [m]
+        place: wp.array(dtype=V4)  # both of these, lane by lane
+        moved: wp.array(dtype=int)  # 1: the particle's pairs are being listed anew
+        stamp: wp.array(dtype=int)  # 1 + number of the last triangle it was found exempt from
+        key: wp.array(dtype=int)  # particles by cell (see `cell_sort`)
+        sorted: wp.array(dtype=V4)
+        # the same memory as arrays of V3 and V, scalar by scalar (see `lane_access`)
+        xr_flat: wp.array(dtype=S)
+        slack_flat: wp.array(dtype=S)
+        x: wp.array(dtype=S)
+        xp: wp.array(dtype=S)
+        w: wp.array(dtype=S)
+
+    @wp.struct
+    class Bodies:
+        """State of all rigid bodies, by body_start + lane * body_count + local number."""
+
+        x: wp.array(dtype=R3)  # centre of mass [m]
+        q: wp.array(dtype=Q)
+        v: wp.array(dtype=R3)  # [m/s]
+        omega: wp.array(dtype=R3)  # [rad/s]
+        xp: wp.array(dtype=R3)
+        qp: wp.array(dtype=Q)
+        w: wp.array(dtype=S)  # inverse mass [1/kg], 0 while gripped
+        w0: wp.array(dtype=S)
+        inertia: wp.array(dtype=M33)  # in the body's frame [kg m^2]
+        inverse_inertia: wp.array(dtype=M33)
+        touching: wp.array(dtype=int)  # contacts with particles and bodies in the last substep
+        support: wp.array(dtype=int)  # the same and those with the table
+        dx: wp.array(dtype=R3)  # correction by contacts in this substep [m]
+        dr: wp.array(dtype=R3)  # the same as a rotation vector [rad]
+        spread: wp.array(dtype=M33)  # inverse inertia in the world's frame [1/(kg m^2)]
+
+    @wp.struct
+    class Contacts:
+        """Scratch per group, for one lane at a time: where bodies touch things and the table."""
+
+        a: wp.array(dtype=int)  # body row, -1: the table
+        b: wp.array(dtype=int)
+        ra: wp.array(dtype=R3)  # arms from the centres of mass [m]
+        rb: wp.array(dtype=R3)
+        normal: wp.array(dtype=R3)  # from a to b
+        u: wp.array(dtype=R3)  # across it
+        v: wp.array(dtype=R3)
+        weights: wp.array(dtype=R3)  # inverse masses along normal, u and v [1/kg]
+        steps: wp.array(dtype=R3)  # gap, with the overlap that may remain, and slip along u, v [m]
+        impulse: wp.array(dtype=R3)  # along normal, u and v [kg m]
+        mu: wp.array(dtype=S)
+        # only in the backward sweep
+        code: wp.array(dtype=wp.vec4i)  # shapes of a and b, which feature, how many share the load
+        log: wp.array(dtype=S)  # of every visit: impulse before, friction before its limit
+
+    @wp.struct
+    class Grips:
+        """One grip per world: what is held, and the path of the tip over simulated time."""
+
+        particle: wp.array(dtype=int)  # local number of the held particle or -1
+        body: wp.array(dtype=int)  # local number of the held body or -1
+        offset: wp.array(dtype=R3)  # of the held thing in the tip's frame [m]
+        turn: wp.array(dtype=Q)  # rotation of the held body in the tip's frame
+        tick: wp.array(dtype=int)  # substeps along the path
+        knot: wp.array(dtype=int)  # segment that the tip is on
+        knot_end: wp.array(dtype=int)  # number of the knot after the path's last
+        time: wp.array(dtype=S)  # of each knot [s], ascending per world
+        position: wp.array(dtype=R3)
+        rotation: wp.array(dtype=Q)
+        lower_start: wp.array(dtype=S)  # between these times contact ends the descent [s]
+        lower_end: wp.array(dtype=S)
+        shift: wp.array(dtype=R3)  # added to the path once contact has ended the descent
+        push: wp.array(dtype=int)  # local number of a perturbed particle or -1, PUSHES a slot
+        push_acceleration: wp.array(dtype=R3)  # [m/s^2]
+        push_steps: wp.array(dtype=int)
+
+    @wp.struct
+    class Watch:
+        """What the guards look at, the worst value of the launch per world, and what came out."""
+
+        steps: wp.array(dtype=V)  # substeps simulated
+        nonfinite: wp.array(dtype=V)  # 1 when a coordinate was not a number
+        stretch: wp.array(dtype=V)  # longest watched spring / its rest length
+        depth: wp.array(dtype=V)  # deepest a particle's centre was under the table [m]
+        box_depth: wp.array(dtype=V)  # the same of the lowest corner of a box [m]
+        box_overlap: wp.array(
+            dtype=V
+        )  # deepest that two boxes lay in each other, see `box_overlap`
+        clamped: wp.array(dtype=V)  # substeps in which the speed clamp acted
+        overflow: wp.array(dtype=V)  # pairs of the world that found no room in the list
+        frame_x: wp.array(dtype=V3)  # recorded particle positions
+        frame_body_x: wp.array(dtype=R3)
+        frame_body_q: wp.array(dtype=Q)
+
+    @wp.struct
+    class Tape:
+        """What a taped launch leaves for the backward sweep: four stacks per group (see `tape`)."""
+
+        resume: int  # 1: the launch continues a rollout where `state` and `counters` left it
+        last: int  # 1: the rollout ends with the launch
+        x: wp.array(dtype=V3)
+        v: wp.array(dtype=V)
+        k: wp.array(dtype=int)
+        s: wp.array(dtype=S)
+        # tops of the four stacks, in this order, by group
+        first: wp.array(dtype=wp.vec4i)
+        end: wp.array(dtype=wp.vec4i)  # of the room for them
+        top: wp.array(dtype=wp.vec4i)
+        steps: wp.array(dtype=int)  # substeps on the tape
+        until: wp.array(dtype=int)  # number of the substep after them
+        full: wp.array(dtype=int)  # 1: there was no room for another substep
+        state: wp.array(dtype=V)  # by group * STATE: what the kernel knows between launches
+        counters: wp.array(dtype=int)  # by group * COUNTERS: the same in whole numbers
+        x_flat: wp.array(dtype=S)  # `x` scalar by scalar (see `lane_access`)
+
+    @wp.struct
+    class Adjoint:
+        """Derivatives of the loss by what is named, while the sweep goes back through the tape."""
+
+        x: wp.array(dtype=V3)
+        v: wp.array(dtype=V3)
+        xp: wp.array(dtype=V3)  # by position at the start of the substep
+        w: wp.array(dtype=V)  # not a derivative: inverse masses as they were in the substep
+        mass: wp.array(dtype=V)  # by free inverse mass
+        damping: wp.array(dtype=V)  # by the share of velocity kept; per group, as those below
+        table_friction: wp.array(dtype=V)
+        contact_friction: wp.array(dtype=V)
+        stiffness: wp.array(dtype=V)  # by 1 / (stiffness dt^2)
+        time: wp.array(dtype=S)  # of each knot, as those below
+        position: wp.array(dtype=R3)
+        rotation: wp.array(dtype=Q)
+        shift: wp.array(dtype=R3)  # by group * L + lane
+        leave: int  # 1: the tape before takes back the prediction of this tape's first substep
+        pending: wp.array(dtype=int)  # 1: the tape after has left that to this one, by group
+        fired: wp.array(dtype=V)  # by group * KINDS: constraints that acted, by kind
+        # the same memory as arrays of V3 and V, scalar by scalar (see `lane_access`)
+        x_flat: wp.array(dtype=S)
+        xp_flat: wp.array(dtype=S)
+        w_flat: wp.array(dtype=S)
+        mass_flat: wp.array(dtype=S)
+
+    @wp.struct
+    class BodyAdjoint:
+        """Derivatives of the loss by the state of bodies, and scratch for those by contacts."""
+
+        x: wp.array(dtype=R3)
+        q: wp.array(dtype=Q)  # by its four numbers
+        v: wp.array(dtype=R3)
+        omega: wp.array(dtype=R3)
+        xp: wp.array(dtype=R3)
+        qp: wp.array(dtype=Q)
+        w: wp.array(dtype=S)  # by inverse mass, at the same inertia
+        dx: wp.array(dtype=R3)
+        dr: wp.array(dtype=R3)
+        spread: wp.array(dtype=M33)
+        # by contact, as `Contacts`
+        ra: wp.array(dtype=R3)
+        rb: wp.array(dtype=R3)
+        normal: wp.array(dtype=R3)
+        across_u: wp.array(dtype=R3)
+        across_v: wp.array(dtype=R3)
+        weights: wp.array(dtype=R3)
+        steps: wp.array(dtype=R3)
+        impulse: wp.array(dtype=R3)
+        mu: wp.array(dtype=S)
+
+    return SimpleNamespace(
+        **vars(t), V4=V4, Settings=Settings, Topology=Topology, Springs=Springs, Pairs=Pairs,
+        Shapes=Shapes, Group=Group, Particles=Particles, Near=Near, Bodies=Bodies, Grips=Grips,
+        Watch=Watch, Contacts=Contacts, Sheets=Sheets, Cells=Cells, Tape=Tape,
+        Adjoint=Adjoint, BodyAdjoint=BodyAdjoint,
+    )  # fmt: skip

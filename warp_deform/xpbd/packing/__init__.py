@@ -1,0 +1,1 @@
+"""A Newton model read into the arrays that the kernels work on, world by world in lanes."""

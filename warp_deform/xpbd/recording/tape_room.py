@@ -1,0 +1,171 @@
+"""How much tape the substeps of a rollout need, and tapes with room for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from ...errors import InputError
+from ..lanes.tape import (
+    BODY_SCALARS,
+    BODY_WORDS,
+    BOX_TRIANGLE_SCALARS,
+    COUNTERS,
+    GRIP_WORDS,
+    TRIANGLE_SCALARS,
+    TRIANGLE_WORDS,
+)
+
+if TYPE_CHECKING:
+    from ..packing.data import SolverData
+    from ..packing.mirrored import Mirrored
+
+__all__ = ["Stacks", "TapeRoom", "new_stacks"]
+
+MOST = 2**31 - 1
+"""Elements of one stack at most: whole numbers of 32 bits count them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stacks:
+    """The tape of one segment of a rollout: room (groups, 4) for elements of x, v, k and s."""
+
+    struct: Any
+    room: np.ndarray
+    arrays: dict[str, Any]
+    nbytes: int
+
+    def used(self) -> np.ndarray:
+        """Elements (groups, 4) that the last launch left on it."""
+        used: np.ndarray = self.arrays["top"].numpy() - self.arrays["first"].numpy()
+        return used
+
+    def full(self) -> np.ndarray:
+        """Which groups (groups,) had no room for another substep."""
+        full: np.ndarray = self.arrays["full"].numpy() > 0
+        return full
+
+
+def new_stacks(data: SolverData, control: dict[str, Mirrored], room: np.ndarray) -> Stacks:
+    """A tape with room (groups, 4) for so many elements."""
+    t, device = data.types, data.device
+    struct = t.Tape()
+    end = np.cumsum(room, axis=0)
+    arrays: dict[str, Any] = {}
+    for column, (name, dtype) in enumerate((("x", t.V3), ("v", t.V), ("k", wp.int32), ("s", t.S))):
+        arrays[name] = wp.empty(max(int(end[-1, column]), 1), dtype=dtype, device=device)
+    arrays["first"] = wp.array((end - room).astype(np.int32), dtype=wp.vec4i, device=device)
+    arrays["end"] = wp.array(end.astype(np.int32), dtype=wp.vec4i, device=device)
+    arrays["top"] = wp.zeros(data.group_count, dtype=wp.vec4i, device=device)
+    for name in ("steps", "until", "full"):
+        arrays[name] = wp.zeros(data.group_count, dtype=wp.int32, device=device)
+    for name, mirrored in control.items():
+        arrays[name] = mirrored.array
+    flat = wp.array(
+        ptr=arrays["x"].ptr, dtype=data.scalar,
+        shape=(arrays["x"].capacity // np.dtype(data.number).itemsize,), device=device,
+    )  # fmt: skip
+    for name, array in (*arrays.items(), ("x_flat", flat)):
+        setattr(struct, name, array)
+    return Stacks(struct, room, arrays, int((room @ _sizes(data)).sum()))
+
+
+class TapeRoom:
+    """Learns how much of the tape a substep takes, by what was taped and what is near.
+
+    Room is counted in elements (groups, 4). `use` is what a substep took, None before any was
+    taped; a tape has `spare` room on top, as the kernel begins no substep that might not fit. The
+    spare includes every box with every particle and triangle: once a tape, not once a substep, that
+    is less than a handful of substeps take.
+    """
+
+    def __init__(self, data: SolverData, control: dict[str, Mirrored]) -> None:
+        self._data, self._control = data, control
+        self.sizes = _sizes(data)
+        self.use: np.ndarray | None = None
+        self.spare = 2.0 * self._least() + self._solid()
+
+    def per_substep(self) -> float:
+        """Bytes that a substep takes of all stacks together."""
+        return float(((self._least() if self.use is None else self.use) * self.sizes).sum())
+
+    def room(self, length: int) -> np.ndarray:
+        """Room for `length` substeps."""
+        use = self._least() if self.use is None else 1.1 * self.use
+        room: np.ndarray = np.ceil(use * length + self.spare).astype(int)
+        return room
+
+    def check(self, room: np.ndarray, kept: int, memory: int) -> int:
+        """Bytes of a tape with the room and of what is `kept` beside it.
+
+        Raises:
+            InputError: that is more than `memory`, or more than can be counted.
+        """
+        nbytes = kept + int((room * self.sizes).sum())
+        if nbytes > memory or int(room.sum(axis=0).max()) > MOST:
+            raise InputError(
+                f"the tape would need {nbytes} bytes of {memory}: allow more memory, use "
+                'storage="replay", or record fewer worlds at once'
+            )
+        return nbytes
+
+    def learn(self, stacks: Stacks, steps: int) -> None:
+        """Take in how much `steps` substeps took."""
+        used = stacks.used() / steps
+        self.use = used if self.use is None else np.maximum(self.use, used)
+        self.grow()
+
+    def grow(self, *, double: bool = False) -> None:
+        """Spare room for the worst substep with the lists as they are."""
+        self.spare = np.maximum(self.spare, self._worst())
+        if double:
+            self.spare = 2 * self.spare
+
+    def _least(self) -> np.ndarray:
+        """What any substep needs; contacts come on top."""
+        data, rows = self._data, []
+        for k in data.group_topology:
+            top = data.topologies[k]
+            springs, particles = len(top.spring_ij), top.particle_count
+            words = springs + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
+            bodies = top.body_count * data.lanes
+            words += BODY_WORDS * bodies
+            rows.append((2 * springs + 4 * particles, particles + 8, words, BODY_SCALARS * bodies))
+        return np.array(rows)
+
+    def _solid(self) -> np.ndarray:
+        """What contacts of all boxes with all particles and triangles would need."""
+        data, rows = self._data, []
+        for k in data.group_topology:
+            top = data.topologies[k]
+            solid = len(top.shape_body) * (top.particle_count + len(top.sheet_triangle))
+            solid *= data.lanes
+            rows.append((0, 0, BODY_WORDS * solid, BOX_TRIANGLE_SCALARS * solid))
+        return np.array(rows)
+
+    def _worst(self) -> np.ndarray:
+        """What a substep needs at worst with the lists as they are."""
+        data = self._data
+        counters = self._control["counters"]
+        counters.to_host()
+        near = counters.view.reshape(-1, COUNTERS)[: data.group_count, 1]
+        listed = np.zeros(data.group_count)
+        if data.has_sheets:
+            for name in ("cells.count", "cells.edge_count"):
+                data.arrays[name].to_host()
+                counts = data.arrays[name].view[: data.group_count * data.lanes]
+                if len(counts) == data.group_count * data.lanes:
+                    listed += counts.reshape(-1, data.lanes).sum(axis=1)
+        words, scalars = near + TRIANGLE_WORDS * listed, TRIANGLE_SCALARS * listed
+        contacts = np.stack([2 * near, near, words, scalars], axis=1)
+        worst: np.ndarray = self._least() + self._solid() + 1.5 * contacts
+        return worst
+
+
+def _sizes(data: SolverData) -> np.ndarray:
+    """Bytes of an element of each stack (4,)."""
+    scalar = np.dtype(data.number).itemsize
+    return np.array([3 * data.lanes * scalar, data.lanes * scalar, 4, scalar])

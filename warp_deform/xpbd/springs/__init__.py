@@ -1,0 +1,1 @@
+"""Constraints within an object: links, bending, tethers, internal friction, with their adjoints."""
