@@ -55,8 +55,13 @@ def name(value: Any) -> str:
     """A value as conditions compare it: lower case, hyphens, no marks, commas and backticks."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
-    text = re.sub(r"[`*¹²³,]", "", json.dumps(value) if not isinstance(value, str) else value)
-    slug = re.sub(r"[\s_]+", "-", text.strip().lower())
+    return _slug(value if isinstance(value, str) else json.dumps(value))
+
+
+@cache
+def _slug(text: str) -> str:
+    bare = re.sub(r"[`*¹²³,]", "", text)
+    slug = re.sub(r"[\s_]+", "-", bare.strip().lower())
     return _PRINTED.get(slug, slug)
 
 
