@@ -12,7 +12,17 @@ from typing import Any
 
 import warp as wp
 
-from ..lanes.algebra import any_less, dot, less, root, select
+from ..lanes.algebra import (  # noqa: F401  (operators are found by name)
+    add,
+    any_less,
+    div,
+    dot,
+    less,
+    mul,
+    root,
+    select,
+    sub,
+)
 from ..lanes.structures import structures
 from ..lanes.tape import Kind
 from .friction import friction, friction_adjoint

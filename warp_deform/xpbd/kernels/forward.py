@@ -18,12 +18,18 @@ from ..contact.cell_list import cell_list
 from ..contact.edge_contact import edge_contact
 from ..contact.sphere_contact import sphere_contact
 from ..contact.table_contact import table_contact, table_contact_adjoint
-from ..lanes.algebra import (
+from ..lanes.algebra import (  # noqa: F401  (operators are found by name)
+    add,
     any_less,
+    div,
     kernel_options,
+    length,
     less,
+    mul,
+    nonfinite,
     root,
     select,
+    sub,
 )
 from ..lanes.structures import structures
 from ..lanes.tape import BODY_SCALARS, COUNTERS, GRIP_WORDS, tape
