@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 
-.PHONY: help venv demo test lint format bench clean
+.PHONY: help venv demo test lint format bench docs clean
 
 help:
 	@echo "make demo    demonstrations of cable-shape and bag-items-1 and their videos, under demo/"
@@ -15,6 +15,7 @@ help:
 	@echo "make lint    ruff and mypy"
 	@echo "make format  let ruff rewrite what it can"
 	@echo "make bench   time the simulator"
+	@echo "make docs    the documentation site, in build/site; a broken link fails"
 	@echo "make clean   remove demo/ and caches (the environment stays: remove $(VENV) by hand)"
 
 venv: $(STAMP)
@@ -47,6 +48,11 @@ format: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/warp-deform bench
+
+# Not --quiet: that hides warnings from --strict, too.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "open build/site/index.html"
 
 clean:
 	rm -rf demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

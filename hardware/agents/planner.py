@@ -175,7 +175,8 @@ def chord_error(beads: np.ndarray, targets: np.ndarray, *, links: int, spacing: 
     A chord joins beads so many links apart. It says how bent the chain is there, not where it lies.
 
     Args:
-        beads, targets: along the chain [m], (n, 2)
+        beads: along the chain [m], (n, 2)
+        targets: where they are to lie [m], (n, 2)
         links: bridged by a chord
         spacing: of the beads [m]
 

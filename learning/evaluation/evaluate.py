@@ -194,8 +194,9 @@ def measure(task: str) -> str:
 def wilson(successes: int, n: int) -> tuple[float, float]:
     """Wilson's 95 % interval [%] of a share of successes.
 
-    >>> [round(bound, 1) for bound in wilson(15, 20)]
-    [53.1, 88.8]
+    Examples:
+        >>> [round(bound, 1) for bound in wilson(15, 20)]
+        [53.1, 88.8]
     """
     interval = binomtest(successes, n).proportion_ci(method="wilson")
     return 100 * float(interval.low), 100 * float(interval.high)

@@ -11,10 +11,11 @@ __all__ = ["coverage", "hull_area", "mask_iou", "pose_error", "share_in_zone", "
 
 
 def wrap_angle(angle: float) -> float:
-    """The same direction within [-pi, pi] [rad].
+    """The same direction, from -pi to pi [rad].
 
-    >>> round(wrap_angle(2 * np.pi + 0.5), 6)
-    0.5
+    Examples:
+        >>> round(wrap_angle(2 * np.pi + 0.5), 6)
+        0.5
     """
     return float(np.arctan2(np.sin(angle), np.cos(angle)))
 
