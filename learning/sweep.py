@@ -24,11 +24,13 @@ from collections.abc import Iterator
 from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import joblib
 
 from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.settings import DemonstratorName
 from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError, WarpDeformError
@@ -38,11 +40,13 @@ from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 
 from .evaluation.run import evaluate_run
+from .evaluation.settings import EvalSettings
 from .models.transporter import Transporter
 from .policy.policy import AGENTS, AgentDescription
 from .report.report import write_report
 from .runs.folder import read_json, write_json
 from .training.config import TrainConfig
+from .training.settings import AgentName, PresetName, TrainMethod
 from .training.train import train
 
 __all__ = ["Collecting", "Evaluating", "SweepConfig", "read_sweep", "run_sweep"]
@@ -62,46 +66,32 @@ class Collecting:
     folder: Path | None = None
     count: int | None = None
     seed: int = 0
-    demonstrator: str = "scripted"
+    demonstrator: DemonstratorName = "scripted"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluating:
-    """How runs are evaluated, see `report_run.evaluate_run`. The section `evaluation`."""
+class Evaluating(EvalSettings):
+    """How runs are evaluated, see `evaluation.run.evaluate_run`. The section `evaluation`."""
 
-    episodes: int = 200
-    validation_episodes: int = 20
-    paper: bool = False
-    stage_rule: Literal["action", "privileged"] = "action"
     retry: bool = True
-    robot: str = "ur5"
+    """Agents over pictures remember what they missed; the paper's do not."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepConfig:
+class SweepConfig(TrainMethod):
     """A grid. The fields are the keys of the file; those without a default have to be there.
 
-    steps, batch, lr, snapshots, validate: None takes the preset's; untrained: evaluate step 0 too
-    bf16: of agents over pictures; device, patience: see `training.TrainConfig`
+    bf16: of agents over pictures
     Agents are combined with the tasks that they fit: those that see a goal, with tasks that have
     one.
     """
 
     out: Path
     tasks: tuple[str, ...]
-    agents: tuple[str, ...]
+    agents: tuple[AgentName, ...]
     demos: tuple[int, ...]
     seeds: tuple[int, ...] = (0,)
-    preset: str = "fast"
-    steps: int | None = None
-    batch: int | None = None
-    lr: float | None = None
-    snapshots: int | None = None
-    bf16: bool = False
-    untrained: bool = False
-    device: str = "cpu"
-    validate: int | None = None
-    patience: int | None = None
+    preset: PresetName = "fast"
     demonstrations: Collecting = field(default_factory=Collecting)
     evaluation: Evaluating = field(default_factory=Evaluating)
 
@@ -143,7 +133,9 @@ class SweepConfig:
         """Folder of a task's demonstrations."""
         return (self.demonstrations.folder or self.out / "demos") / task
 
-    def _cell(self, demos: int, task: str, agent: str, seed: int) -> TrainConfig:
+    def _cell(self, demos: int, task: str, agent: AgentName, seed: int) -> TrainConfig:
+        method = {each.name: getattr(self, each.name) for each in fields(TrainMethod)}
+        method["bf16"] = self.bf16 and issubclass(AGENTS[agent], Transporter)
         return TrainConfig(
             task=task,
             agent=agent,
@@ -151,17 +143,8 @@ class SweepConfig:
             out=self.out / "runs" / f"{task}-{agent}-{demos}-s{seed}",
             demos=demos,
             seed=seed,
-            preset=self.preset,
-            steps=self.steps,
-            batch=self.batch,
-            lr=self.lr,
-            snapshots=self.snapshots,
-            bf16=self.bf16 and issubclass(AGENTS[agent], Transporter),
-            untrained=self.untrained,
-            device=self.device,
-            validate=self.validate,
-            patience=self.patience,
             progress=False,
+            **method,
         )
 
 
@@ -322,13 +305,14 @@ def _section(kind: type[Any], data: object, where: str, **given: Any) -> Any:
     if not isinstance(data, dict):
         raise InputError(f"{where.rstrip('.')} must be a table")
     known = {each.name: each for each in fields(kind) if each.name not in given}
+    hints = get_type_hints(kind)
     values = dict(given)
     for key, value in data.items():
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(known)}"
             raise InputError(f"unknown key {where + key!r}; {hint}")
-        values[key] = _value(where + key, value, str(known[key].type).removesuffix(" | None"))
+        values[key] = _value(where + key, value, hints[key])
     missing = [
         name
         for name, each in known.items()
@@ -339,23 +323,23 @@ def _section(kind: type[Any], data: object, where: str, **given: Any) -> Any:
     return kind(**values)
 
 
-_KINDS = {"int": int, "float": float, "bool": bool, "str": str, "Path": str}
+_SAID = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
-def _value(key: str, value: object, kind: str) -> Any:
-    """A value of the file as the field's type `kind`, as it is written in the class."""
-    inner = kind.removeprefix("tuple[").removesuffix(", ...]")
-    if inner != kind:
+def _value(key: str, value: object, hint: Any) -> Any:
+    """A value of the file as the type that the class names; one of several words is a string."""
+    if get_origin(hint) is UnionType:
+        (hint,) = set(get_args(hint)) - {NoneType}
+    if get_origin(hint) is tuple:
         if not isinstance(value, list):
             raise InputError(f"{key} is {value!r}; it must be a list, as in [{value!r}]")
-        return tuple(_value(key, each, inner) for each in value)
-    wanted = _KINDS.get(kind, str)
+        return tuple(_value(key, each, get_args(hint)[0]) for each in value)
+    wanted = hint if hint in _SAID else str
     if wanted is float and type(value) is int:
         value = float(value)
     if type(value) is not wanted:  # in Python, a bool is an int
-        name = {int: "a whole number", float: "a number", bool: "true or false"}
-        raise InputError(f"{key} is {value!r}; it must be {name.get(wanted, 'a string')}")
-    return Path(str(value)) if kind == "Path" else value
+        raise InputError(f"{key} is {value!r}; it must be {_SAID.get(wanted, 'a string')}")
+    return Path(str(value)) if hint is Path else value
 
 
 @contextlib.contextmanager

@@ -17,9 +17,9 @@ import pytest
 
 from hardware.command.franka import franka
 from warp_deform.command import main as cli
-from warp_deform.command.flag_range import FlagRange, check_flags, check_seed, flag_range
 from warp_deform.command.main import CommandOptions, main
 from warp_deform.errors import InputError
+from warp_deform.support.flag_range import FlagRange, check_flags, check_seed, flag_range
 
 FRANKA: dict[str, type[CommandOptions]] = {
     f"franka {verb.__metadata__[0].name}": typing.get_args(verb)[0]

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from warp_deform.command.flag_range import FlagRange
 from warp_deform.command.main import CommandOptions, Outcome
+from warp_deform.support.flag_range import FlagRange
 
 from ..rig.config import CameraName, RigConfig, RobotName
 

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 from tyro.conf import arg
 
-from warp_deform.command.flag_range import SEED, FlagRange
 from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
+from warp_deform.support.flag_range import SEED, FlagRange
 
 from .calibrate import WorkspaceFlag
 

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg, subcommand
 
-from warp_deform.command.flag_range import SEED, FlagRange
 from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
+from warp_deform.support.flag_range import SEED, FlagRange
 
 from ..rig.config import AgentName, CameraName, RigConfig, RobotName
 from .calibrate import CalibrateOptions, DoctorOptions, HomeFlag, WorkspaceFlag, calibrate, doctor

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from warp_deform.command.flag_range import check_seed
 from warp_deform.errors import InputError
 from warp_deform.rendering.strand_mask import draw_line
+from warp_deform.support.flag_range import check_seed
 
 from ..arm.panda import PandaKinematics
 from ..arm.table_plane import TablePlane

@@ -19,12 +19,12 @@ from dataclasses import dataclass, field
 import newton
 import numpy as np
 
-from warp_deform.command.flag_range import check_seed
 from warp_deform.errors import InputError
 from warp_deform.objects.cable import CableConfig, add_cable
 from warp_deform.quiet import quiet_warp
 from warp_deform.robots.jaw import Jaw, JawConfig
 from warp_deform.solver.solver import SolverFusedXPBD
+from warp_deform.support.flag_range import check_seed
 from warp_deform.tasks.chain_physics import BEAD_CHAIN, CHAIN_SOLVER
 from warp_deform.tasks.chain_shapes import straight_chain, tossed_chain
 from warp_deform.xpbd.config import SolverConfig

@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from warp_deform.command.flag_range import COUNT
 from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
+from warp_deform.support.flag_range import COUNT
 
 __all__ = ["ConvertOptions", "convert"]
 

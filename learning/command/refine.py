@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass, fields
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
-from warp_deform.command.flag_range import COUNT
 from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
+from warp_deform.support.flag_range import COUNT
+
+from ..refinement.settings import FolderSettings, RefineSettings
 
 __all__ = ["RefineOptions", "refine"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefineOptions(CommandOptions):
+class RefineOptions(RefineSettings, CommandOptions):
     """Improve recorded demonstrations by search; the same command goes on where it was stopped."""
 
-    source: Annotated[Positional[Path], arg(metavar="DIR")]
-    """Folder of demonstrations; it stays as it is."""
-    out: Annotated[Path, arg(metavar="DIR")]
-    """Folder for the refined ones, and for copies of those that did not become better."""
     method: Literal["enumerate", "random", "cem", "gradient"] = "cem"
     """How to search beyond the task's candidates: not at all, by draws, by draws ever closer to the
     best (the cross-entropy method), or down the slope of the task's loss."""
@@ -31,16 +28,11 @@ class RefineOptions(CommandOptions):
     """Actions to look ahead."""
     budget: Annotated[int, arg(metavar="N"), COUNT] = 64
     """Simulated actions that the search for one action may spend."""
-    accept: Literal["score", "solved"] = "score"
-    """When an episode takes the place of the original: if it has no lower last score and no more
-    actions, or if it solves the task in fewer actions or in as many with a higher score."""
     lifts: bool = False
     """Let the search move the lift of an action too; policies lift as the task does."""
     way_points: bool = False
     """Bend the recorded actions' paths instead, by the gradient. No policy can act so: the folder
     then holds paths, no demonstrations."""
-    workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
-    """Processes; left out, one per core. The result is the same."""
 
 
 def refine(options: RefineOptions) -> Outcome:
@@ -53,18 +45,8 @@ def refine(options: RefineOptions) -> Outcome:
     quiet_warp()
     if options.way_points:
         return _bend(options)
-    search = SearchConfig(
-        method=options.method, depth=options.depth, budget=options.budget, lifts=options.lifts
-    )
-    report = refine_folder(
-        RefineConfig(
-            source=options.source,
-            out=options.out,
-            search=search,
-            accept=options.accept,
-            workers=options.workers,
-        )
-    )
+    config = options.configure(RefineConfig, search=options.configure(SearchConfig))
+    report = refine_folder(config)
     text = (
         f"{options.out}: {report.improved} of {report.episodes} episodes improved, actions "
         f"{report.actions_before} -> {report.actions_after}, mean score {report.score_before:.3f} "
@@ -83,27 +65,15 @@ def _bend(options: RefineOptions) -> Outcome:
 
     from ..refinement.waypoints import BendConfig, bend
 
-    others = RefineOptions(
-        source=options.source,
-        out=options.out,
-        budget=options.budget,
-        workers=options.workers,
-        way_points=True,
-        json=options.json,
-    )
-    if options != others:
+    applies = {field.name for kind in (FolderSettings, CommandOptions) for field in fields(kind)}
+    given = {name: getattr(options, name) for name in (*applies, "budget", "way_points")}
+    if options != RefineOptions(**given):
         raise InputError("--way-points goes by the gradient and takes --budget and --workers alone")
     steps = options.budget // (SLOPE_COST + 1)
     if steps < 1:
         raise InputError(f"a step of way-points costs {SLOPE_COST + 1}: give --budget that or more")
-    report = bend(
-        BendConfig(
-            source=options.source,
-            out=options.out,
-            bending=WayPointConfig(steps=steps),
-            workers=options.workers,
-        )
-    )
+    config = options.configure(BendConfig, bending=WayPointConfig(steps=steps))
+    report = bend(config)
     text = (
         f"{options.out}: {report.bent} of {report.actions} paths bent (no demonstrations), in "
         f"{report.seconds:.1f} s"

@@ -4,78 +4,43 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from warp_deform.command.flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
 from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError, Interrupted
 from warp_deform.quiet import quiet_warp
-from warp_deform.robots import RobotName
+from warp_deform.support.flag_range import COUNT, SEED
 from warp_deform.tasks.registry import task as find_task
 
-__all__ = ["EvalOptions", "ReportOptions", "SweepOptions", "TrainOptions", "evaluate", "report",
-           "sweep", "train"]  # fmt: skip
+from ..evaluation.settings import EvalSettings
+from ..training.settings import TrainSettings
 
-_Task = Annotated[Positional[str], arg(metavar="TASK")]
+__all__ = [
+    "EvalOptions",
+    "ReportOptions",
+    "SweepOptions",
+    "TrainOptions",
+    "evaluate",
+    "report",
+    "sweep",
+    "train",
+]
+
 _Folder = Annotated[Positional[Path], arg(metavar="RUN")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainOptions(CommandOptions):
+class TrainOptions(TrainSettings, CommandOptions):
     """Train an agent on demonstrations; the same command goes on where it was interrupted.
 
     With --preset fast every snapshot plays validation episodes, and training ends when one solves
     them all. Off a terminal a line on stderr tells every 30 s how far it is.
     """
 
-    task: _Task
-    """Name of the task, see `warp-deform list`."""
-    agent: Literal["transporter", "goal-split", "goal-stack", "gt-mlp", "gt-mlp-2step"]
-    """Transporters see pictures (goal-split and goal-stack the goal's too), the others see the
-    simulator's state."""
-    data: Annotated[Path, arg(metavar="DIR")]
-    """Folder of demonstrations, see `warp-deform demo`."""
-    demos: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Demonstrations to learn from, drawn by --seed; when left out, all that are not held out."""
-    seed: Annotated[int, SEED] = 0
-    """Of the initial weights, of what is drawn, and of which demonstrations are used."""
-    preset: Literal["paper", "fast"] = "paper"
-    """The paper's network and schedule, or one for two CPU cores."""
-    out: Annotated[Path, arg(metavar="DIR")]
-    """Folder of the run."""
-    steps: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Steps of training; the preset's when left out."""
-    batch: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Moments a step; the preset's when left out."""
-    lr: Annotated[float | None, arg(metavar="LR"), FlagRange(1e-12, 1e3)] = None
-    """Step size of Adam; the preset's when left out."""
-    snapshots: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Snapshots, evenly spread; when left out, the preset's: of `paper` 10, of `fast` after 1/16,
-    1/8, 1/4, 1/2 and all of the steps."""
     no_augment: bool = False
     """Do not turn, shift or mirror what is seen at random, as the paper does (but for mirrors)."""
-    exact: bool = False
-    """Compute by the original's operations, several times slower; see docs/learning.md."""
-    bf16: bool = False
-    """Convolve in bfloat16: quicker where the processor multiplies it natively."""
-    hold_out: Annotated[int, arg(metavar="N"), COUNT_OR_NONE] = 0
-    """Further demonstrations, not learnt from: the snapshot of the lowest loss on them is taken."""
-    validate: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
-    """Validation episodes that every snapshot plays; training ends when one solves them all, and
-    `eval` does not play them again. When left out, the preset's: 20 of `fast` (0 with --hold-out),
-    0 of `paper`."""
-    patience: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Also stop when so many snapshots in a row played no better; needs validation."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where the network computes; under `torchrun`, each process takes one GPU."""
-    threads: Annotated[int, arg(metavar="N"), FlagRange(1, 4096)] = 1
-    """Threads of torch."""
-    untrained: bool = False
-    """Also keep the untrained network, as the snapshot of step 0: learning curves begin there."""
-    tensorboard: bool = False
-    """Write for TensorBoard too, which has to be installed."""
 
 
 def train(options: TrainOptions) -> Outcome:
@@ -88,29 +53,7 @@ def train(options: TrainOptions) -> Outcome:
     from .outcome_text import interrupted, trained
 
     quiet_warp()
-    config = TrainConfig(
-        task=options.task,
-        agent=options.agent,
-        data=options.data,
-        out=options.out,
-        demos=options.demos,
-        seed=options.seed,
-        preset=options.preset,
-        steps=options.steps,
-        batch=options.batch,
-        lr=options.lr,
-        snapshots=options.snapshots,
-        augment=not options.no_augment,
-        exact=options.exact,
-        bf16=options.bf16,
-        device=options.device,
-        threads=options.threads,
-        hold_out=options.hold_out,
-        validate=options.validate,
-        patience=options.patience,
-        tensorboard=options.tensorboard,
-        untrained=options.untrained,
-    )
+    config = options.configure(TrainConfig, augment=not options.no_augment)
     try:
         report = asdict(run_training(config))
     except KeyboardInterrupt:
@@ -122,7 +65,7 @@ def train(options: TrainOptions) -> Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalOptions(CommandOptions):
+class EvalOptions(EvalSettings, CommandOptions):
     """Choose a run's best snapshot on validation seeds and play the test seeds with it.
 
     Goals are constructed from goal seeds unless given. Results are kept: what was played, in
@@ -131,21 +74,12 @@ class EvalOptions(CommandOptions):
 
     run: _Folder
     """Folder of a training run."""
-    episodes: Annotated[int, arg(metavar="N"), COUNT] = 200
-    """Test episodes."""
-    first_seed: Annotated[int | None, arg(metavar="S"), SEED] = None
-    """Play test episodes of seeds S and up in place of 10,000 and up; their result is kept apart
-    from that of the test seeds."""
-    validation_episodes: Annotated[int, arg(metavar="N"), COUNT] = 20
-    """Validation episodes a snapshot, seeds 50,000 and up."""
-    paper: bool = False
-    """Also the paper's protocol: every snapshot plays 20 test episodes with demonstrated goals, and
-    the best result counts, which is optimistic."""
-    stage_rule: Literal["action", "privileged"] = "action"
-    """Who chooses the lift: the policy, or the paper's rule, which reads the simulator."""
     no_retry: bool = False
     """Keep agents over pictures from remembering what they missed and what they just put down, to
     pick elsewhere: so the paper's play."""
+    first_seed: Annotated[int | None, arg(metavar="S"), SEED] = None
+    """Play test episodes of seeds S and up in place of 10,000 and up; their result is kept apart
+    from that of the test seeds."""
     goals: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of goals that the test episodes share in turn, see `warp-deform goals`."""
     video: Annotated[Path | None, arg(metavar="DIR")] = None
@@ -155,8 +89,6 @@ class EvalOptions(CommandOptions):
     """Videos at most."""
     share: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to be made: a run's with the chosen snapshot alone, in half its bytes, to hand on."""
-    robot: RobotName = "ur5"
-    """The arm."""
     workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
     """Processes; left out, one per core, fewer for few episodes. The result is the same."""
 
@@ -172,13 +104,9 @@ def evaluate(options: EvalOptions) -> Outcome:
     quiet_warp()
     report = evaluate_run(
         options.run,
-        episodes=options.episodes,
-        validation_episodes=options.validation_episodes,
-        paper=options.paper,
-        stage_rule=options.stage_rule,
+        **asdict(options.configure(EvalSettings)),
         retry=not options.no_retry,
         first_seed=options.first_seed,
-        robot=options.robot,
         goals=options.goals,
         video=options.video,
         videos=options.videos,

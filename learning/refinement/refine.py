@@ -41,6 +41,8 @@ from warp_deform.tasks.task import Action, Task
 from warp_deform.worlds.loop import SOLVED, Run, play, worlds_for
 from warp_deform.worlds.worlds import Worlds
 
+from .settings import RefineSettings
+
 __all__ = ["ACCEPT", "RECORDED", "REFINED", "REFINEMENT", "RefineConfig", "RefineReport", "refine",
            "seeds_by_task"]  # fmt: skip
 
@@ -62,21 +64,12 @@ _CHUNK = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefineConfig:
-    """What to refine, and how.
+class RefineConfig(RefineSettings):
+    """The settings of a refinement, checked, and how each action is searched."""
 
-    source: folder of simulated demonstrations, of any tasks; out: folder for the refined ones
-    search: how each action is searched; its budget is per action. What an action that solves the
-        task leaves of it goes into better ones, whatever `search.polish` says.
-    accept: when an episode takes the place of the original, see `ACCEPT`
-    workers: processes; None takes one per core
-    """
-
-    source: Path
-    out: Path
     search: SearchConfig = field(default_factory=SearchConfig)
-    accept: str = "score"
-    workers: int | None = None
+    """Its budget is per action. What an action that solves the task leaves of it goes into better
+    ones, whatever `search.polish` says."""
 
     def __post_init__(self) -> None:
         if self.accept not in ACCEPT:

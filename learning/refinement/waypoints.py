@@ -36,6 +36,7 @@ from warp_deform.worlds.state import WorldState
 from warp_deform.worlds.worlds import Worlds
 
 from .refine import seeds_by_task
+from .settings import FolderSettings
 
 __all__ = ["WAY_POINTS", "BendConfig", "BendReport", "bend", "read_path"]
 
@@ -49,15 +50,11 @@ _COLLECTED = 32
 
 
 @dataclass(frozen=True, kw_only=True)
-class BendConfig:
-    """source: folder of simulated demonstrations; out: folder for the paths
-    bending: how way-points are moved; workers: processes, None takes one per core
-    """
+class BendConfig(FolderSettings):
+    """The paths of which folder are bent, and how; `out` is then a folder for paths."""
 
-    source: Path
-    out: Path
     bending: WayPointConfig = field(default_factory=WayPointConfig)
-    workers: int | None = None
+    """How way-points are moved."""
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from warp_deform.errors import InputError
@@ -13,55 +12,23 @@ from ..models.transporter import Transporter, TransporterConfig
 from ..policy.policy import AGENTS
 from .processes import DEVICES
 from .schedules import SCHEDULES, Schedule, preset_schedule
+from .settings import TrainSettings
 
 __all__ = ["TrainConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainConfig:
-    """What to train, and how.
+class TrainConfig(TrainSettings):
+    """The settings of a run, checked, and what a program alone can choose."""
 
-    demos: demonstrations to learn from, drawn by `seed`; None takes all that `data` holds
-    schedule: None takes the preset's; steps, batch, lr, snapshots: changes to it; snapshots whose
-        number is given are evenly spread
-    network: None takes the preset's; rotations and lifts are the task's in any case
-    augment: turn and shift what is seen at random
-    exact: compute by the original's operations, several times slower
-    bf16: convolve in bfloat16, agents over pictures alone
-    threads: of torch, a process; another number may change the last bits
-    hold_out: further demonstrations, not learnt from, on which every snapshot's loss is measured
-    validate: validation episodes that every snapshot plays: training ends when one solves them all,
-        as nothing is left to be gained; 0 plays none. None takes the schedule's, but 0 with
-        `hold_out`, which is for where nothing can be played
-    patience: stop as well when so many snapshots in a row brought no better validation
-    untrained: also a snapshot of the initial weights, step 0, where a learning curve begins
-    progress: tell of it on stderr, see `warp_deform.support.progress`
-    """
-
-    task: str
-    agent: str
-    data: Path
-    out: Path
-    demos: int | None = None
-    seed: int = 0
-    preset: str = "paper"
-    schedule: Schedule | None = None
-    steps: int | None = None
-    batch: int | None = None
-    lr: float | None = None
-    snapshots: int | None = None
-    network: TransporterConfig | None = None
     augment: bool = True
-    exact: bool = False
-    bf16: bool = False
-    device: str = "cpu"
-    threads: int = 1
-    hold_out: int = 0
-    validate: int | None = None
-    patience: int | None = None
-    tensorboard: bool = False
-    untrained: bool = False
+    """Turn, shift and mirror what is seen at random, as the paper does (but for mirrors)."""
+    schedule: Schedule | None = None
+    """In place of the preset's; steps, batch, lr, snapshots and validate change it."""
+    network: TransporterConfig | None = None
+    """In place of the preset's; rotations and lifts are the task's in any case."""
     progress: bool = True
+    """Tell of it on stderr, see `warp_deform.support.progress`."""
 
     def __post_init__(self) -> None:
         find_task(self.task)

@@ -23,6 +23,7 @@ from ..worlds.loop import SLOTS, SOLVED, play, worlds_for
 from .folder import Attempt, Collection, append_attempt, check_seeds
 from .goals import load_goals
 from .recording import observe, record, task_config
+from .settings import CollectSettings
 from .workers import Workers, worker_count
 
 __all__ = ["CollectConfig", "CollectReport", "collect"]
@@ -35,28 +36,12 @@ FILMED = 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollectConfig:
-    """What to collect.
+class CollectConfig(CollectSettings):
+    """The settings of a collection, checked, and what a program alone can choose."""
 
-    episodes: successes to keep; seed: first seed, the others follow
-    demonstrator: who acts, one of `demonstrators.DEMONSTRATORS`
-    goals: folder of goals (see `make_goals`); a seed aims at the one number seed modulo their
-        count, as in the environments. None constructs a goal from every seed
-    workers: processes; None takes one per core, but not for a handful of episodes
-    ray: address of a Ray cluster whose machines share the folder; workers defaults to its cores
-    video: MP4 of the first kept episodes
-    """
-
-    task: str
-    episodes: int
-    out: Path
-    seed: int = 0
-    demonstrator: str = "scripted"
-    robot: str = "ur5"
     goals: Path | None = None
-    workers: int | None = None
-    ray: str | None = None
-    video: Path | None = None
+    """Folder of goals (see `make_goals`); a seed aims at the one number seed modulo their count, as
+    in the environments. None constructs a goal from every seed."""
 
     def __post_init__(self) -> None:
         find_task(self.task)

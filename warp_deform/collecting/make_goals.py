@@ -21,6 +21,7 @@ from .collect import CollectConfig, collect
 from .folder import Attempt, Collection, append_attempt, check_seeds
 from .goals import CONSTRUCTED, DEMONSTRATED, at_goal
 from .recording import GOAL_TARGETS, observe, origin, record, task_config
+from .settings import DemonstratorName
 from .workers import single_threaded
 
 __all__ = ["GOAL_SEED", "make_goals"]
@@ -36,7 +37,7 @@ def make_goals(
     count: int,
     seed: int = GOAL_SEED,
     kind: str = DEMONSTRATED,
-    demonstrator: str = "scripted",
+    demonstrator: DemonstratorName = "scripted",
     robot: str = "ur5",
     workers: int | None = None,
 ) -> dict[str, Any]:

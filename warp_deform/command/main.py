@@ -21,17 +21,24 @@ import re
 import sys
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 from tyro.conf import arg
 
 from ..errors import InputError, Interrupted, WarpDeformError
+from ..support.flag_range import check_flags
 from ..support.version import __version__
-from .flag_range import check_flags
 
 __all__ = ["VERBS", "CommandOptions", "Outcome", "Verb", "main"]
+
+
+class _Dataclass(Protocol):
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+
+Config = TypeVar("Config", bound=_Dataclass)
 
 
 class Verb(NamedTuple):
@@ -105,6 +112,15 @@ class CommandOptions:
     """Print one JSON object, and nothing else, on stdout."""
     task_module: Annotated[str | None, arg(metavar="MODULE")] = None
     """Module, or .py file, that registers tasks of your own; it is imported, so it runs."""
+
+    def configure(self, kind: type[Config], **further: Any) -> Config:
+        """The configuration `kind`, a dataclass: the fields that it shares with these options.
+
+        further: fields that they do not have
+        """
+        own = {field.name for field in fields(self)}
+        shared = {f.name: getattr(self, f.name) for f in fields(kind) if f.name in own}
+        return kind(**shared, **further)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,13 +10,15 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from ..collecting.settings import CollectSettings, DemonstratorName
 from ..errors import InputError
+from ..gradcheck.config import GradcheckConfig
 from ..quiet import quiet_warp
 from ..robots import RobotName
+from ..support.flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
 from ..tasks.registration import env_id
 from ..tasks.registry import TASKS, all_tasks
 from ..tasks.registry import task as find_task
-from .flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
 from .main import CommandOptions, Outcome
 
 __all__ = [
@@ -40,10 +42,7 @@ __all__ = [
 
 _Task = Annotated[Positional[str], arg(metavar="TASK")]
 _Folder = Annotated[Positional[Path], arg(metavar="DIR")]
-_Count = Annotated[int, arg(aliases=["-n"], metavar="N"), COUNT]
 _Workers = Annotated[int | None, arg(metavar="W"), COUNT]
-_Demonstrator = Literal["scripted", "visible", "mpc", "planner"]
-_File = Annotated[Path | None, arg(metavar="FILE")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,29 +87,8 @@ def list_tasks(options: ListOptions) -> Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions(CommandOptions):
+class DemoOptions(CollectSettings, CommandOptions):
     """Collect successful demonstrations of a task; attempts that fail are counted, not kept."""
-
-    task: _Task
-    """Name of the task, see `warp-deform list`."""
-    episodes: _Count = 10
-    """Successes to keep: the first N in the order of their seeds."""
-    seed: Annotated[int, SEED] = 0
-    """First seed. Training 0.., test 10,000.., validation 50,000.., goals 100,000.. ."""
-    out: Annotated[Path, arg(metavar="DIR")]
-    """Folder for the episodes; complete ones that are there already are kept."""
-    demonstrator: _Demonstrator = "scripted"
-    """Who acts: "scripted", the paper's; "visible", which picks only what the tip would really
-    meet; "mpc", which simulates eight candidates and takes the best; "planner", which searches two
-    actions ahead. All see the state."""
-    workers: _Workers = None
-    """Processes; left out, one per core, fewer for few episodes. The result is the same."""
-    ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Address of a Ray cluster to work on (needs the extra `ray`)."""
-    video: _File = None
-    """MP4 of the first two kept episodes."""
-    robot: RobotName = "ur5"
-    """The arm."""
 
 
 def demo(options: DemoOptions) -> Outcome:
@@ -119,21 +97,7 @@ def demo(options: DemoOptions) -> Outcome:
     from ..collecting.collect import CollectConfig, collect
 
     quiet_warp()
-    report = asdict(
-        collect(
-            CollectConfig(
-                task=options.task,
-                episodes=options.episodes,
-                seed=options.seed,
-                out=options.out,
-                demonstrator=options.demonstrator,
-                workers=options.workers,
-                ray=options.ray,
-                video=options.video,
-                robot=options.robot,
-            )
-        )
-    )
+    report = asdict(collect(options.configure(CollectConfig)))
     if report["enclosed"] is None:  # there are no items to enclose
         del report["enclosed"]
     failure = None
@@ -159,7 +123,7 @@ class GoalsOptions(CommandOptions):
     """Folder for the goals."""
     kind: Literal["demonstrated", "constructed"] = "demonstrated"
     """Last states of demonstrations (the paper), or objects placed at the goal and settled."""
-    demonstrator: _Demonstrator = "scripted"
+    demonstrator: DemonstratorName = "scripted"
     """Whose demonstrations, see `warp-deform demo`."""
     workers: _Workers = None
     """Processes; one per core when left out."""
@@ -277,21 +241,11 @@ def bench(options: BenchOptions) -> Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class GradcheckOptions(CommandOptions):
+class GradcheckOptions(GradcheckConfig, CommandOptions):
     """Compare derivatives of the solver with finite differences, in states of real episodes."""
 
     task: Annotated[Positional[str | None], arg(metavar="[TASK]")] = None
     """Name of a task; left out, all."""
-    levels: tuple[Literal["substep", "window", "action"], ...] = ("substep", "window", "action")
-    """One substep; 0.1 s; whole actions."""
-    states: Annotated[int, arg(metavar="N"), COUNT] = 200
-    """States whose next substep is differentiated."""
-    windows: Annotated[int, arg(metavar="N"), COUNT] = 30
-    """States from which 0.1 s are differentiated."""
-    actions: Annotated[int, arg(metavar="N"), COUNT] = 16
-    """Whole actions that are differentiated."""
-    seed: Annotated[int, SEED] = 0
-    """First episode, and the random directions."""
     summary: bool = False
     """One line per task and level instead of all rows."""
 
@@ -300,19 +254,11 @@ def gradcheck(options: GradcheckOptions) -> Outcome:
     """Check the adjoint."""
     if options.task is not None:
         find_task(options.task)
-    from ..gradcheck import GradcheckConfig, check, summarise
+    from ..gradcheck.report import check
+    from ..gradcheck.summary import summarise
 
     quiet_warp()
-    rows, notes = check(
-        options.task,
-        GradcheckConfig(
-            levels=options.levels,
-            states=options.states,
-            windows=options.windows,
-            actions=options.actions,
-            seed=options.seed,
-        ),
-    )
+    rows, notes = check(options.task, options)
     found = [asdict(row) for row in (summarise(rows) if options.summary else rows)]
     head = tuple(key.replace("_", " ") for key in found[0]) if found else ()
     cells = [

@@ -1,6 +1,20 @@
-"""Checks of the solver's derivatives against finite differences, in states of real episodes."""
+"""Checks of the solver's derivatives against finite differences, in states of real episodes.
 
-from .report import GradcheckConfig, Row, check
-from .summary import Summary, summarise
+The names load on first use, so that reading the configuration loads no simulator.
+"""
 
-__all__ = ["GradcheckConfig", "Row", "Summary", "check", "summarise"]
+from __future__ import annotations
+
+from ..support.handed_on import hand_on
+
+_HOME = {
+    "GradcheckConfig": ".config",
+    "Row": ".report",
+    "Summary": ".summary",
+    "check": ".report",
+    "summarise": ".summary",
+}
+
+__all__ = list(_HOME)
+
+__getattr__ = hand_on(__name__, _HOME)

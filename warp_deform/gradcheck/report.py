@@ -16,12 +16,12 @@ from ..tasks.registry import task as find_task
 from ..worlds.worlds import Worlds
 from ..xpbd.lanes.tape import Kind
 from .actions import ActionSample, compare_actions
+from .config import GradcheckConfig
 from .differences import PARAMETERS, WORLDS, Sample, compare, fired
 from .draws import Draw, draw_states
 
 __all__: list[str] = []  # `warp_deform.gradcheck` is the import path of what is here
 
-LEVELS = ("substep", "window", "action")
 BOUNDS = {"substep": 1e-6, "window": 1e-5}
 """Errors that the adjoint is to stay below."""
 WINDOW = 0.1
@@ -33,21 +33,6 @@ MOST_SEARCHED = 2
 """States searched for rare kinds, as a multiple of those that are compared anyway."""
 _DTYPE = "float64"
 _MEMORY = 3 * 2**29  # bytes
-
-
-@dataclass(frozen=True, kw_only=True)
-class GradcheckConfig:
-    """What is checked, and how much of it."""
-
-    levels: tuple[str, ...] = LEVELS
-    states: int = 200
-    """States whose next substep is differentiated; more where a constraint acts in few of them."""
-    windows: int = 30
-    """States from which a window is differentiated."""
-    actions: int = 16
-    """Whole actions that are differentiated."""
-    seed: int = 0
-    """First episode, and the random directions."""
 
 
 @dataclass(frozen=True, kw_only=True)
