@@ -14,6 +14,7 @@ from ..objects.box import Box, BoxConfig, BoxPart, add_box
 from ..objects.colors import BROWN, RED, Color
 from ..objects.scene_object import SceneObject
 from ..objects.zone import square_zone
+from ..rendering.pixels import pixel_to_world
 from ..robots.primitive import Outcome
 from .bag_opening import BAG_ROWS, BagTask
 from .bag_physics import CARRY, INSERT, OPEN
@@ -185,7 +186,7 @@ class BagItems1(BagTask):
             return None
         tried = self._inserted(snapshot)
         if tried >= len(self.cubes):
-            return self._carry(layout, snapshot, rng, None)
+            return self._carry(layout, snapshot, rng)
         clear = self._clear(layout, snapshot, tried)
         if clear.any():
             return self.insert(layout, snapshot, rng, clear, tried)
@@ -196,11 +197,12 @@ class BagItems1(BagTask):
     ) -> Action | None:
         """The same with picks that the tip really meets, and with a look at what is in the bag.
 
-        An item that did not get in, or fell out, is put in again.
+        An item that did not get in, or fell out, is put in again. The bag is carried by the bead
+        that lies across the bag from the items, so that they are below it when it hangs.
         """
         outside = self._outside(snapshot)
         if not outside:
-            return self._carry(layout, snapshot, rng, self.met_beads(snapshot))
+            return self._carry_across(layout, snapshot)
         inserted = len(self.cubes) - len(outside)
         clear = self._clear(layout, snapshot, inserted, outside[0])
         if clear.any():
@@ -268,19 +270,41 @@ class BagItems1(BagTask):
         """Where (320, 160) the next item fits into the opening."""
         return self.clear_opening(layout, snapshot, self.nominal, _ROOM)
 
-    def _carry(
-        self,
-        layout: Layout,
-        snapshot: Snapshot,
-        rng: np.random.Generator,
-        beads: list[int] | None,
-    ) -> Action | None:
-        """Carry the bag by a random visible bead, of `beads` if any of them is visible."""
+    def _carry(self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator) -> Action | None:
+        """Carry the bag by a random visible bead."""
+        seen = self.visible_beads(layout, snapshot)
+        if not len(seen):
+            return None
+        return self._carry_by(layout, snapshot, seen[rng.integers(len(seen))])
+
+    def _carry_across(self, layout: Layout, snapshot: Snapshot) -> Action | None:
+        """Carry the bag by the visible bead across it from the items, of those that the tip takes.
+
+        The shell below the lifted bead becomes a wall that the items slide down, and what lies
+        beyond them the pocket that they fall into. Items on the bead's side of the bag's middle, or
+        far from the rim beyond them, are caught in the mouth instead, and fall out of it.
+        """
         seen = self.visible_beads(layout, snapshot).tolist()
-        chosen = [b for b in seen if beads is None or b in beads] or seen
+        met = self.met_beads(snapshot)
+        chosen = [bead for bead in seen if bead in met] or seen
         if not chosen:
             return None
-        return self._carry_by(layout, snapshot, chosen[rng.integers(len(chosen))])
+        across = self.across(layout, snapshot)
+        return self._carry_by(layout, snapshot, max(chosen, key=lambda bead: across[bead]))
+
+    def across(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
+        """How far (32,) [m] the items lie beyond the middle of the bag, seen from every bead.
+
+        Less how far beyond them, along the same line, the bead opposite on the rim is.
+        """
+        rim, items = self.beads(snapshot)[:, :2], snapshot.body_q[:, :2].mean(axis=0)
+        ids = self._segments(layout, snapshot, self.bag_of(snapshot))
+        shown = snapshot.images.segmentation
+        middle = pixel_to_world(np.argwhere((shown >= ids.start) & (shown < ids.stop)).mean(axis=0))
+        way = items - rim
+        way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-6)
+        opposite = np.roll(rim, -len(rim) // 2, axis=0)
+        return ((2 * items - middle - opposite) * way).sum(axis=1)
 
     def _carry_by(self, layout: Layout, snapshot: Snapshot, bead: int) -> Action:
         return pick_place(self.beads(snapshot)[bead], _frame(layout)[:2], stage=CARRY)
