@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from test_bag_tasks import delivered, each_items, snapshot, start
 
-from warp_deform.episode_loop import SLOTS
 from warp_deform.planning import Lookahead, Outlook
-from warp_deform.running import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.tasks.bag_items import BagItems1
 from warp_deform.tasks.bag_physics import CARRY
-from warp_deform.world_state import WorldState
 from warp_deform.worlds import Worlds
+from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
+from warp_deform.worlds.loop import SLOTS
+from warp_deform.worlds.state import WorldState
 
 FIRST = 30_000  # seed, of none that the rule was found or is reported with
 ENCLOSED = 4
