@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import types
 import typing
+from collections.abc import Iterator
 from dataclasses import fields, make_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -21,10 +22,18 @@ from warp_deform.command.main import CommandOptions, main
 from warp_deform.errors import InputError
 from warp_deform.support.flag_range import FlagRange, check_flags, check_seed, flag_range
 
-FRANKA: dict[str, type[CommandOptions]] = {
-    f"franka {verb.__metadata__[0].name}": typing.get_args(verb)[0]
-    for verb in typing.get_args(typing.get_type_hints(franka, include_extras=True)["options"])
-}
+
+def subverbs(name: str, verbs: Any) -> Iterator[tuple[str, type[CommandOptions]]]:
+    """Words and options of every verb of a verb, and of theirs."""
+    for each in typing.get_args(verbs):
+        inner, words = typing.get_args(each)[0], f"{name} {each.__metadata__[0].name}"
+        if isinstance(inner, type):
+            yield words, inner
+        else:
+            yield from subverbs(words, inner)
+
+
+FRANKA = dict(subverbs("franka", typing.get_type_hints(franka, include_extras=True)["options"]))
 OWN: dict[str, type[CommandOptions]] = {
     verb: typing.get_type_hints(getattr(import_module(module), function))["options"]
     for verb, (target, *_) in cli.VERBS.items()
@@ -32,9 +41,10 @@ OWN: dict[str, type[CommandOptions]] = {
     for module, function in [target.split(":")]
 }
 VERBS = OWN | FRANKA
+STEPS = ("board", "lens", "table", "camera", "points", "hand", "empty")
 LINE = "cable-line-notarget"
 NEEDED = {
-    "franka calibrate": ["lens"], "franka capture-goal": ["--out", "g.png"],
+    "franka capture-goal": ["--out", "g.png"],
     "franka collect": ["--out", "demos"], "demo": [LINE, "--out", "d"],
     "goals": [LINE, "--out", "d"], "replay": ["d"], "inspect": ["d"],
     "convert": ["d", "o", "--from", "deformable-ravens"],
@@ -81,10 +91,11 @@ FLAGS = numeric_flags()
 
 def test_the_table_has_the_flags() -> None:
     assert {verb.removeprefix("franka ") for verb in FRANKA} == {
-        "doctor", "calibrate", "capture-goal", "collect", "run", "replay", "score", "emulate",
+        "doctor", "capture-goal", "collect", "run", "replay", "score", "emulate",
+        *(f"calibrate {step}" for step in STEPS),
     }  # fmt: skip
     names = {(verb, name) for verb, name, _ in FLAGS}
-    assert {("franka run", "seed"), ("franka emulate", "chain"), ("franka calibrate", "size"),
+    assert {("franka run", "seed"), ("franka emulate", "chain"), ("franka calibrate lens", "size"),
             ("demo", "seed"), ("goals", "count"), ("train", "seed"), ("gradcheck", "seed"),
             ("eval", "first_seed"), ("refine", "budget"), ("convert", "workers"),
             } <= names  # fmt: skip

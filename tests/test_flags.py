@@ -54,15 +54,13 @@ def test_a_switch_is_off_unless_it_is_named(verb: str, kind: type) -> None:
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_help_of_switches(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    parts = [[]]
-    if verb == "franka":
-        assert main([verb, "--help"]) == 0
-        inner = re.search(r"{([a-z,-]+)}", capsys.readouterr().out)
-        assert inner is not None
-        parts = [[part] for part in inner[1].split(",")]
-    for part in parts:
-        assert main([verb, *part, "--help"]) == 0
+    left = [verb]
+    while left:
+        words = left.pop()
+        assert main([*words.split(), "--help"]) == 0
         said = " ".join(re.sub(r"[│╭╰─╮╯]", " ", capsys.readouterr().out).split())
+        if inner := re.match(rf"usage: warp-deform {words} \[-h\] {{([a-z,-]+)}}", said):
+            left += [f"{words} {part}" for part in inner[1].split(",")]
         assert "(default: True)" not in said
         for negative in re.findall(r"(--no-[a-z-]+) (\S+ \S+)", said):
             assert negative[1].startswith(("Do not", "Keep agents")), negative

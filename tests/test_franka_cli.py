@@ -18,12 +18,13 @@ import hardware.arm.robot as robot_module
 from hardware import RobotError
 from hardware.backends.panda import BUSY
 from hardware.cameras.camera import CameraError
+from hardware.command.franka import franka
 from hardware.episodes.goals import read_goal, sampled_goal, write_goal
 from hardware.recordings.scoring import StartAtGoal
 from hardware.twin.look_server import LookServer, remote_look
 from hardware.twin.twin import TwinLook
 from hardware.vision.top_down_view import TopDownView
-from warp_deform.command.main import main
+from warp_deform.command.main import _parse, main
 from warp_deform.errors import InputError
 from warp_deform.support.revision import running_revision
 
@@ -219,7 +220,8 @@ def test_a_goal_is_captured_and_read(tmp_path: Path, capfd: pytest.CaptureFixtur
         (["calibrate", "points", "--typed", "--setup", "nowhere"], r"table\.json"),
         (["calibrate", "points", "--pairs", "p.csv"], "whose are the points"),
         (["calibrate", "empty", "--setup", "nowhere"], "calibration"),
-        (["calibrate", "nonsense"], "board"),
+        (["calibrate", "nonsense"], "nonsense; available subcommands: board, lens, table"),
+        (["calibrate", "board", "--table-z", "0"], "--table-z"),
         ([], "Expected one of"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -256,6 +258,42 @@ def test_doctor_explains_a_bare_machine(
     CALIBRATION.save(tmp_path / "calibration.json")
     checks = run(capfd, "doctor", "--setup", str(tmp_path))[1]["checks"]
     assert next(c for c in checks if c["name"] == "calibration")["ok"] is True
+
+
+WHERE = {"--setup"}
+SEEN = {"--camera", "--device"}
+PLACE = {"--robot", "--host", "--home", "--workspace"}
+STEPS = {
+    "board": WHERE | {"--square-mm"},
+    "lens": WHERE | SEEN | {"--square-mm", "--views", "--size"},
+    "table": WHERE | PLACE | {"--execute", "--table-z"},
+    "camera": WHERE | SEEN | PLACE | {"--execute", "--square-mm", "--corners"},
+    "points": WHERE | SEEN | PLACE | {"--execute", "--points", "--typed", "--pairs"},
+    "hand": WHERE | SEEN | PLACE | {"--execute", "--square-mm", "--views"},
+    "empty": WHERE | SEEN | PLACE,
+}
+"""Flags of each step of `calibrate`."""
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_a_step_of_calibrate_has_its_own_flags(
+    step: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["franka", "calibrate", step, "--help"]) == 0
+    shown = set(re.findall(r"^\W*(--[a-z-]+)", capfd.readouterr().out, re.MULTILINE))
+    assert shown == STEPS[step] | {"--json", "--task-module"}
+    for flag in set.union(*STEPS.values()) - STEPS[step]:
+        assert main(["franka", "calibrate", step, flag, "1"]) == 2
+        assert flag in capfd.readouterr().err.splitlines()[-1]
+
+
+def test_the_documented_lines_of_calibrate_are_understood() -> None:
+    text = (ROOT / "docs" / "hardware.md").read_text()
+    lines = re.findall(r"^\| `franka (calibrate [a-z]+(?: [^`]*)?)`", text, re.MULTILINE)
+    assert {line.split()[1] for line in lines} == STEPS.keys()
+    for line in lines:
+        words = line.replace("--table-z Z", "--table-z -0.02").split()
+        assert _parse("warp-deform franka", franka, words) is not None, line
 
 
 def test_the_board_is_written_at_its_size(

@@ -10,6 +10,8 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
+from hardware.command.franka import RunOptions
+from hardware.rig.config import RigConfig
 from learning.command import refine, verbs
 from learning.evaluation import run as evaluation
 from learning.evaluation.settings import EvalSettings
@@ -60,6 +62,7 @@ CHANGED: dict[str, tuple[list[str], Any]] = {
     ("options", "config"),
     [
         (verbs.TrainOptions, TrainConfig),
+        (RunOptions, RigConfig),
         (verbs.EvalOptions, EvalSettings),
         (refine.RefineOptions, RefineConfig),
         (own_verbs.DemoOptions, CollectConfig),
@@ -162,7 +165,8 @@ def test_a_task_is_looked_up_when_its_module_is_loaded() -> None:
 
 @pytest.mark.parametrize(
     "line", ["train --help", "eval --help", "sweep --help", "demo --help", "refine --help",
-             "gradcheck --help", "franka run --help", "franka calibrate --help"],
+             "gradcheck --help", "franka run --help", "franka calibrate --help",
+             "franka calibrate hand --help"],
 )  # fmt: skip
 def test_help_loads_neither_torch_nor_a_simulator(line: str) -> None:
     script = (

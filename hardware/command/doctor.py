@@ -9,15 +9,17 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
 from warp_deform.support.extras import install_extra
 
-from ..rig.config import RobotName
+from ..rig.config import RobotName, SetupFlag
 
-__all__ = ["Check", "examine"]
+__all__ = ["Check", "DoctorOptions", "doctor", "examine"]
 
 _PACKAGES = (
     ("panda_py", "panda-python", "panda", "Panda, server version 5",
@@ -43,6 +45,39 @@ _TAKE_PRIORITY = (
     "import os; os.sched_setscheduler(0, os.SCHED_FIFO, "
     "os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO)))"
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorOptions(CommandOptions):
+    """What this machine has for a robot, what is missing, and how to get it; moves nothing."""
+
+    robot: RobotName = "sim"
+    """What must work for the exit code to be 0; sim needs nothing but this package."""
+    host: str | None = None
+    """Address of a robot to connect to and read."""
+    setup: SetupFlag = field(default_factory=lambda: Path("franka-setup"))
+    """Folder of the calibration."""
+
+
+def doctor(options: DoctorOptions) -> Outcome:
+    """Examine the machine."""
+    checks = examine(options.robot, host=options.host, setup=options.setup)
+    missing = [check for check in checks if check.needed and not check.ok]
+    width = max(len(check.name) for check in checks)
+    lines = []
+    for check in checks:
+        mark = "ok" if check.ok else ("MISSING" if check.needed else "-")
+        lines.append(f"{mark:<8}{check.name:<{width}}  {check.found}")
+        if not check.ok:
+            lines.append(f"{'':<8}{'':<{width}}  {check.advice}")
+    data: dict[str, Any] = {
+        "ready": not missing,
+        "robot": options.robot,
+        "checks": [check._asdict() for check in checks],
+    }
+    first = missing[0] if missing else None
+    failure = None if first is None else f"{first.name}: {first.found}; {first.advice}"
+    return Outcome(data=data, text="\n".join(lines), failure=failure)
 
 
 class Check(NamedTuple):

@@ -13,7 +13,7 @@ from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
 from warp_deform.support.flag_range import SEED, FlagRange
 
-from .calibrate import WorkspaceFlag
+from ..rig.config import WorkspaceFlag
 
 __all__ = ["EmulateOptions", "emulate"]
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,10 +20,11 @@ from tyro.conf import arg, subcommand
 from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
-from warp_deform.support.flag_range import SEED, FlagRange
+from warp_deform.support.flag_range import FlagRange
 
-from ..rig.config import AgentName, CameraName, RigConfig, RobotName
-from .calibrate import CalibrateOptions, DoctorOptions, HomeFlag, WorkspaceFlag, calibrate, doctor
+from ..rig.config import AgentName, RigConfig
+from .calibrate import CALIBRATE, CalibrateOptions
+from .doctor import DoctorOptions, doctor
 from .emulate import EmulateOptions, emulate
 from .records import ReplayOptions, ScoreOptions, replay, score
 
@@ -39,39 +40,11 @@ _DRY_ACTIONS = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class _RigOptions(CommandOptions):
-    """Robot, camera and where their calibration is."""
+class _RigOptions(RigConfig, CommandOptions):
+    """Robot, camera and where their calibration is: what to open."""
 
-    robot: RobotName = "dry_run"
-    """dry_run prints commands and moves nothing, sim moves a simulated chain; panda (panda-python,
-    server version 5), fr3 (franky, 10) and frankapy (ROS) move an arm, with --execute."""
-    camera: CameraName = "sim"
-    """sim sees the simulated chain, also that of `emulate --chain`; file replays --frames."""
-    host: str | None = None
-    """Address of the robot, or of the emulator."""
-    setup: Annotated[Path, arg(metavar="DIR")] = field(default_factory=lambda: Path("franka-setup"))
-    """Folder of the calibration, see `calibrate`; not needed with --camera sim."""
-    device: str | None = None
-    """Number of a video device, or serial number of a RealSense."""
-    frames: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Recorded pictures for --camera file: the folder `frames` of an episode."""
-    seed: Annotated[int, SEED] = 0
-    """Of the simulated toss and goal, and of what an agent draws."""
-    execute: bool = False
-    """Let a real arm move; without it, its commands are printed."""
     auto: bool = False
     """Do not ask before every action of a real arm."""
-    home: HomeFlag = None
-    """Joint positions of the home pose [rad]; a setup has it from its calibration, and others are
-    refused. With --camera sim, any that the arm can wait at."""
-    workspace: WorkspaceFlag = None
-    """Ends of the workspace along x and y [m]; as for --home."""
-    joint_speed: Annotated[float, FlagRange(1e-3, 0.2)] = 0.05
-    """Share of the joints' greatest speeds between poses, at most 0.2; begin with 0.05."""
-
-    def rig(self) -> RigConfig:
-        """What to open."""
-        return RigConfig(**{field.name: getattr(self, field.name) for field in fields(RigConfig)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,9 +95,14 @@ class CaptureGoalOptions(_RigOptions):
     """The mask; the picture is written beside it."""
 
 
+_CALIBRATE = (
+    "Measure the setup: board, lens, table, camera, in this order; see docs/hardware.md. Of "
+    "camera, points and hand one is enough."
+)
+
 _Options = (
     Annotated[DoctorOptions, subcommand("doctor")]
-    | Annotated[CalibrateOptions, subcommand("calibrate")]
+    | Annotated[CalibrateOptions, subcommand("calibrate", description=_CALIBRATE)]
     | Annotated[CaptureGoalOptions, subcommand("capture-goal")]
     | Annotated[CollectOptions, subcommand("collect")]
     | Annotated[RunOptions, subcommand("run")]
@@ -137,21 +115,7 @@ _Options = (
 def franka(options: _Options) -> Outcome:
     """The cable task on a Franka arm."""
     quiet_warp()
-    if isinstance(options, DoctorOptions):
-        return doctor(options)
-    if isinstance(options, CalibrateOptions):
-        return calibrate(options)
-    if isinstance(options, CaptureGoalOptions):
-        return _capture_goal(options)
-    if isinstance(options, CollectOptions):
-        return _collect(options)
-    if isinstance(options, RunOptions):
-        return _run(options)
-    if isinstance(options, ReplayOptions):
-        return replay(options)
-    if isinstance(options, ScoreOptions):
-        return score(options)
-    return emulate(options)
+    return _VERBS[type(options)](options)
 
 
 def _run(options: RunOptions) -> Outcome:
@@ -159,7 +123,7 @@ def _run(options: RunOptions) -> Outcome:
 
     folder = options.out or _next_folder(Path("franka-episodes"))
     clock = time.monotonic()
-    with open_rig(options.rig()) as rig:
+    with open_rig(options) as rig:
         result = _episode(options, rig, folder, seed=options.seed)
     data = {**_described(options, result), "seconds": time.monotonic() - clock}
     return Outcome(data=data, text=_text(data), failure=_failure(result))
@@ -175,7 +139,6 @@ def _collect(options: CollectOptions) -> Outcome:
 
     if options.out is None:
         raise InputError("collect needs --out, the folder of the dataset")
-    config = options.rig()
     live, writer = options.out / "live", EpisodeWriter(options.out)
     done: list[EpisodeResult] = []
     kept = 0
@@ -186,7 +149,7 @@ def _collect(options: CollectOptions) -> Outcome:
             if rig is None or rig.toss is not None:
                 # What is simulated is made anew, so that every episode is that of `run --seed`.
                 stack.close()
-                rig = stack.enter_context(open_rig(replace(config, seed=seed)))
+                rig = stack.enter_context(open_rig(replace(options, seed=seed)))
             if isinstance(rig.camera, SimCamera):
                 rig.camera.reseed(seed)
             simulated = rig.toss is not None or options.auto
@@ -228,25 +191,24 @@ def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> Episo
     from ..episodes.operators import Unattended
     from ..recordings.recorder import EpisodeRecorder, RecorderConfig
 
-    config = options.rig()
     actions = options.max_actions
     if actions is None:
-        actions = EpisodeConfig().max_actions if config.moves else _DRY_ACTIONS
+        actions = EpisodeConfig().max_actions if options.moves else _DRY_ACTIONS
     settings = EpisodeConfig(max_actions=actions, view=rig.view)
     goal = _goal(options, rig, seed)
     chooser = make_chooser(
         options.agent, rig, goal, seed=seed, policy=options.policy, budget=options.budget
     )
     described = RecorderConfig(
-        robot_id=config.robot_id,
-        camera_id=config.camera_id,
+        robot_id=options.robot_id,
+        camera_id=options.camera_id,
         actor=chooser.name,
         calibration=rig.calibration.digest(),
         config={
             "episode": settings.to_record(),
-            "robot": config.robot,
-            "camera": config.camera,
-            "executed": config.moves,
+            "robot": options.robot,
+            "camera": options.camera,
+            "executed": options.moves,
             "seed": seed,
             "policy": None if options.policy is None else str(options.policy),
         },
@@ -267,7 +229,7 @@ def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> Episo
             recorder=recorder,
             goal=mask,
             config=settings,
-            operator=Terminal() if config.real and not options.auto else Unattended(),
+            operator=Terminal() if options.real and not options.auto else Unattended(),
             empty=rig.empty,
             toss=rig.toss,
             say=_say,
@@ -293,7 +255,7 @@ def _capture_goal(options: CaptureGoalOptions) -> Outcome:
     from ..rig.rig import open_rig
     from ..vision.segmentation import segment_cable
 
-    with open_rig(options.rig()) as rig:
+    with open_rig(options) as rig:
         if rig.lay is not None:
             targets = sampled_goal(options.seed, rig.view).targets
             assert targets is not None
@@ -329,7 +291,7 @@ def _described(options: RunOptions, result: EpisodeResult) -> dict[str, Any]:
         "robot": options.robot,
         "camera": options.camera,
         "agent": options.agent,
-        "executed": options.rig().moves,
+        "executed": options.moves,
         "outcome": result.outcome,
         "success": score is not None and score.success,
         "actions": len(result.outcomes),
@@ -350,3 +312,16 @@ def _text(data: dict[str, Any]) -> str:
 
 def _failure(result: EpisodeResult) -> str | None:
     return None if result.error is None else result.outcome.removeprefix("error: ")
+
+
+_VERBS: dict[type, Callable[[Any], Outcome]] = {
+    DoctorOptions: doctor,
+    **CALIBRATE,
+    CaptureGoalOptions: _capture_goal,
+    CollectOptions: _collect,
+    RunOptions: _run,
+    ReplayOptions: replay,
+    ScoreOptions: score,
+    EmulateOptions: emulate,
+}
+"""By its options, what a verb does."""

@@ -4,13 +4,36 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-__all__ = ["REAL_ROBOTS", "AgentName", "CameraName", "RigConfig", "RobotName"]
+from tyro.conf import arg
+
+from warp_deform.support.flag_range import SEED, FlagRange
+
+__all__ = [
+    "REAL_ROBOTS",
+    "AgentName",
+    "CameraName",
+    "HomeFlag",
+    "RigConfig",
+    "RobotName",
+    "SetupFlag",
+    "WorkspaceFlag",
+]
 
 RobotName = Literal["dry_run", "sim", "panda", "fr3", "frankapy"]
 CameraName = Literal["sim", "file", "uvc", "realsense", "azure-kinect"]
 AgentName = Literal["planner", "policy", "scripted", "random", "human", "typed"]
+
+SetupFlag = Annotated[Path, arg(metavar="DIR")]
+HomeFlag = Annotated[
+    tuple[float, float, float, float, float, float, float] | None,
+    arg(metavar="Q1 ... Q7"),
+    FlagRange(-4.0, 4.0),
+]
+WorkspaceFlag = Annotated[
+    tuple[float, float, float, float] | None, arg(metavar="X0 X1 Y0 Y1"), FlagRange(-1.0, 1.0)
+]
 
 REAL_ROBOTS: tuple[RobotName, ...] = ("panda", "fr3", "frankapy")
 """Those that are outside of this process."""
@@ -18,30 +41,32 @@ REAL_ROBOTS: tuple[RobotName, ...] = ("panda", "fr3", "frankapy")
 
 @dataclass(frozen=True, kw_only=True)
 class RigConfig:
-    """What to open."""
+    """Robot, camera and where their calibration is."""
 
     robot: RobotName = "dry_run"
-    """The backend."""
+    """dry_run prints commands and moves nothing, sim moves a simulated chain; panda (panda-python,
+    server version 5), fr3 (franky, 10) and frankapy (ROS) move an arm, with --execute."""
     camera: CameraName = "sim"
-    """Where pictures come from."""
+    """sim sees the simulated chain, also that of `emulate --chain`; file replays --frames."""
     host: str | None = None
-    """Address of the robot."""
-    setup: Path = field(default_factory=lambda: Path("franka-setup"))
-    """Folder of the calibration."""
-    frames: Path | None = None
-    """Folder of recorded pictures, for the camera "file"."""
+    """Address of the robot, or of the emulator."""
+    setup: SetupFlag = field(default_factory=lambda: Path("franka-setup"))
+    """Folder of the calibration, see `calibrate`; not needed with --camera sim."""
     device: str | None = None
-    """Number of a video device or serial number of a RealSense."""
-    seed: int = 0
-    """Of the simulated toss and goal, and of draws."""
+    """Number of a video device, or serial number of a RealSense."""
+    frames: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Recorded pictures for --camera file: the folder `frames` of an episode."""
+    seed: Annotated[int, SEED] = 0
+    """Of the simulated toss and goal, and of what an agent draws."""
     execute: bool = False
-    """Whether a real robot moves; without it its commands are printed."""
-    joint_speed: float = 0.05
-    """Share of the joints' greatest speeds, between poses."""
-    home: tuple[float, ...] | None = None
-    """Seven joint positions of the home pose [rad]; None: as stored, see `rig.workplace`."""
-    workspace: tuple[float, float, float, float] | None = None
-    """Ends of the workspace along x, then y [m]; None: as stored."""
+    """Let a real arm move; without it, its commands are printed."""
+    home: HomeFlag = None
+    """Joint positions of the home pose [rad]; a setup has it from its calibration, and others are
+    refused. With --camera sim, any that the arm can wait at."""
+    workspace: WorkspaceFlag = None
+    """Ends of the workspace along x and y [m]; as for --home."""
+    joint_speed: Annotated[float, FlagRange(1e-3, 0.2)] = 0.05
+    """Share of the joints' greatest speeds between poses, at most 0.2; begin with 0.05."""
 
     @property
     def moves(self) -> bool:

@@ -288,8 +288,9 @@ def _essence(boxed: str) -> str:
     text = "\n".join(line.strip("│╭╰ ") for line in boxed.splitlines())
     _, *paragraphs = re.split(r"^.*[─-]{3,}.*$", text, flags=re.MULTILINE)
     wrong, *others = (" ".join(part.split()) for part in paragraphs)
-    meant = [part for part in others if part.startswith("Perhaps you meant")]
-    return " ".join([wrong, *meant]).rstrip(".")
+    helpful = ("Perhaps you meant", "Available subcommands")
+    meant = [part[0].lower() + part[1:] for part in others if part.startswith(helpful)]
+    return "; ".join([wrong.rstrip("."), *meant]).rstrip(".")
 
 
 @contextlib.contextmanager
