@@ -1,6 +1,6 @@
 """Which patches of a picture have to be shaded again.
 
-A patch is a square of pixels. What it shows depends on what its samples see, and on the tiles of
+A patch is a square of pixels. What it shows depends on what its samples see, and on the cells of
 the lamp's buffer and of the view from above where its points looked for shadows. Shading notes the
 rows and columns there, and what the points compared with what is there: a patch is stale when
 something it sees changed, or when one of these comparisons may come out differently.
@@ -10,63 +10,65 @@ from __future__ import annotations
 
 import warp as wp
 
-from .occlusion import CELL, MOST, SOFT, TILE, Occluders, shadow_limit
+from .occlusion import CELL, TILE, Occluders
 
-__all__ = ["LOOKS", "PATCH", "find_stale", "note_above", "note_lamp"]
+__all__ = ["LOOKS", "PATCH", "Look6", "find_stale", "keep_looks", "look", "no_look"]
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 PATCH = 8
 """Pixels along a patch's side."""
-LOOKS = 16
+LOOKS = 12
 """Numbers noted for each patch, of the lamp's buffer and then of the view from above.
 
-First and last row, first and last column of cells; least and greatest inverse depth that was asked
-for (its bits), least and greatest height that was compared with the tops [0.01 mm].
+First and last row, first and last column of cells; the least and the greatest depth that samples
+there were compared with, as bits, which sort alike.
 """
+SIDE = wp.constant(LOOKS // 2)
+MOST = wp.constant(0x7FFFFFFF)
+FAR_OFF = wp.constant(1.0e9)
 
-HEIGHTS = wp.constant(1.0e5)  # to a metre
+Look6 = wp.types.vector(length=6, dtype=wp.float32)
+"""Bounds of looks: least row, column and depth, and the greatest ones with another sign."""
 
 
 @wp.func
-def note_look(
-    at: wp.vec3,
-    reach: float,
-    least: int,
-    greatest: int,
-    height: float,
+def no_look():
+    """The bounds of no look."""
+    return Look6(FAR_OFF, FAR_OFF, FAR_OFF, FAR_OFF, FAR_OFF, FAR_OFF)
+
+
+@wp.func
+def look(at: wp.vec3, reach: float, least: float, greatest: float):
+    """The bounds of a look at column and row `at`, `reach` samples to all sides."""
+    if at[0] < 0.0:
+        return no_look()
+    return Look6(
+        at[1] - reach, at[0] - reach, least, -(at[1] + reach), -(at[0] + reach), -greatest
+    )
+
+
+@wp.func
+def keep_looks(bounds: Look6, patch: int, slot: int, looks: wp.array2d(dtype=int)):
+    """Add the bounds of some looks to what a patch noted."""
+    if bounds[0] < FAR_OFF:
+        wp.atomic_min(looks, patch, slot, int(bounds[0]) / CELL)
+        wp.atomic_max(looks, patch, slot + 1, int(-bounds[3]) / CELL)
+        wp.atomic_min(looks, patch, slot + 2, int(bounds[1]) / CELL)
+        wp.atomic_max(looks, patch, slot + 3, int(-bounds[4]) / CELL)
+        wp.atomic_min(looks, patch, slot + 4, wp.cast(bounds[2], wp.int32))
+        wp.atomic_max(looks, patch, slot + 5, wp.cast(-bounds[5], wp.int32))
+
+
+@wp.func
+def looks_changed(
+    changed: wp.array2d(dtype=int),
+    least: wp.array2d(dtype=float),
+    greatest: wp.array2d(dtype=float),
     patch: int,
     slot: int,
     looks: wp.array2d(dtype=int),
 ):
-    """Note a look at column and row `at`, `reach` samples to all sides; none where negative."""
-    if at[0] >= 0.0:
-        level = int(wp.floor(height * HEIGHTS))
-        wp.atomic_min(looks, patch, slot, int(at[1] - reach) / CELL)
-        wp.atomic_max(looks, patch, slot + 1, int(at[1] + reach) / CELL)
-        wp.atomic_min(looks, patch, slot + 2, int(at[0] - reach) / CELL)
-        wp.atomic_max(looks, patch, slot + 3, int(at[0] + reach) / CELL)
-        wp.atomic_min(looks, patch, slot + 4, least)
-        wp.atomic_max(looks, patch, slot + 5, greatest)
-        wp.atomic_min(looks, patch, slot + 6, level)
-        wp.atomic_max(looks, patch, slot + 7, level)
-
-
-@wp.func
-def note_lamp(at: wp.vec3, height: float, patch: int, looks: wp.array2d(dtype=int)):
-    """Note what `lit_share` asks: whether samples are nearer to the lamp than a limit."""
-    limit = shadow_limit(at)
-    note_look(at, float(SOFT) + 1.0, limit, limit, height, patch, 0, looks)
-
-
-@wp.func
-def note_above(at: wp.vec3, reach: float, height: float, patch: int, looks: wp.array2d(dtype=int)):
-    """Note what `open_share` asks: how far samples are above the point, if they are."""
-    note_look(at, reach, wp.cast(1.0 / at[2], wp.int32), MOST, height, patch, 8, looks)
-
-
-@wp.func
-def looks_changed(seen: Occluders, patch: int, slot: int, looks: wp.array2d(dtype=int)):
     """Whether a comparison that a patch noted may come out differently now."""
     row = looks[patch, slot]
     last_row = looks[patch, slot + 1]
@@ -74,20 +76,20 @@ def looks_changed(seen: Occluders, patch: int, slot: int, looks: wp.array2d(dtyp
     last_column = looks[patch, slot + 3]
     if last_row < row:
         return False
-    limit = looks[patch, slot + 4]
-    last_limit = looks[patch, slot + 5]
-    for i in range(row, last_row + 1):
-        for j in range(column, last_column + 1):
-            if seen.greatest[i, j] >= limit and seen.least[i, j] < last_limit:
-                return True
-    height = float(looks[patch, slot + 6])
-    last_height = float(looks[patch, slot + 7]) + 1.0
+    found = bool(False)
     for i in range(row * CELL / TILE, last_row * CELL / TILE + 1):
         for j in range(column * CELL / TILE, last_column * CELL / TILE + 1):
-            low = seen.lowest_top[i, j]
-            high = seen.highest_top[i, j]
-            if low < high and low * HEIGHTS < last_height and high * HEIGHTS >= height:
-                return True
+            if changed[i, j] != 0:
+                found = True
+    if not found:
+        return False
+    limit = wp.cast(looks[patch, slot + 4], float)
+    last_limit = wp.cast(looks[patch, slot + 5], float)
+    for i in range(row, last_row + 1):
+        for j in range(column, last_column + 1):
+            if changed[i * CELL / TILE, j * CELL / TILE] != 0:
+                if least[i, j] < last_limit and greatest[i, j] >= limit:
+                    return True
     return False
 
 
@@ -107,8 +109,8 @@ def find_stale(
     patch = i * tiles.shape[1] + j
     if (
         tiles[i, j] != 0
-        or looks_changed(lamp, patch, 0, looks)
-        or looks_changed(above, patch, 8, looks)
+        or looks_changed(lamp.changed, lamp.least, lamp.greatest, patch, 0, looks)
+        or looks_changed(above.changed, above.least, above.greatest, patch, SIDE, looks)
     ):
         stale[i, j] = wp.uint8(1)
         for slot in range(0, LOOKS, 2):

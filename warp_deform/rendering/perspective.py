@@ -14,7 +14,7 @@ from ..errors import InputError
 from .camera import Camera, look_at
 from .drawables import Drawables
 from .geometry import Geometry, HostArray, Mesh
-from .occlusion import OccluderBuffer, Occluders
+from .occlusion import ABOVE_SPREAD, LAMP_SPREAD, OccluderBuffer, Occluders
 from .patches import LOOKS, PATCH, find_stale
 from .pinhole import view_of
 from .shading import Lighting, Look, lighting_of, shade
@@ -73,11 +73,13 @@ class Perspective:
         self._supersample, self._links = supersample, links
         self._lighting = lighting_of(look)
         self._lamp, self._above = (
-            OccluderBuffer(_centred(eye, size, reach), links=links, device=self._device)
-            for eye, size, reach in (
-                (look.lamp, SHADOW_SIZE, SHADOW_REACH),
+            OccluderBuffer(
+                _centred(eye, size, reach), spread=spread, links=links, device=self._device
+            )
+            for eye, size, reach, spread in (
+                (look.lamp, SHADOW_SIZE, SHADOW_REACH, LAMP_SPREAD),
                 # a little off the vertical, which has no right or left
-                ((0.5, -1e-3, 3.0), ABOVE_SIZE, ABOVE_REACH),
+                ((0.5, -1e-3, 3.0), ABOVE_SIZE, ABOVE_REACH, ABOVE_SPREAD),
             )
         )
         self._whole = False

@@ -14,16 +14,18 @@ from ..objects.colors import TABLE, Color
 from .drawables import WORKSPACE_SEGMENT
 from .geometry import MESH_MATERIAL, Scene
 from .occlusion import (
-    OFFSET,
-    SLACK,
+    SOFT,
+    TAPS,
     Occluders,
+    above_limit,
     above_sample,
+    lamp_limit,
     lamp_sample,
     lit_share,
     open_share,
     tap_reach,
 )
-from .patches import PATCH, note_above, note_lamp
+from .patches import PATCH, SIDE, keep_looks, look, no_look
 from .pinhole import View, inverse_depth, primitive_of, ray, to_camera
 from .pixels import BOUNDS
 
@@ -262,49 +264,44 @@ def surface_at(
 
 
 @wp.func
-def radiance(
-    s: Surface,
-    view: View,
-    lighting: Lighting,
-    lamp: Occluders,
-    above: Occluders,
-    patch: int,
-    looks: wp.array2d(dtype=int),
-):
-    """Linear colour that a surface sends to the camera; notes in `looks` what it depends on."""
-    if s.segment == NOTHING:
-        return s.color
-    to_lamp = wp.normalize(lighting.lamp - s.position)
-    cosine = wp.dot(s.normal, to_lamp)
-    direct = float(0.0)
-    highlight = float(0.0)
-    if cosine > 0.0:
-        at = lamp_sample(lamp.view, s.position, s.normal)
-        seen = lit_share(lamp.keys, lamp.tops_near, at, s.position, s.normal)
-        note_lamp(at, s.position[2] + s.normal[2] * OFFSET, patch, looks)
-        direct = lighting.direct * cosine * seen
-        if s.gloss > 0.0:
-            half = wp.normalize(to_lamp + wp.normalize(view.origin - s.position))
-            h = wp.max(wp.dot(s.normal, half), 0.0)
-            h = h * h
-            h = h * h
-            h = h * h
-            h = h * h
-            highlight = s.gloss * seen * h * h
-    # the sky is bright, the floor throws a little back
-    ambient = lighting.ambient * (0.7 + 0.3 * s.normal[2])
-    if lighting.occlusion > 0.0:
-        around = above_sample(above.view, s.position, s.normal)
-        closed = 1.0 - open_share(above.view, above.keys, above.tops_near, around, s.position)
-        reach = 2.0 * tap_reach(above.view, around[2])
-        note_above(around, reach, s.position[2] + SLACK, patch, looks)
-        ambient = ambient * wp.max(1.0 - lighting.occlusion * closed, 0.0)
-    color = s.color * (direct + ambient) + wp.vec3(highlight, highlight, highlight)
-    if s.segment == 0 and lighting.haze > 0.0:
-        gap = s.position - view.origin
-        ratio = wp.dot(gap, gap) / (lighting.haze * lighting.haze)
-        color = wp.lerp(color, lighting.horizon, ratio / (1.0 + ratio))
-    return color
+def radiance(s: Surface, view: View, lighting: Lighting, lamp: Occluders, above: Occluders):
+    """Linear colour that a surface sends to the camera; bounds of its looks at lamp and above."""
+    lamp_look = no_look()
+    above_look = no_look()
+    color = s.color
+    if s.segment != NOTHING:
+        to_lamp = wp.normalize(lighting.lamp - s.position)
+        cosine = wp.dot(s.normal, to_lamp)
+        direct = float(0.0)
+        highlight = float(0.0)
+        if cosine > 0.0:
+            at = lamp_sample(lamp.view, s.position, s.normal)
+            seen = lit_share(lamp.depths, lamp.nearest, at)
+            limit = lamp_limit(at)
+            lamp_look = look(at, float(SOFT) + 1.0, limit, limit)
+            direct = lighting.direct * cosine * seen
+            if s.gloss > 0.0:
+                half = wp.normalize(to_lamp + wp.normalize(view.origin - s.position))
+                h = wp.max(wp.dot(s.normal, half), 0.0)
+                h = h * h
+                h = h * h
+                h = h * h
+                h = h * h
+                highlight = s.gloss * seen * h * h
+        # the sky is bright, the floor throws a little back
+        ambient = lighting.ambient * (0.7 + 0.3 * s.normal[2])
+        if lighting.occlusion > 0.0:
+            around = above_sample(above.view, s.position, s.normal)
+            reach = tap_reach(above.view, around[2])
+            closed = 1.0 - open_share(above.depths, above.nearest, around, reach)
+            above_look = look(around, float(TAPS) * reach, 0.0, above_limit(around))
+            ambient = ambient * wp.max(1.0 - lighting.occlusion * closed, 0.0)
+        color = s.color * (direct + ambient) + wp.vec3(highlight, highlight, highlight)
+        if s.segment == 0 and lighting.haze > 0.0:
+            gap = s.position - view.origin
+            ratio = wp.dot(gap, gap) / (lighting.haze * lighting.haze)
+            color = wp.lerp(color, lighting.horizon, ratio / (1.0 + ratio))
+    return color, lamp_look, above_look
 
 
 @wp.kernel
@@ -337,6 +334,8 @@ def shade(
     if i >= out_color.shape[0]:
         return
     first = patch % patch_columns * PATCH_SIDE
+    lamp_looks = no_look()
+    above_looks = no_look()
     for j in range(first, wp.min(first + PATCH_SIDE, out_color.shape[1])):
         r0 = i * supersample
         c0 = j * supersample
@@ -357,7 +356,10 @@ def shade(
                 s = ground(lighting, view, row, column)
             else:
                 s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-            total = radiance(s, view, lighting, lamp, above, patch, looks)
+            color, lamp_look, above_look = radiance(s, view, lighting, lamp, above)
+            total = color
+            lamp_looks = wp.min(lamp_looks, lamp_look)
+            above_looks = wp.min(above_looks, above_look)
             out_depth[i, j] = wp.where(s.segment == NOTHING or s.depth > far, far, s.depth)
             out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
         else:
@@ -371,10 +373,15 @@ def shade(
                         s = ground(lighting, view, row, column)
                     else:
                         s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-                    total += radiance(s, view, lighting, lamp, above, patch, looks)
+                    color, lamp_look, above_look = radiance(s, view, lighting, lamp, above)
+                    total += color
+                    lamp_looks = wp.min(lamp_looks, lamp_look)
+                    above_looks = wp.min(above_looks, above_look)
             total = total / float(supersample * supersample)
         out_color[i, j] = wp.vec3ub(
             wp.uint8(wp.sqrt(wp.min(total[0], 1.0)) * 255.0 + 0.5),
             wp.uint8(wp.sqrt(wp.min(total[1], 1.0)) * 255.0 + 0.5),
             wp.uint8(wp.sqrt(wp.min(total[2], 1.0)) * 255.0 + 0.5),
         )
+    keep_looks(lamp_looks, patch, 0, looks)
+    keep_looks(above_looks, patch, SIDE, looks)

@@ -76,15 +76,12 @@ def empty(
     side: int,
     tiles: wp.array2d(dtype=int),
     keys: wp.array2d(dtype=wp.int64),
-    before: wp.array2d(dtype=wp.int64),
 ):
-    """One thread a tile: empty it if it is marked; `before`, if there is one, keeps its keys."""
+    """One thread a tile: empty it if it is marked."""
     i, j = wp.tid()
     if tiles[i, j] != 0:
         for r in range(i * side, wp.min((i + 1) * side, keys.shape[0])):
             for c in range(j * side, wp.min((j + 1) * side, keys.shape[1])):
-                if before.shape[0] > 0:
-                    before[r, c] = keys[r, c]
                 keys[r, c] = wp.int64(0)
 
 
@@ -92,19 +89,15 @@ class ZBuffer:
     """What a view sees of a geometry, sample by sample.
 
     view: from where; side: samples along a tile's side; links: whether rods are drawn
-    remember: whether `before` is kept
     keys (rows, columns) int64; tiles: 1 where the last drawing changed something
-    before: what the keys were in these tiles; everything: whether they are not known
+    everything: whether it was drawn whole
     """
 
     def __init__(
-        self, view: View, *, side: int, links: bool, remember: bool = False, device: wp.Device
+        self, view: View, *, side: int, links: bool, device: wp.Device
     ) -> None:
         self.view, self.side, self._links, self._device = view, side, links, device
         self.keys = wp.zeros((view.rows, view.columns), dtype=wp.int64, device=device)
-        self.before = wp.zeros(
-            self.keys.shape if remember else (0, 0), dtype=wp.int64, device=device
-        )
         self.everything = True
         self.shape = -(-view.rows // side), -(-view.columns // side)
         self.tiles = wp.zeros(self.shape, dtype=wp.int32, device=device)
@@ -138,7 +131,7 @@ class ZBuffer:
             self.keys.zero_()
         else:
             wp.launch(
-                empty, self.shape, inputs=[side, self.tiles, self.keys, self.before], device=device
+                empty, self.shape, inputs=[side, self.tiles, self.keys], device=device
             )
         where = [scene, self.view, self._windows, side, self.tiles]
         for kernel, dim, inputs in (
