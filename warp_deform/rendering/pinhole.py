@@ -97,14 +97,24 @@ def last_sample(x: float, count: int):
 
 
 @wp.func
-def narrowed(view: View, slope: float, offset: float, span: wp.vec2):
-    """Part of the columns `span` where slope * x + offset >= 0 may hold."""
+def root_slope(view: View, slope: float):
+    """By how many columns an edge function's root moves where its value at x = 0 grows by one."""
     if wp.abs(slope) < 1.0e-9:
-        return span
-    root = -offset / slope * view.fx + view.cx
-    if slope > 0.0:
-        return wp.vec2(wp.clamp(wp.floor(root) - 1.0, span[0], span[1] + 1.0), span[1])
-    return wp.vec2(span[0], wp.clamp(wp.ceil(root) + 1.0, span[0] - 1.0, span[1]))
+        return 0.0
+    return -view.fx / slope
+
+
+@wp.func
+def narrowed(slope: float, root: float, span: wp.vec2):
+    """Part of the columns `span` where an edge function may not be negative, one more at its root.
+
+    slope: how it changes along the row; root: the column where it is 0
+    """
+    if slope > 1.0e-9:
+        return wp.vec2(wp.max(span[0], root - 1.0), span[1])
+    if slope < -1.0e-9:
+        return wp.vec2(span[0], wp.min(span[1], root + 1.0))
+    return span
 
 
 @wp.func
@@ -117,17 +127,6 @@ def touches(window: wp.vec4i, side: int, tiles: wp.array2d(dtype=int)):
                 if tiles[i, j] != 0:
                     found = True
     return found
-
-
-@wp.func
-def window_in_tile(window: wp.vec4i, row: int, column: int, side: int):
-    """The part of a window that lies in one tile of `side` samples."""
-    return wp.vec4i(
-        wp.max(window[0], row * side),
-        wp.min(window[1], row * side + side - 1),
-        wp.max(window[2], column * side),
-        wp.min(window[3], column * side + side - 1),
-    )
 
 
 @wp.func
@@ -199,37 +198,54 @@ def raster_triangles(
         ea = -ea
         eb = -eb
         ec = -ec
-    # along a row the edge functions change by this
     step = 1.0 / view.fx
-    for i in range(window[0] / side, window[1] / side + 1):
-        for j in range(window[2] / side, window[3] / side + 1):
-            if tiles[i, j] != 0:
-                part = window_in_tile(window, i, j, side)
-                for r in range(part[0], part[1] + 1):
-                    y = (float(r) - view.cy) / view.fy
-                    ra = ea[1] * y + ea[2]
-                    rb = eb[1] * y + eb[2]
-                    rc = ec[1] * y + ec[2]
-                    rn = n[1] * y + n[2]
-                    low = float(part[2])
-                    high = float(part[3])
-                    # a wide part: go only where the row can be inside, a sample more to both sides
-                    if part[3] - part[2] > 12:
-                        span = narrowed(view, ea[0], ra, wp.vec2(low, high))
-                        span = narrowed(view, eb[0], rb, span)
-                        span = narrowed(view, ec[0], rc, span)
-                        low = span[0]
-                        high = span[1]
-                    for q in range(int(low), int(high) + 1):
-                        x = (float(q) - view.cx) * step
-                        if (
-                            ea[0] * x + ra >= 0.0
-                            and eb[0] * x + rb >= 0.0
-                            and ec[0] * x + rc >= 0.0
-                        ):
-                            inverse = n[0] * x + rn
-                            if inverse > 0.0 and inverse * NEAR < 1.0:
-                                wp.atomic_max(buffer, r, q, key_of(inverse, f))
+    root = wp.vec3(root_slope(view, ea[0]), root_slope(view, eb[0]), root_slope(view, ec[0]))
+    i = window[0] / side
+    # `while`, as a `for` of unknown bounds costs as much as a sample
+    while i <= window[1] / side:
+        # from the first to the last marked tile of this row of tiles
+        first = window[2] / side
+        last = window[3] / side
+        while first <= last and tiles[i, first] == 0:
+            first += 1
+        while first < last and tiles[i, last] == 0:
+            last -= 1
+        r = wp.max(window[0], i * side)
+        bottom = wp.min(window[1], i * side + side - 1)
+        if first > last:
+            r = bottom + 1
+        c0 = float(wp.max(window[2], first * side))
+        c1 = float(wp.min(window[3], last * side + side - 1))
+        while r <= bottom:
+            y = (float(r) - view.cy) / view.fy
+            ra = ea[1] * y + ea[2]
+            rb = eb[1] * y + eb[2]
+            rc = ec[1] * y + ec[2]
+            rn = n[1] * y + n[2]
+            # only where the row can be inside, and a sample more to both sides
+            span = narrowed(ea[0], ra * root[0] + view.cx, wp.vec2(c0, c1))
+            span = narrowed(eb[0], rb * root[1] + view.cx, span)
+            span = narrowed(ec[0], rc * root[2] + view.cx, span)
+            q = int(span[0])
+            end = int(span[1])
+            while q <= end:
+                j = q / side
+                stop = wp.min(end, j * side + side - 1)
+                if tiles[i, j] == 0:
+                    q = stop + 1
+                while q <= stop:
+                    x = (float(q) - view.cx) * step
+                    if (
+                        ea[0] * x + ra >= 0.0
+                        and eb[0] * x + rb >= 0.0
+                        and ec[0] * x + rc >= 0.0
+                    ):
+                        inverse = n[0] * x + rn
+                        if inverse > 0.0 and inverse * NEAR < 1.0:
+                            wp.atomic_max(buffer, r, q, key_of(inverse, f))
+                    q += 1
+            r += 1
+        i += 1
 
 
 @wp.func

@@ -172,21 +172,21 @@ def on_triangle(
     points: wp.array(dtype=wp.vec3),
     triangles: wp.array(dtype=wp.vec3i),
     normals: wp.array2d(dtype=wp.vec3),
-    view: View,
+    origin: wp.vec3,
     f: int,
     d: wp.vec3,
 ):
-    """Normal of a triangle where the ray `d` meets it, and the depth there."""
+    """Normal of a triangle where the ray `d` from `origin` meets it, and the depth there."""
     tri = triangles[f]
-    a = to_camera(view, points[tri[0]])
-    b = to_camera(view, points[tri[1]])
-    c = to_camera(view, points[tri[2]])
-    n = wp.cross(b - a, c - a)
+    a = points[tri[0]] - origin
+    ab = points[tri[1]] - origin - a
+    ac = points[tri[2]] - origin - a
+    n = wp.cross(ab, ac)
     depth = wp.dot(n, a) / wp.dot(n, d)
-    p = d * depth
-    square = wp.dot(n, n)
-    wb = wp.clamp(wp.dot(wp.cross(p - a, c - a), n) / square, 0.0, 1.0)
-    wc = wp.clamp(wp.dot(wp.cross(b - a, p - a), n) / square, 0.0, 1.0)
+    ap = d * depth - a
+    scale = 1.0 / wp.dot(n, n)
+    wb = wp.clamp(wp.dot(wp.cross(ap, ac), n) * scale, 0.0, 1.0)
+    wc = wp.clamp(wp.dot(wp.cross(ab, ap), n) * scale, 0.0, 1.0)
     wa = wp.max(1.0 - wb - wc, 0.0)
     normal = wp.normalize(normals[f, 0] * wa + normals[f, 1] * wb + normals[f, 2] * wc)
     return normal, depth
@@ -233,7 +233,7 @@ def surface_at(
     material = int(0)
     if primitive < triangles:
         normal, depth = on_triangle(
-            scene.points, scene.triangles, scene.triangle_normals, view, primitive, d
+            scene.points, scene.triangles, scene.triangle_normals, view.origin, primitive, world_d
         )
         s.normal = normal
         s.depth = depth
@@ -325,8 +325,8 @@ def shade(
 ):
     """One thread a row of the listed patches: the mean of each pixel's samples.
 
-    A pixel whose samples all see one primitive is shaded once. Depth and segmentation are whole
-    only with one sample a pixel.
+    Samples of a pixel that see one primitive are shaded as one, in their middle. Depth and
+    segmentation are whole only with one sample a pixel.
     """
     n, k = wp.tid()
     patch = patches[n]
@@ -336,6 +336,7 @@ def shade(
     first = patch % patch_columns * PATCH_SIDE
     lamp_looks = no_look()
     above_looks = no_look()
+    samples = supersample * supersample
     for j in range(first, wp.min(first + PATCH_SIDE, out_color.shape[1])):
         r0 = i * supersample
         c0 = j * supersample
@@ -345,39 +346,51 @@ def shade(
             for c in range(supersample):
                 if primitive_of(buffer[r0 + r, c0 + c]) != primitive_of(key):
                     same = False
-        middle = 0.5 * float(supersample - 1)
+        # the table is painted where no primitive is, so its edge may go through a pixel of them
+        painted = lighting.table == 1 and supersample > 1
         total = wp.vec3(0.0, 0.0, 0.0)
-        if same and (key != wp.int64(0) or supersample == 1 or lighting.table == 0):
-            row = float(r0) + middle
-            column = float(c0) + middle
-            # apart from each other, as handing over the whole scene costs more than the floor does
-            s = Surface()
-            if key == wp.int64(0):
-                s = ground(lighting, view, row, column)
-            else:
-                s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-            color, lamp_look, above_look = radiance(s, view, lighting, lamp, above)
-            total = color
-            lamp_looks = wp.min(lamp_looks, lamp_look)
-            above_looks = wp.min(above_looks, above_look)
-            out_depth[i, j] = wp.where(s.segment == NOTHING or s.depth > far, far, s.depth)
-            out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
-        else:
-            for r in range(supersample):
-                for c in range(supersample):
-                    key = buffer[r0 + r, c0 + c]
-                    row = float(r0 + r)
-                    column = float(c0 + c)
-                    s = Surface()
-                    if key == wp.int64(0):
-                        s = ground(lighting, view, row, column)
-                    else:
-                        s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-                    color, lamp_look, above_look = radiance(s, view, lighting, lamp, above)
-                    total += color
-                    lamp_looks = wp.min(lamp_looks, lamp_look)
-                    above_looks = wp.min(above_looks, above_look)
-            total = total / float(supersample * supersample)
+        a = int(0)
+        while a < samples:
+            row = float(r0) + 0.5 * float(supersample - 1)
+            column = float(c0) + 0.5 * float(supersample - 1)
+            count = int(samples)
+            earlier = bool(False)
+            whole = same and (not painted or key != wp.int64(0))
+            if not whole:
+                key = buffer[r0 + a / supersample, c0 + a % supersample]
+                row = float(0.0)
+                column = float(0.0)
+                count = int(0)
+                for b in range(samples):
+                    r = r0 + b / supersample
+                    c = c0 + b % supersample
+                    alike = primitive_of(buffer[r, c]) == primitive_of(key)
+                    if painted and key == wp.int64(0):
+                        alike = a == b
+                    if alike:
+                        row += float(r)
+                        column += float(c)
+                        count += 1
+                        earlier = earlier or b < a
+                row = row / float(count)
+                column = column / float(count)
+            if not earlier:
+                # apart from each other, as handing over the whole scene costs more than the floor
+                s = Surface()
+                if key == wp.int64(0):
+                    s = ground(lighting, view, row, column)
+                else:
+                    s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
+                color, lamp_look, above_look = radiance(s, view, lighting, lamp, above)
+                total += color * float(count)
+                lamp_looks = wp.min(lamp_looks, lamp_look)
+                above_looks = wp.min(above_looks, above_look)
+                if count == samples:
+                    deep = s.segment == NOTHING or s.depth > far
+                    out_depth[i, j] = wp.where(deep, far, s.depth)
+                    out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
+            a += wp.where(whole, samples, 1)
+        total = total / float(samples)
         out_color[i, j] = wp.vec3ub(
             wp.uint8(wp.sqrt(wp.min(total[0], 1.0)) * 255.0 + 0.5),
             wp.uint8(wp.sqrt(wp.min(total[1], 1.0)) * 255.0 + 0.5),
