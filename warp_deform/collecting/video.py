@@ -10,7 +10,7 @@ import numpy as np
 
 from ..episodes import Episode, EpisodeReader, Goal
 from ..errors import InputError, WarpDeformError
-from ..rendering.caption import annotate
+from ..rendering.caption import Caption
 from ..rendering.scene_view import ArmMeshes, SceneView
 from ..rendering.video import VideoWriter
 from ..worlds.episode import StepReport
@@ -114,12 +114,19 @@ def film_takes(takes: Sequence[Take], path: Path, *, size: tuple[int, int] = (54
             worlds = worlds_for(take.task, take.robot)
             robot = worlds.robot
             arm = ArmMeshes(robot.meshes())
+            captions = [
+                Caption(size[0], lines=_caption(take, t, speed), inset=row.seen)
+                for t, row in enumerate(take.rows)
+            ]
             for shot in _shots(worlds, take, speed):
-                links = arm.at(robot.link_poses(shot.q))
-                drawables = worlds.episodes[0].drawables
-                frame = view.render(drawables, shot.particle_q, shot.body_q, links)
-                lines = _caption(take, shot.row, speed)
-                video.write(annotate(frame, lines=lines, inset=take.rows[shot.row].seen))
+                frame = view.render(
+                    worlds.episodes[0].drawables,
+                    shot.particle_q,
+                    shot.body_q,
+                    arm.at(robot.link_poses(shot.q)),
+                )
+                captions[shot.row].draw(frame)
+                video.write(frame)
 
 
 def _take(recording: Recording, episode: Episode) -> Take:

@@ -104,6 +104,29 @@ class Perspective:
         Raises:
             InputError: the state is not finite or has fewer particles or bodies than are drawn.
         """
+        pictures = self._draw(drawables, particle_q, body_q, cameras, robot_links)
+        return [picture.read() for picture in pictures]
+
+    def colors(
+        self,
+        drawables: Drawables,
+        particle_q: np.ndarray,
+        body_q: np.ndarray,
+        cameras: Sequence[Camera],
+        robot_links: Sequence[RobotLink] = (),
+    ) -> list[np.ndarray]:
+        """The colours alone, (H, W, 3) uint8 per camera; see `render`."""
+        pictures = self._draw(drawables, particle_q, body_q, cameras, robot_links)
+        return [picture.color.read() for picture in pictures]
+
+    def _draw(
+        self,
+        drawables: Drawables,
+        particle_q: np.ndarray,
+        body_q: np.ndarray,
+        cameras: Sequence[Camera],
+        robot_links: Sequence[RobotLink],
+    ) -> list[_Picture]:
         whole, self._whole = self._whole, False  # an interrupted picture is no base for the next
         geometry = self._geometry(drawables, len(particle_q), len(body_q), robot_links)
         geometry.move(particle_q, body_q)
@@ -115,7 +138,7 @@ class Perspective:
             self._above.draw(geometry)
         # cameras of one size have a picture each, so that every one finds its own again
         sizes: Counter[tuple[int, int]] = Counter()
-        seen = []
+        pictures = []
         for camera in cameras:
             key = camera.size, sizes[camera.size]
             sizes[camera.size] += 1
@@ -125,9 +148,9 @@ class Perspective:
                     camera, supersample=self._supersample, links=self._links, device=self._device
                 )
             picture.draw(geometry, self._lighting, self._lamp.seen, self._above.seen)
-            seen.append(picture.read())
+            pictures.append(picture)
         self._whole = True
-        return seen
+        return pictures
 
     def _geometry(
         self, drawables: Drawables, particles: int, bodies: int, robot_links: Sequence[RobotLink]
@@ -162,7 +185,7 @@ class _Picture:
         self._stale = HostArray(patches, wp.uint8, device)
         self._list = HostArray(patches[0] * patches[1], wp.int32, device)
         self._looks = wp.zeros((patches[0] * patches[1], LOOKS), dtype=wp.int32, device=device)
-        self._color = HostArray(camera.size, wp.vec3ub, device)
+        self.color = HostArray(camera.size, wp.vec3ub, device)
         self._depth = HostArray(camera.size, wp.float32, device)
         self._segmentation = HostArray(camera.size, wp.uint8, device)
 
@@ -200,7 +223,7 @@ class _Picture:
                 self._list.array,
                 buffer.shape[1],
                 self._looks,
-                self._color.array,
+                self.color.array,
                 self._depth.array,
                 self._segmentation.array,
             ],
@@ -209,7 +232,7 @@ class _Picture:
 
     def read(self) -> RGBD:
         """A copy of the picture."""
-        return RGBD(self._color.read(), self._depth.read(), self._segmentation.read())
+        return RGBD(self.color.read(), self._depth.read(), self._segmentation.read())
 
 
 def _centred(eye: tuple[float, float, float], size: int, reach: float) -> Camera:

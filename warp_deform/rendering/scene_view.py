@@ -113,5 +113,5 @@ class SceneView:
             InputError: the state is not finite or has fewer particles or bodies than are drawn.
         """
         links = [*self._furniture, *robot_links]
-        [view] = self._renderer.render(drawables, particle_q, body_q, [self.camera], links)
-        return view.color
+        [color] = self._renderer.colors(drawables, particle_q, body_q, [self.camera], links)
+        return color
