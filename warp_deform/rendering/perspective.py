@@ -208,7 +208,7 @@ class _Picture:
         self._list.write(self._list.mirror)
         wp.launch(
             shade,
-            (len(stale), PATCH),
+            len(stale),
             inputs=[
                 geometry.scene,
                 buffer.view,

@@ -323,29 +323,37 @@ def shade(
     out_depth: wp.array2d(dtype=float),
     out_segmentation: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread a row of the listed patches: the mean of each pixel's samples.
+    """One thread a listed patch: the mean of each pixel's samples.
 
     Samples of a pixel that see one primitive are shaded as one, in their middle. Depth and
     segmentation are whole only with one sample a pixel.
     """
-    n, k = wp.tid()
+    n = wp.tid()
     patch = patches[n]
-    i = patch / patch_columns * PATCH_SIDE + k
-    if i >= out_color.shape[0]:
-        return
-    first = patch % patch_columns * PATCH_SIDE
+    top = patch / patch_columns * PATCH_SIDE
+    left = patch % patch_columns * PATCH_SIDE
     lamp_looks = no_look()
     above_looks = no_look()
     samples = supersample * supersample
-    for j in range(first, wp.min(first + PATCH_SIDE, out_color.shape[1])):
+    # `while`, as a `for` of unknown bounds is slow
+    pixel = int(-1)
+    while pixel < PATCH_SIDE * PATCH_SIDE - 1:
+        pixel += 1
+        i = top + pixel / PATCH_SIDE
+        j = left + pixel % PATCH_SIDE
+        if i >= out_color.shape[0] or j >= out_color.shape[1]:
+            continue
         r0 = i * supersample
         c0 = j * supersample
         key = buffer[r0, c0]
         same = bool(True)
-        for r in range(supersample):
-            for c in range(supersample):
-                if primitive_of(buffer[r0 + r, c0 + c]) != primitive_of(key):
-                    same = False
+        r = r0
+        while r < r0 + supersample:
+            c = c0
+            while c < c0 + supersample:
+                same = same and primitive_of(buffer[r, c]) == primitive_of(key)
+                c += 1
+            r += 1
         # the table is painted where no primitive is, so its edge may go through a pixel of them
         painted = lighting.table == 1 and supersample > 1
         total = wp.vec3(0.0, 0.0, 0.0)
@@ -361,17 +369,22 @@ def shade(
                 row = float(0.0)
                 column = float(0.0)
                 count = int(0)
-                for b in range(samples):
-                    r = r0 + b / supersample
-                    c = c0 + b % supersample
-                    alike = primitive_of(buffer[r, c]) == primitive_of(key)
-                    if painted and key == wp.int64(0):
-                        alike = a == b
-                    if alike:
-                        row += float(r)
-                        column += float(c)
-                        count += 1
-                        earlier = earlier or b < a
+                b = int(0)
+                r = r0
+                while r < r0 + supersample:
+                    c = c0
+                    while c < c0 + supersample:
+                        alike = primitive_of(buffer[r, c]) == primitive_of(key)
+                        if painted and key == wp.int64(0):
+                            alike = a == b
+                        if alike:
+                            row += float(r)
+                            column += float(c)
+                            count += 1
+                            earlier = earlier or b < a
+                        b += 1
+                        c += 1
+                    r += 1
                 row = row / float(count)
                 column = column / float(count)
             if not earlier:
