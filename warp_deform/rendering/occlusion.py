@@ -60,7 +60,10 @@ def find_changes(
     least: wp.array2d(dtype=float),
     greatest: wp.array2d(dtype=float),
 ):
-    """One thread a tile, where it was drawn again: its depths, and how those of cells changed."""
+    """One thread a tile, where it was drawn again: its depths, and how those of cells changed.
+
+    Loops are `while` where they are short, as a `for` of unknown bounds is slow.
+    """
     i, j = wp.tid()
     if tiles[i, j] == 0:
         return
@@ -69,8 +72,10 @@ def find_changes(
             low = float(NOWHERE)
             high = float(0.0)
             peak = float(NOWHERE)
-            for r in range(m * CELL, (m + 1) * CELL):
-                for c in range(n * CELL, (n + 1) * CELL):
+            r = m * CELL
+            while r < (m + 1) * CELL:
+                c = n * CELL
+                while c < (n + 1) * CELL:
                     old = depths[r, c]
                     new = wp.min(1.0 / inverse_depth(keys[r, c]), NOWHERE)
                     peak = wp.min(peak, new)
@@ -78,6 +83,8 @@ def find_changes(
                         low = wp.min(low, wp.min(old, new))
                         high = wp.max(high, wp.max(old, new))
                         depths[r, c] = new
+                    c += 1
+                r += 1
             if everything == 1:
                 low = 0.0
                 high = NOWHERE
@@ -105,9 +112,13 @@ def spread_peaks(
     for m in range(i * TILE / CELL, (i + 1) * TILE / CELL):
         for n in range(j * TILE / CELL, (j + 1) * TILE / CELL):
             peak = float(NOWHERE)
-            for r in range(wp.max(m - spread, 0), wp.min(m + spread + 1, peaks.shape[0])):
-                for c in range(wp.max(n - spread, 0), wp.min(n + spread + 1, peaks.shape[1])):
+            r = wp.max(m - spread, 0)
+            while r < wp.min(m + spread + 1, peaks.shape[0]):
+                c = wp.max(n - spread, 0)
+                while c < wp.min(n + spread + 1, peaks.shape[1]):
                     peak = wp.min(peak, peaks[r, c])
+                    c += 1
+                r += 1
             nearest[m, n] = peak
 
 

@@ -122,10 +122,14 @@ def touches(window: wp.vec4i, side: int, tiles: wp.array2d(dtype=int)):
     """Whether a window has a sample in a marked tile."""
     found = bool(False)
     if window[0] <= window[1] and window[2] <= window[3]:
-        for i in range(window[0] / side, window[1] / side + 1):
-            for j in range(window[2] / side, window[3] / side + 1):
-                if tiles[i, j] != 0:
-                    found = True
+        i = window[0] / side
+        # `while`, as a `for` of unknown bounds is slow
+        while i <= window[1] / side and not found:
+            j = window[2] / side
+            while j <= window[3] / side and not found:
+                found = tiles[i, j] != 0
+                j += 1
+            i += 1
     return found
 
 
@@ -201,7 +205,6 @@ def raster_triangles(
     step = 1.0 / view.fx
     root = wp.vec3(root_slope(view, ea[0]), root_slope(view, eb[0]), root_slope(view, ec[0]))
     i = window[0] / side
-    # `while`, as a `for` of unknown bounds costs as much as a sample
     while i <= window[1] / side:
         # from the first to the last marked tile of this row of tiles
         first = window[2] / side

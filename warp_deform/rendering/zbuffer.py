@@ -29,9 +29,13 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 def mark(window: wp.vec4i, side: int, tiles: wp.array2d(dtype=int)):
     """Mark the tiles of a window."""
     if window[0] <= window[1] and window[2] <= window[3]:
-        for i in range(window[0] / side, window[1] / side + 1):
-            for j in range(window[2] / side, window[3] / side + 1):
+        i = window[0] / side
+        while i <= window[1] / side:
+            j = window[2] / side
+            while j <= window[3] / side:
                 tiles[i, j] = 1
+                j += 1
+            i += 1
 
 
 @wp.kernel
@@ -80,9 +84,13 @@ def empty(
     """One thread a tile: empty it if it is marked."""
     i, j = wp.tid()
     if tiles[i, j] != 0:
-        for r in range(i * side, wp.min((i + 1) * side, keys.shape[0])):
-            for c in range(j * side, wp.min((j + 1) * side, keys.shape[1])):
+        r = i * side
+        while r < wp.min((i + 1) * side, keys.shape[0]):
+            c = j * side
+            while c < wp.min((j + 1) * side, keys.shape[1]):
                 keys[r, c] = wp.int64(0)
+                c += 1
+            r += 1
 
 
 class ZBuffer:
