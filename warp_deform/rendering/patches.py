@@ -43,9 +43,7 @@ def look(at: wp.vec3, reach: float, least: float, greatest: float):
     """The bounds of a look at column and row `at`, `reach` samples to all sides."""
     if at[0] < 0.0:
         return no_look()
-    return Look6(
-        at[1] - reach, at[0] - reach, least, -(at[1] + reach), -(at[0] + reach), -greatest
-    )
+    return Look6(at[1] - reach, at[0] - reach, least, -(at[1] + reach), -(at[0] + reach), -greatest)
 
 
 @wp.func

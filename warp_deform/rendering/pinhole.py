@@ -238,11 +238,7 @@ def raster_triangles(
                     q = stop + 1
                 while q <= stop:
                     x = (float(q) - view.cx) * step
-                    if (
-                        ea[0] * x + ra >= 0.0
-                        and eb[0] * x + rb >= 0.0
-                        and ec[0] * x + rc >= 0.0
-                    ):
+                    if ea[0] * x + ra >= 0.0 and eb[0] * x + rb >= 0.0 and ec[0] * x + rc >= 0.0:
                         inverse = n[0] * x + rn
                         if inverse > 0.0 and inverse * NEAR < 1.0:
                             wp.atomic_max(buffer, r, q, key_of(inverse, f))

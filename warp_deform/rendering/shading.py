@@ -280,7 +280,7 @@ def radiance(s: Surface, view: View, lighting: Lighting, lamp: Occluders, above:
             limit = lamp_limit(at)
             lamp_look = look(at, float(SOFT) + 1.0, limit, limit)
             direct = lighting.direct * cosine * seen
-            if s.gloss > 0.0:
+            if s.gloss * seen > 0.0:
                 half = wp.normalize(to_lamp + wp.normalize(view.origin - s.position))
                 h = wp.max(wp.dot(s.normal, half), 0.0)
                 h = h * h
@@ -325,8 +325,8 @@ def shade(
 ):
     """One thread a listed patch: the mean of each pixel's samples.
 
-    Samples of a pixel that see one primitive are shaded as one, in their middle. Depth and
-    segmentation are whole only with one sample a pixel.
+    A pixel whose samples all see one primitive is shaded once. Depth and segmentation are whole
+    only with one sample a pixel.
     """
     n = wp.tid()
     patch = patches[n]
@@ -334,7 +334,6 @@ def shade(
     left = patch % patch_columns * PATCH_SIDE
     lamp_looks = no_look()
     above_looks = no_look()
-    samples = supersample * supersample
     # `while`, as a `for` of unknown bounds is slow
     pixel = int(-1)
     while pixel < PATCH_SIDE * PATCH_SIDE - 1:
@@ -355,55 +354,32 @@ def shade(
                 c += 1
             r += 1
         # the table is painted where no primitive is, so its edge may go through a pixel of them
-        painted = lighting.table == 1 and supersample > 1
+        same = same and (supersample == 1 or lighting.table == 0 or key != wp.int64(0))
+        rows = wp.where(same, 1, supersample)
+        middle = wp.where(same, 0.5 * float(supersample - 1), 0.0)
         total = wp.vec3(0.0, 0.0, 0.0)
         a = int(0)
-        while a < samples:
-            row = float(r0) + 0.5 * float(supersample - 1)
-            column = float(c0) + 0.5 * float(supersample - 1)
-            count = int(samples)
-            earlier = bool(False)
-            whole = same and (not painted or key != wp.int64(0))
-            if not whole:
-                key = buffer[r0 + a / supersample, c0 + a % supersample]
-                row = float(0.0)
-                column = float(0.0)
-                count = int(0)
-                b = int(0)
-                r = r0
-                while r < r0 + supersample:
-                    c = c0
-                    while c < c0 + supersample:
-                        alike = primitive_of(buffer[r, c]) == primitive_of(key)
-                        if painted and key == wp.int64(0):
-                            alike = a == b
-                        if alike:
-                            row += float(r)
-                            column += float(c)
-                            count += 1
-                            earlier = earlier or b < a
-                        b += 1
-                        c += 1
-                    r += 1
-                row = row / float(count)
-                column = column / float(count)
-            if not earlier:
-                # apart from each other, as handing over the whole scene costs more than the floor
-                s = Surface()
-                if key == wp.int64(0):
-                    s = ground(lighting, view, row, column)
-                else:
-                    s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
-                color, lamp_look, above_look = radiance(s, view, lighting, lamp, above)
-                total += color * float(count)
-                lamp_looks = wp.min(lamp_looks, lamp_look)
-                above_looks = wp.min(above_looks, above_look)
-                if count == samples:
-                    deep = s.segment == NOTHING or s.depth > far
-                    out_depth[i, j] = wp.where(deep, far, s.depth)
-                    out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
-            a += wp.where(whole, samples, 1)
-        total = total / float(samples)
+        while a < rows * rows:
+            r = r0 + a / rows
+            c = c0 + a % rows
+            key = buffer[r, c]
+            row = float(r) + middle
+            column = float(c) + middle
+            # apart from each other, as handing over the whole scene costs more than the floor does
+            s = Surface()
+            if key == wp.int64(0):
+                s = ground(lighting, view, row, column)
+            else:
+                s = surface_at(scene, view, lighting, triangles, spheres, key, row, column)
+            color, lamp_look, above_look = radiance(s, view, lighting, lamp, above)
+            total += color
+            lamp_looks = wp.min(lamp_looks, lamp_look)
+            above_looks = wp.min(above_looks, above_look)
+            if same:
+                out_depth[i, j] = wp.where(s.segment == NOTHING or s.depth > far, far, s.depth)
+                out_segmentation[i, j] = wp.uint8(wp.max(s.segment, 0))
+            a += 1
+        total = total / float(rows * rows)
         out_color[i, j] = wp.vec3ub(
             wp.uint8(wp.sqrt(wp.min(total[0], 1.0)) * 255.0 + 0.5),
             wp.uint8(wp.sqrt(wp.min(total[1], 1.0)) * 255.0 + 0.5),

@@ -101,9 +101,7 @@ class ZBuffer:
     everything: whether it was drawn whole
     """
 
-    def __init__(
-        self, view: View, *, side: int, links: bool, device: wp.Device
-    ) -> None:
+    def __init__(self, view: View, *, side: int, links: bool, device: wp.Device) -> None:
         self.view, self.side, self._links, self._device = view, side, links, device
         self.keys = wp.zeros((view.rows, view.columns), dtype=wp.int64, device=device)
         self.everything = True
@@ -138,9 +136,7 @@ class ZBuffer:
         if everything:
             self.keys.zero_()
         else:
-            wp.launch(
-                empty, self.shape, inputs=[side, self.tiles, self.keys], device=device
-            )
+            wp.launch(empty, self.shape, inputs=[side, self.tiles, self.keys], device=device)
         where = [scene, self.view, self._windows, side, self.tiles]
         for kernel, dim, inputs in (
             (raster_triangles, spheres, [scene.points, scene.triangles, *where[1:], self.keys]),
