@@ -44,6 +44,7 @@ def evaluate_run(
     first_seed: int | None = None,
     video: Path | None = None,
     videos: int = 4,
+    video_arm: bool = True,
     workers: int | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
@@ -51,7 +52,7 @@ def evaluate_run(
 
     goals: folder of goals for the test episodes; None: constructed from goal seeds
     first_seed: of other test episodes; their results are kept apart
-    video: folder for videos of the first `videos` test episodes
+    video: folder for videos of the first `videos` test episodes; video_arm: also with the arm
     progress: tell of it on stderr, see `warp_deform.support.progress`
 
     Writes `eval_info.json` into the run's folder and returns what it says: task, agent, preset,
@@ -176,7 +177,7 @@ def evaluate_run(
         from .video import film_episodes
 
         count = min(videos, episodes)
-        paths = film_episodes(run, result, test, video, count=count)
+        paths = film_episodes(run, result, test, video, count=count, arm=video_arm)
         kept = {**kept, "videos": [str(path) for path in paths]}
         write_json(run.report, kept)
     return kept if first_seed is None else {**kept, "played": kept["other_seeds"][str(first_seed)]}

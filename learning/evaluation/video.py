@@ -90,12 +90,19 @@ def heat_maps(
 
 
 def film_episodes(
-    run: RunFolder, evaluation: Evaluation, protocol: Protocol, folder: Path, *, count: int
+    run: RunFolder,
+    evaluation: Evaluation,
+    protocol: Protocol,
+    folder: Path,
+    *,
+    count: int,
+    arm: bool = True,
 ) -> list[Path]:
     """Write MP4s of each of the first `count` episodes of an evaluation; returns their paths.
 
     `TASK_SEED.mp4` shows heat maps, `TASK_SEED_arm.mp4` the arm at work, as `filming.film` shows a
-    demonstrator's; the latter is missing where no action was done or the physics failed.
+    demonstrator's; the latter is missing where no action was done or the physics failed, and
+    without `arm`.
     They are played again, and have to come out as they did.
 
     Raises:
@@ -144,7 +151,7 @@ def film_episodes(
             shown = sights.pop(played.seed, [])
             if len(episode.rows) > len(shown):  # else the last state cannot be trusted
                 shown.append(_look(worlds, slot, None))
-                if episode.actions:
+                if arm and episode.actions:
                     states = [*hashes[played.seed], worlds.hash(slot)]
                     goal = None if given is None else given[played.seed]
                     takes.append(_take(worlds, slot, episode, shown, states, goal))

@@ -119,6 +119,10 @@ class Perspective:
         pictures = self._draw(drawables, particle_q, body_q, cameras, robot_links)
         return [picture.color.read() for picture in pictures]
 
+    def forget(self) -> None:
+        """Draw the next picture whole, whatever the last one was."""
+        self._whole = False
+
     def _draw(
         self,
         drawables: Drawables,

@@ -115,3 +115,7 @@ class SceneView:
         links = [*self._furniture, *robot_links]
         [color] = self._renderer.colors(drawables, particle_q, body_q, [self.camera], links)
         return color
+
+    def forget(self) -> None:
+        """Draw the next frame whole, whatever the last one was."""
+        self._renderer.forget()
