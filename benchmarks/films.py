@@ -2,12 +2,11 @@
 
     python benchmarks/films.py --out benchmarks/results/films.jsonl
 
-Collects one demonstration a task, films it as `warp-deform film`'s Python does (simulation, drawing,
-captions, encoder), once to compile and then `--repeats` times, and prints CPU seconds of the process
-and its encoder: the least of the repeats, as other work on the machine only adds. `--whole` times
-frames that forget the one before, too. Rows are appended, with the commit measured; run it from a
-worktree of an older commit to compare with that (it needs `warp_deform.collecting.video.film` alone, and
-`--whole` a commit that has `SceneView.forget`).
+Collects one demonstration a task, films it by `warp_deform.collecting.video.film` (simulation,
+drawing, captions, encoder), once to compile and then `--repeats` times, and prints CPU time of the
+process and its encoder: the least of the repeats, as other work on the machine only adds. `--whole`
+also times frames that forget the one before. Rows are appended, with the commit measured; that of
+581dce6 comes from this script in a worktree of that commit, with its names of the modules.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ import imageio_ffmpeg
 
 from warp_deform.collecting import video as filming
 from warp_deform.collecting.collect import CollectConfig, collect
-from warp_deform.rendering.scene_view import SceneView
 from warp_deform.collecting.workers import single_threaded
+from warp_deform.rendering.scene_view import SceneView
 
 
 class Whole(SceneView):

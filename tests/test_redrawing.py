@@ -9,13 +9,13 @@ import pytest
 import trimesh
 from drawable_samples import NO_BODIES, NO_PARTICLES, drawables
 
-from warp_deform.worlds.loop import worlds_for
+from warp_deform.collecting.workers import single_threaded
 from warp_deform.rendering.camera import look_at
 from warp_deform.rendering.geometry import Mesh, box_mesh
 from warp_deform.rendering.perspective import Perspective
 from warp_deform.rendering.scene_view import STUDIO, ArmMeshes, SceneView
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.collecting.workers import single_threaded
+from warp_deform.worlds.loop import worlds_for
 
 SIZE = (150, 266)
 GREY = (120, 130, 140)
