@@ -12,7 +12,7 @@ import warp as wp
 
 from .occlusion import CELL, TILE, Occluders
 
-__all__ = ["LOOKS", "PATCH", "Look6", "find_stale", "keep_looks", "look", "no_look"]
+__all__ = ["LOOKS", "PATCH", "find_stale", "keep_looks", "look", "no_look"]
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -28,14 +28,11 @@ SIDE = wp.constant(LOOKS // 2)
 MOST = wp.constant(0x7FFFFFFF)
 FAR_OFF = wp.constant(1.0e9)
 
-Look6 = wp.types.vector(length=6, dtype=wp.float32)
-"""Bounds of looks: least row, column and depth, and the greatest ones with another sign."""
-
 
 @wp.func
 def no_look():
-    """The bounds of no look."""
-    return Look6(FAR_OFF, FAR_OFF, FAR_OFF, FAR_OFF, FAR_OFF, FAR_OFF)
+    """The bounds of no look: least row, column and depth, and the greatest ones negated."""
+    return wp.spatial_vector(FAR_OFF, FAR_OFF, FAR_OFF, FAR_OFF, FAR_OFF, FAR_OFF)
 
 
 @wp.func
@@ -43,11 +40,13 @@ def look(at: wp.vec3, reach: float, least: float, greatest: float):
     """The bounds of a look at column and row `at`, `reach` samples to all sides."""
     if at[0] < 0.0:
         return no_look()
-    return Look6(at[1] - reach, at[0] - reach, least, -(at[1] + reach), -(at[0] + reach), -greatest)
+    return wp.spatial_vector(
+        at[1] - reach, at[0] - reach, least, -(at[1] + reach), -(at[0] + reach), -greatest
+    )
 
 
 @wp.func
-def keep_looks(bounds: Look6, patch: int, slot: int, looks: wp.array2d(dtype=int)):
+def keep_looks(bounds: wp.spatial_vector, patch: int, slot: int, looks: wp.array2d(dtype=int)):
     """Add the bounds of some looks to what a patch noted."""
     if bounds[0] < FAR_OFF:
         wp.atomic_min(looks, patch, slot, int(bounds[0]) / CELL)
