@@ -38,6 +38,7 @@ from warp_deform.objects import Bag, BagConfig, BoxConfig
 from warp_deform.quiet import quiet_warp
 from warp_deform.rollout import Frames, GripPath, rollout
 from warp_deform.solver import SolverFusedXPBD
+from warp_deform.support.quaternion import quat_from_yaw
 from warp_deform.tasks.metrics import hull_area
 
 DT, LANES, FIRST_SEED = 1 / 1200, 8, 5000
@@ -130,7 +131,7 @@ def insertion(box: BoxConfig, rng: np.random.Generator) -> GripPath:
     knots = [x0, [*x0[:2], 0.3], [*at, 0.3], [*at, 0.02]]
     times, knots = timed(knots, 0.4)
     yaw = rng.uniform(0, 2 * np.pi)
-    turns = np.array([[0, 0, np.sin(a / 2), np.cos(a / 2)] for a in (0, 0, yaw, yaw)])
+    turns = quat_from_yaw(np.array([0, 0, yaw, yaw]))
     return GripPath(times, knots, body=0, rotations=turns, lower=(times[2], times[3]))
 
 

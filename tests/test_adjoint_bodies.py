@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cloth_scenes import SMALL, cloth_solver
+from scipy.spatial.transform import Rotation
 from solver_scenes import (
     LOOSE,
     G,
@@ -150,9 +151,7 @@ def tilted(
 ) -> None:
     """Turn a body by a rotation vector and put it at height z."""
     poses, twists = solver.data.body_poses(0)
-    angle = np.linalg.norm(turn)
-    axis = np.asarray(turn) / angle
-    poses[body, 3:] = np.append(np.sin(angle / 2) * axis, np.cos(angle / 2))
+    poses[body, 3:] = Rotation.from_rotvec(turn).as_quat()
     poses[body, 2] = z
     solver.data.set_bodies(0, poses, twists)
 

@@ -34,6 +34,7 @@ from warp_deform.objects import Bag, BagConfig, add_bag, add_bag_mesh
 from warp_deform.objects.attributes import SpringMode, attribute
 from warp_deform.rollout import GripPath, Rollout, rollout
 from warp_deform.solver import SolverFusedXPBD
+from warp_deform.support.quaternion import quat_from_yaw
 from warp_deform.tasks.metrics import hull_area
 
 DT = 1 / 1200
@@ -245,7 +246,7 @@ def put_in(box, offset: tuple[float, float], yaw: float) -> GripPath:
     start = np.array([0.5, 0.35, -box.lowest])
     at = CENTRE + offset
     times, knots = timed([start, [*start[:2], 0.3], [*at, 0.3], [*at, 0.02]], 0.5)
-    turns = np.array([[0, 0, np.sin(a / 2), np.cos(a / 2)] for a in (0, 0, yaw, yaw)])
+    turns = quat_from_yaw(np.array([0, 0, yaw, yaw]))
     return GripPath(times, knots, body=0, rotations=turns, lower=(times[2], times[3]))
 
 

@@ -22,6 +22,7 @@ from warp_deform.robots.primitive import (
     find_grasp,
     solve_joints,
 )
+from warp_deform.support.quaternion import quat_from_yaw
 
 CONFIG = PrimitiveConfig()
 STAGE = Stage(lift=0.04, speed=0.15)
@@ -42,7 +43,7 @@ def scene(*boxes: BoxConfig):
 
 
 def pose(x: float, y: float, z: float, yaw: float = 0.0) -> list[float]:
-    return [x, y, z, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]
+    return [x, y, z, *quat_from_yaw(yaw)]
 
 
 def pick(x: float, y: float, yaw: float = 0.0) -> np.ndarray:

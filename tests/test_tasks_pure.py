@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from warp_deform.errors import InputError
 from warp_deform.rendering.images import Images
 from warp_deform.rendering.pixels import SHAPE, pixel_to_world, world_to_pixel
+from warp_deform.support.quaternion import quat_from_yaw, quat_yaw
 from warp_deform.tasks.block import BlockNotarget
 from warp_deform.tasks.cable_line import CableLineNotarget
 from warp_deform.tasks.cable_ring import CableRing, CableRingNotarget
 from warp_deform.tasks.cable_shape import CableShape, CableShapeNotarget
 from warp_deform.tasks.demonstrators import farthest_bead, ring_maps, visible_point
 from warp_deform.tasks.free_space import FreeSpace, NoFreeSpace
-from warp_deform.tasks.ground_truth import quaternion_yaw
 from warp_deform.tasks.registry import TASKS, task
 from warp_deform.tasks.shapes import chain_yaw, to_world
 from warp_deform.tasks.task import Layout, Snapshot
@@ -49,7 +49,7 @@ def snapshot(beads: np.ndarray, layout: Layout, body_q: np.ndarray | None = None
             near = np.linalg.norm(points - beads[i, :2], axis=-1) <= 0.0075
             segmentation[near] = segments[-1][i]
         for body in body_q:
-            pose = np.array([*body[:2], quaternion_yaw(body[3:])])
+            pose = np.array([*body[:2], quat_yaw(body[3:])])
             for part in BlockNotarget.block.parts:
                 x, y = np.array(part.size[:2]) / 2
                 square = np.array([[-x, -y], [x, -y], [x, y], [-x, y]]) + part.offset[:2]
@@ -354,8 +354,8 @@ def test_block_action_carries_the_block_exactly_to_the_target(seed: int) -> None
     assert action[6] == 0.30
     x, y = layout.body_q[0, :2]
     spot = to_world(np.array([[x, y]]) - pick, np.array([*place, turn]))[0]
-    yaw = quaternion_yaw(layout.body_q[0, 3:]) + turn
-    moved = np.array([*spot, -item.block.lowest, 0, 0, math.sin(yaw / 2), math.cos(yaw / 2)])
+    yaw = quat_yaw(layout.body_q[0, 3:]) + turn
+    moved = np.array([*spot, -item.block.lowest, *quat_from_yaw(yaw)])
     after = snapshot(layout.particle_q, layout, moved[None])
     assert not item.solved(layout, state)
     assert item.solved(layout, after)

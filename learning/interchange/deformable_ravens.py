@@ -42,7 +42,7 @@ from warp_deform.errors import InputError
 from warp_deform.rendering.camera import Camera
 from warp_deform.rendering.fusion import fuse
 from warp_deform.support.progress import progress_bar
-from warp_deform.tasks.ground_truth import quaternion_yaw
+from warp_deform.support.quaternion import quat_yaw
 from warp_deform.tasks.registry import TASKS
 from warp_deform.tasks.registry import task as find_task
 
@@ -301,7 +301,7 @@ def _action(action: Mapping[str, Any]) -> list[float]:
     values: list[float] = []
     for name in ("pose0", "pose1"):
         position, quat_xyzw = action["params"][name]
-        yaw = quaternion_yaw(_numbers(quat_xyzw, 4))
+        yaw = float(quat_yaw(_numbers(quat_xyzw, 4)))
         values += [*_numbers(position, 3)[:2].tolist(), yaw]
     return values
 
@@ -375,13 +375,13 @@ def _targets(task: str, last: _Row) -> np.ndarray | None:
     """What the last state stands for as a goal, see `Task.goal_targets`; None if unknown."""
     if task == "block-notarget" and len(last.body_q) == 1:
         x, y = last.body_q[0, :2].astype(float)
-        return np.array([x, y, quaternion_yaw(last.body_q[0, 3:])])
+        return np.array([x, y, quat_yaw(last.body_q[0, 3:])])
     if task in ("cable-shape-notarget", "cable-line-notarget") and len(last.body_q) == 24:
         return last.body_q[:, :2].astype(float)
     if task == "fabric-flat-notarget" and last.zone_pose is not None:
         position, quat_xyzw = last.zone_pose
         x, y, _ = _numbers(position, 3)
-        yaw = quaternion_yaw(_numbers(quat_xyzw, 4))
+        yaw = float(quat_yaw(_numbers(quat_xyzw, 4)))
         return np.vstack([[x, y, yaw], last.particle_q]).astype(float)
     return None
 

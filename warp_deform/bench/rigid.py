@@ -13,6 +13,7 @@ from ..objects.box import add_box, l_block
 from ..objects.cable import add_cable
 from ..peers import PeerScene, peer_scene
 from ..solver.solver import SolverFusedXPBD
+from ..support.quaternion import quat_from_yaw
 from ..tasks.block import BlockNotarget
 from ..tasks.cable_physics import CABLE_SOLVER
 from .timing import Played, time_worlds
@@ -58,9 +59,8 @@ def _place(solver: SolverFusedXPBD, starts: list[PeerScene]) -> None:
             solver.data.lane("particles.x", world)[:] = start.beads
             solver.data.lane("particles.v", world)[:] = 0.0
         else:
-            yaw = start.block_yaw
-            quat = [0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]
-            solver.data.set_bodies(world, np.array([[*start.block_position, *quat]]))
+            turn = quat_from_yaw(start.block_yaw)
+            solver.data.set_bodies(world, np.array([[*start.block_position, *turn]]))
 
 
 def _play(scene: str, seconds: float, solver: SolverFusedXPBD, seeds: list[int]) -> Played:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..rollout.differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
 from ..rollout.launch import GripPath
+from ..support.quaternion import quat_by_rotation
 from ..worlds.worlds import Worlds
 from .branches import counted, taken
 from .draws import Draw, touching_of
@@ -349,7 +350,7 @@ def _moved(name: str, base: np.ndarray, by: np.ndarray) -> np.ndarray:
     if name == "body_velocities":
         return base + by * _TWIST
     if name == "body_poses":
-        turn = base[:, 3:] + np.einsum("bk,bkq->bq", by[:, 3:] / ARM, _turns(base))
+        turn = base[:, 3:] + np.einsum("bk,bkq->bq", by[:, 3:] / ARM, quat_by_rotation(base[:, 3:]))
         turn /= np.linalg.norm(turn, axis=1, keepdims=True)
         return np.column_stack([base[:, :3] + by[:, :3], turn])
     return base + by
@@ -363,7 +364,7 @@ def _gradient(gradients: Gradients, name: str, base: dict[str, np.ndarray]) -> n
     if name == "body_velocities":
         return value * _TWIST
     if name == "body_poses":
-        turn = np.einsum("bq,bkq->bk", value[:, 3:], _turns(base[name])) / ARM
+        turn = np.einsum("bq,bkq->bk", value[:, 3:], quat_by_rotation(base[name][:, 3:])) / ARM
         return np.column_stack([value[:, :3], turn])
     if name == "knot_times":
         return value * (np.arange(len(value)) > 0)
@@ -371,10 +372,3 @@ def _gradient(gradients: Gradients, name: str, base: dict[str, np.ndarray]) -> n
 
 
 _TWIST = np.array([1.0] * 3 + [1 / ARM] * 3)
-
-
-def _turns(poses: np.ndarray) -> np.ndarray:
-    """How quaternions change with a rotation vector (B, 3, 4): half its product with them."""
-    x, y, z, w = poses[:, 3:].T / 2
-    rows = [[w, -z, y, -x], [z, w, -x, -y], [-y, x, w, -z]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)

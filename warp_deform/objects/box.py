@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..support.checked import NOT_NEGATIVE, POSITIVE, check_fields, real_array
+from ..support.quaternion import quat_from_yaw
 from .attributes import register_attributes
 from .colors import RED, Color
 
@@ -109,9 +110,8 @@ def add_box(
         raise InputError(f"a box needs a finite pose, got {position}, yaw {yaw}")
     register_attributes(builder)
     centre, tensor = config.inertia()
-    quaternion = wp.quat(0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
     body = builder.add_body(
-        xform=wp.transform(wp.vec3(*position), quaternion),
+        xform=wp.transform(wp.vec3(*position), wp.quat(*quat_from_yaw(yaw).tolist())),
         com=wp.vec3(*centre),
         inertia=wp.mat33(*tensor.flatten()),
         mass=config.mass,

@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..rendering.pixels import BOUNDS
 from ..robots.primitive import LIFT, Motion, solve_joints
 from ..rollout.launch import GripPath, rollout
+from ..support.quaternion import quat_from_yaw
 from ..tasks.task import Action, Task
 from ..worlds.episode import ALOFT_EVERY, Carry, Plan
 from ..worlds.state import WorldState
@@ -240,13 +241,12 @@ class _Bend:
         share = np.linspace(0.0, 1.0, len(values) // 3 + 2)[1:-1]
         between = yaws[self.first] + share * (yaws[self.last] - yaws[self.first])
         yaws = np.concatenate([yaws[: self.first + 1], between, yaws[self.last :]])
-        zeros = np.zeros_like(yaws)
         lower, late = self.base.lower, float(times[-1]) - float(self.base.times[-1])
         return replace(
             self.base,
             times=times.numpy(),
             positions=positions.numpy(),
-            rotations=np.column_stack([zeros, zeros, np.sin(yaws / 2), np.cos(yaws / 2)]),
+            rotations=quat_from_yaw(yaws),
             lower=None if lower is None else (lower[0] + late, lower[1] + late),
         )
 

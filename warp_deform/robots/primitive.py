@@ -23,6 +23,7 @@ from ..objects.box import Box
 from ..objects.cable import Cable
 from ..objects.cloth import Cloth
 from ..rollout.launch import GripPath
+from ..support.quaternion import quat_from_yaw, quat_inverse, quat_multiply, quat_rotate
 
 if TYPE_CHECKING:
     from ..objects.scene_object import SceneObject
@@ -160,16 +161,16 @@ def find_grasp(
         return None
     height, particle, body = best
     tip = np.array([x, y, height])
-    back = _yaw_quat(-yaw)
+    back = quat_from_yaw(-yaw)
     if particle is not None:
-        offset = _rotate(back, particle_q[particle] - tip)
+        offset = quat_rotate(back, particle_q[particle] - tip)
         sheet = any(isinstance(o, Cloth | Bag) and particle in o.particles for o in objects)
-        return Grasp(height, offset, _yaw_quat(0.0), particle=particle, sheet=sheet)
+        return Grasp(height, offset, quat_from_yaw(0.0), particle=particle, sheet=sheet)
     assert body is not None
     com = next(o for o in objects if isinstance(o, Box) and o.body == body).config.inertia()[0]
-    centre = body_q[body, :3] + _rotate(body_q[body, 3:], com)
-    turn = _multiply(back, body_q[body, 3:])
-    return Grasp(height, _rotate(back, centre - tip), turn, body=body)
+    centre = body_q[body, :3] + quat_rotate(body_q[body, 3:], com)
+    turn = quat_multiply(back, body_q[body, 3:])
+    return Grasp(height, quat_rotate(back, centre - tip), turn, body=body)
 
 
 def approach(
@@ -222,7 +223,7 @@ def carry(
     path = GripPath(
         times=times,
         positions=way_points[:, :3],
-        rotations=np.array([_yaw_quat(w[3]) for w in way_points]),
+        rotations=np.array([quat_from_yaw(w[3]) for w in way_points]),
         particle=grasp.particle,
         body=grasp.body,
         offset=grasp.offset,
@@ -324,9 +325,9 @@ def _thickness(sheet: Cloth | Bag, particle: int) -> float:
 def _box_top(x: float, y: float, box: Box, pose: np.ndarray) -> float | None:
     """Height at which a vertical line through x, y first meets a body, or None."""
     best: float | None = None
-    back = pose[3:] * [-1, -1, -1, 1]
-    start = _rotate(back, np.array([x, y, 1.0]) - pose[:3])
-    along = _rotate(back, np.array([0.0, 0.0, -1.0]))
+    back = quat_inverse(pose[3:])
+    start = quat_rotate(back, np.array([x, y, 1.0]) - pose[:3])
+    along = quat_rotate(back, np.array([0.0, 0.0, -1.0]))
     for part in box.config.parts:
         half = np.array(part.size) / 2
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -338,18 +339,3 @@ def _box_top(x: float, y: float, box: Box, pose: np.ndarray) -> float | None:
         if low <= high and (best is None or 1.0 - low > best):
             best = 1.0 - float(low)
     return best
-
-
-def _yaw_quat(yaw: float) -> np.ndarray:
-    return np.array([0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
-
-
-def _rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    twice = 2.0 * np.cross(quat[:3], vector)
-    return vector + quat[3] * twice + np.cross(quat[:3], twice)
-
-
-def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product of two quaternions xyzw."""
-    xyz = a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])
-    return np.append(xyz, a[3] * b[3] - a[:3] @ b[:3])

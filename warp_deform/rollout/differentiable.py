@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..support.checked import POSITIVE, check_number
+from ..support.quaternion import quat_rotate_vjp, quat_tangent
 from ..xpbd.lanes.tape import Kind
 from ..xpbd.recording.recorder import Recorder
 from .launch import GripPath, prepare
@@ -276,7 +276,7 @@ class DifferentiableRollout:
                 rest = g[:, 3:]
                 if names[1] == "q":
                     turn = state["bodies.q"][rows]
-                    rest = _on_sphere(turn, rest - _turned_by(com, turn, g[:, :3]))
+                    rest = quat_tangent(turn, rest - quat_rotate_vjp(turn, com, g[:, :3]))
                 cotangent[f"bodies.{names[1]}"][rows] = rest
 
     def _by_frames(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -286,7 +286,9 @@ class DifferentiableRollout:
         by_x, by_q = self._of_bodies(x), self._of_bodies(q)
         if by_x.shape[1]:
             turned = zip(self._turns, by_x, by_q, strict=True)
-            by_q = np.stack([_on_sphere(t, gq + _turned_by(com, t, gx)) for t, gx, gq in turned])
+            by_q = np.stack(
+                [quat_tangent(t, gq + quat_rotate_vjp(t, com, gx)) for t, gx, gq in turned]
+            )
         return np.concatenate([by_x, by_q], axis=-1)
 
     def _worldwise(self, lanes: np.ndarray) -> np.ndarray:
@@ -312,20 +314,6 @@ class DifferentiableRollout:
         data = self.solver.data
         slots = [divmod(int(data.slot[w]), data.lanes) for w in self._worlds]
         return np.stack([lanes[group, ..., lane] for group, lane in slots])
-
-
-def _turned_by(offset: np.ndarray, turn: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """Derivatives (B, 4) by quaternions of g . (offsets turned by them)."""
-    v, w = turn[:, :3], turn[:, 3:]
-    dot = functools.partial(np.einsum, "bi,bi->b")
-    by_v = 2 * w * np.cross(offset, g) + 2 * g * dot(v, offset)[:, None]
-    by_v += 2 * offset * dot(v, g)[:, None] - 4 * v * dot(g, offset)[:, None]
-    return np.column_stack([by_v, 2 * dot(g, np.cross(v, offset))])
-
-
-def _on_sphere(turn: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """Derivatives by unit quaternions without their share along these."""
-    return g - turn * (turn * g).sum(axis=-1, keepdims=True)
 
 
 def substep_vjp(

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..objects.push import MOST_PUSHES
 from ..support.checked import NOT_NEGATIVE, Interval, check_number, real_array
+from ..support.quaternion import quat_same_side
 
 if TYPE_CHECKING:
     from ..objects.push import Push
@@ -222,18 +223,9 @@ def _write_paths(solver: FusedXPBD, paths: Mapping[int, GripPath]) -> None:
         views["grips.position"][k : k + n] = path.positions
         if path.particle is not None:
             data.tether(w, path.particle)
-        rotations = _IDENTITY if path.rotations is None else _same_side(path.rotations)
+        rotations = _IDENTITY if path.rotations is None else quat_same_side(path.rotations)
         views["grips.rotation"][k : k + n] = rotations
         k += n
-
-
-def _same_side(rotations: np.ndarray) -> np.ndarray:
-    """Flip quaternions so that neighbours interpolate the short way round."""
-    out = np.array(rotations, dtype=float)
-    for i in range(1, len(out)):
-        if out[i] @ out[i - 1] < 0:
-            out[i] = -out[i]
-    return out
 
 
 def _frames(solver: FusedXPBD, world: int, steps: int, every: int) -> Frames | None:

@@ -14,10 +14,11 @@ from ..objects.bag import add_bag
 from ..objects.box import Box, BoxConfig, BoxPart, add_box
 from ..objects.colors import BLUE, CYAN, GREEN, PURPLE, RED, YELLOW, Color
 from ..objects.scene_object import SceneObject
+from ..support.quaternion import quat_from_yaw, quat_yaw
 from .bag_opening import BAG_ROWS, BagTask
 from .bag_physics import INSERT, OPEN
 from .free_space import FreeSpace, NoFreeSpace
-from .ground_truth import Row, pose_rows, quaternion_yaw
+from .ground_truth import Row, pose_rows
 from .task import Action, Layout, Snapshot, Stage
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ class BagColorGoal(BagTask):
         block_color = COLORS[rng.integers(len(COLORS))]
         return Layout(
             particle_q=np.concatenate([first, self.drop(rng, ox, oy)]),
-            body_q=np.array([[bx, by, height / 2, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]]),
+            body_q=np.array([[bx, by, height / 2, *quat_from_yaw(yaw)]]),
             targets=np.concatenate([[[x, y, color]], np.zeros((69, 3))]),
             pushes=(self.push(rng, 0), self.push(rng, len(first))),
             settle_seconds=self.settle_seconds,
@@ -267,7 +268,7 @@ class BagColorGoal(BagTask):
             [
                 self.bag_rows(layout, snapshot, 0),
                 self.bag_rows(layout, snapshot, 1),
-                pose_rows(block[:2], quaternion_yaw(block[3:])),
+                pose_rows(block[:2], quat_yaw(block[3:])),
                 np.array(colors, np.float32) / 255,
             ]
         )

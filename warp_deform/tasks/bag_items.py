@@ -16,11 +16,12 @@ from ..objects.scene_object import SceneObject
 from ..objects.zone import square_zone
 from ..rendering.pixels import pixel_to_world
 from ..robots.primitive import Outcome
+from ..support.quaternion import quat_from_yaw, quat_yaw
 from .bag_opening import BAG_ROWS, BagTask
 from .bag_physics import CARRY, INSERT, OPEN
 from .demonstrators import pick_place
 from .free_space import FreeSpace, NoFreeSpace
-from .ground_truth import Row, pose_rows, quaternion_yaw
+from .ground_truth import Row, pose_rows
 from .past import PastAction
 from .shapes import to_world
 from .task import Action, Layout, Snapshot, Stage
@@ -93,7 +94,7 @@ class BagItems1(BagTask):
         for config in configs:
             width, depth, height = config.parts[0].size
             px, py, yaw = space.sample(rng, width, depth)
-            poses.append([px, py, height / 2, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)])
+            poses.append([px, py, height / 2, *quat_from_yaw(yaw)])
             space = space.occupy_disc((px, py), float(np.hypot(width, depth)) / 2)
         return Layout(
             particle_q=particles,
@@ -315,7 +316,7 @@ class BagItems1(BagTask):
         Each is x, y, -yaw / 15.
         """
         frame = _frame(layout)
-        yaws = np.array([quaternion_yaw(q[3:]) for q in snapshot.body_q])
+        yaws = np.array([quat_yaw(q[3:]) for q in snapshot.body_q])
         return np.concatenate(
             [
                 pose_rows(frame, frame[2]),

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from ..objects.box import Box, BoxConfig, add_box, l_block
+from ..support.quaternion import quat_from_yaw, quat_yaw
 from ..xpbd.config import SolverConfig
 from .demonstrators import pick_place_pose, visible_point
 from .free_space import FreeSpace
-from .ground_truth import Row, pose_rows, quaternion_yaw
+from .ground_truth import Row, pose_rows
 from .metrics import pose_error, wrap_angle
 from .shapes import to_world
 from .task import Action, Layout, Snapshot, Stage, Task
@@ -123,8 +124,8 @@ class BlockNotarget(Task):
     def _body(self, pose: np.ndarray) -> np.ndarray:
         """Pose (1, 7) of the upright block on the table at `pose` (3,)."""
         x, y, yaw = pose
-        return np.array([[x, y, -self.block.lowest, 0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]])
+        return np.array([[x, y, -self.block.lowest, *quat_from_yaw(yaw)]])
 
     def _pose(self, snapshot: Snapshot) -> np.ndarray:
         x, y, *_ = snapshot.body_q[0]
-        return np.array([x, y, quaternion_yaw(snapshot.body_q[0, 3:7])], dtype=float)
+        return np.array([x, y, quat_yaw(snapshot.body_q[0, 3:7])], dtype=float)

@@ -12,11 +12,12 @@ import numpy as np
 from ..objects.box import Box, BoxConfig, add_box
 from ..objects.cloth import Cloth, ClothConfig, add_cloth, cloth_sheet
 from ..rendering.pixels import PIXEL_SIZE
+from ..support.quaternion import quat_from_yaw, quat_yaw
 from .cloth_physics import FABRIC, FABRIC_PRIMITIVE, FABRIC_SOLVER, FABRIC_SPEED
 from .demonstrators import pick_place
 from .fabric_pull import beyond, corners, first_taken, on_table
 from .free_space import FreeSpace
-from .ground_truth import Row, pose_rows, quaternion_yaw
+from .ground_truth import Row, pose_rows
 from .metrics import wrap_angle
 from .shapes import to_world
 from .task import Action, Layout, Snapshot, Stage, Task
@@ -78,7 +79,7 @@ class FabricCover(Task):
         )
         turn = rng.normal(0.0, _YAW_SPREAD)
         turned = wrap_angle(yaw)
-        pose = [x, y, -self.cube.lowest, 0.0, 0.0, np.sin(turned / 2), np.cos(turned / 2)]
+        pose = [x, y, -self.cube.lowest, *quat_from_yaw(turned)]
         return Layout(
             particle_q=cloth_sheet(self.fabric, (u, v), yaw=turn, height=_DROP),
             body_q=np.array([pose]),
@@ -150,7 +151,7 @@ class FabricCover(Task):
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(303,): x, y, -yaw / 15 of the cube, then x, y, z of every vertex."""
         cube = snapshot.body_q[0]
-        rows = pose_rows(cube, quaternion_yaw(cube[3:]))
+        rows = pose_rows(cube, quat_yaw(cube[3:]))
         return np.concatenate([rows.ravel(), snapshot.particle_q.ravel()]).astype(np.float32)
 
     def _distance(self, snapshot: Snapshot) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["YAW_SCALE", "Row", "Rows", "pose_rows", "quaternion_yaw", "row_count", "row_kinds",
+__all__ = ["YAW_SCALE", "Row", "Rows", "pose_rows", "row_count", "row_kinds",
            "rows_of", "yaw_columns"]  # fmt: skip
 
 YAW_SCALE = 15.0
@@ -93,13 +93,3 @@ def pose_rows(xy: np.ndarray, yaw: np.ndarray | float) -> np.ndarray:
     return np.column_stack([xy, np.broadcast_to(-np.asarray(yaw) / YAW_SCALE, len(xy))]).astype(
         np.float32
     )
-
-
-def quaternion_yaw(quat_xyzw: np.ndarray) -> float:
-    """Turn about the vertical axis [rad, -pi to pi] of a rotation given as quat_xyzw (4,).
-
-    >>> round(quaternion_yaw(np.array([0.0, 0.0, np.sin(0.2), np.cos(0.2)])), 6)
-    0.4
-    """
-    x, y, z, w = np.asarray(quat_xyzw, dtype=float)
-    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))

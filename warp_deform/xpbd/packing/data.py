@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from ...objects.push import MOST_PUSHES
+from ...support.quaternion import quat_rotate
 from ..bodies.box_box import POINTS
 from ..springs.tether import NO_TETHER
 from .groups import NUMPY, PackedWorlds
@@ -316,7 +317,7 @@ class SolverData(PackedWorlds):
         # a unit quaternion stays as it is, so that steps through a Newton state lose no bits
         norm = np.linalg.norm(quat, axis=1, keepdims=True)
         quat = np.where(np.abs(norm - 1.0) > 1e-6, quat / norm, quat)
-        views["bodies.x"][rows] = np.asarray(body_q)[:, :3] + _rotate(quat, com)
+        views["bodies.x"][rows] = np.asarray(body_q)[:, :3] + quat_rotate(quat, com)
         views["bodies.q"][rows] = quat
         views["bodies.v"][rows] = 0.0 if body_qd is None else np.asarray(body_qd)[:, :3]
         views["bodies.omega"][rows] = 0.0 if body_qd is None else np.asarray(body_qd)[:, 3:]
@@ -332,7 +333,7 @@ class SolverData(PackedWorlds):
     @staticmethod
     def frame_poses(x: np.ndarray, quat: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Poses (B, 7) of body frames from centres of mass x (B, 3), turns and offsets (B, 3)."""
-        return np.column_stack([x - _rotate(quat, com), quat])
+        return np.column_stack([x - quat_rotate(quat, com), quat])
 
 
 def _contact_room(shape_body: np.ndarray) -> int:
@@ -345,10 +346,3 @@ def _contact_room(shape_body: np.ndarray) -> int:
 def _field(name: str) -> str:
     """Field of `WorldTopology` that fills an array: "springs.length" is "spring_length"."""
     return name.replace("s.", "_", 1)
-
-
-def _rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Rotate vectors (n, 3) by quaternions (n, 4) xyzw."""
-    axis, w = quat[:, :3], quat[:, 3:]
-    twice = 2.0 * np.cross(axis, vector)
-    return vector + w * twice + np.cross(axis, twice)
