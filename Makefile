@@ -52,7 +52,7 @@ bench: $(STAMP)
 # Not --quiet: that hides warnings from --strict, too.
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
-	@echo "open build/site/index.html"
+	@echo "open build/site/index.html; to search it, serve it: python3 -m http.server -d build/site"
 
 clean:
 	rm -rf demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -26,6 +26,7 @@ from .places import MOST_GROWTH, Places
 __all__ = ["MOST_GROWTH"]  # `warp_deform.planning` is the import path of the rest
 
 METHODS = ("enumerate", "random", "cem", "gradient")
+"""The methods of `search` by name."""
 JOINT_STEPS = 8
 """Most steps that two actions go downhill together."""
 SLOPE_COST = 4

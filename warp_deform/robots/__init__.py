@@ -18,6 +18,7 @@ ROBOTS = {config.name: config for config in (UR5, PANDA)}
 
 if TYPE_CHECKING:
     RobotName = str
+    """Name of an arm, one of `ROBOTS`."""
 else:  # the choices that a command's help shows
     RobotName = Literal[tuple(ROBOTS)]
 
