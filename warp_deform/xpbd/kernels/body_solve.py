@@ -13,7 +13,7 @@ from ..bodies.box_particle_adjoint import box_particle_adjoint
 from ..bodies.box_triangle import box_triangle
 from ..bodies.box_triangle_adjoint import box_triangle_adjoint
 from ..bodies.rigid_body_adjoint import rigid_adjoint
-from ..lanes.structures import structures
+from ..lanes.group_state import group_state
 from ..lanes.tape import BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS
 
 __all__ = ["body_solve"]
@@ -21,14 +21,15 @@ __all__ = ["body_solve"]
 
 @functools.cache
 def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) -> SimpleNamespace:
-    """`solve_bodies(g, lane, k, ...)`: the contacts of the bodies of one lane, in a fixed order.
+    """`solve_bodies(...)`: the contacts of all bodies, lane by lane and in a fixed order.
 
     `taped`, each that acts with a particle or a triangle leaves what its adjoint needs on the tape
     from `tops` on, and bodies their poses before contacts with each other. Returns the tops after
     that.
     """
-    t = structures(scalar, lanes)
-    S, R3 = t.S, t.R3
+    t = group_state(scalar, lanes)
+    S, R3, L = t.S, t.R3, t.L
+    Span, Pace, Run = t.Span, t.Pace, t.Run
     Topology, Shapes, Group, Particles = t.Topology, t.Shapes, t.Group, t.Particles
     Bodies, Contacts, Sheets, Cells = t.Bodies, t.Contacts, t.Sheets, t.Cells
     Tape = t.Tape
@@ -42,27 +43,32 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
     solve_contacts, end_body = bodies_.solve_contacts, bodies_.end_body
 
     @wp.func
-    def solve_bodies(
-        g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
-        tops: wp.vec4i, q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets,
+    def solve_lane(
+        lane: int, at: Span, pace: Pace, tops: wp.vec4i, top: Topology, shapes: Shapes,
+        group: Group, q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets,
         cells: Cells, tape: Tape,
     ):  # fmt: skip
         """Contacts of one lane's bodies with particles, each other and the table."""
-        p0 = group.particle_start[g]
-        count = top.body_count[k]
-        b0 = group.body_start[g] + lane * count
-        first = group.shape_start[g] + lane * top.shape_count[k]
-        last = first + top.shape_count[k]
-        mv = group.contact_friction[g]
-        mu = mv[lane]
-        radii = top.particle_start[k]
+        g = at.g
+        k = at.k
+        push = pace.push
+        p0 = at.p0
+        count = at.bodies
+        b0 = at.b0 + lane * count
+        first = at.shape0 + lane * at.shapes
+        last = first + at.shapes
+        mu = pace.contact_mu[lane]
+        radii = at.radii
+        for b in range(b0, b0 + count):
+            bodies.touching[b] = 0
+            bodies.support[b] = 0
         mark = int(tops[2])
         for shape in range(first, last):
             b = b0 + shapes.body[shape]
             far = wp.length(shapes.half[shape])
             center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
             thickest = S(0.0)
-            for i in range(top.particle_count[k]):
+            for i in range(at.particles):
                 radius = top.radius[radii + i]
                 thickest = wp.max(thickest, radius)
                 x = q.x[p0 + i]
@@ -103,6 +109,20 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
         solve_contacts(group.contact_start[g], end, bodies, contacts)
         for b in range(b0, b0 + count):
             end_body(b, bodies)
+        return tops
+
+    @wp.func
+    def solve_bodies(
+        at: Span, pace: Pace, run: Run, tops: wp.vec4i, top: Topology, shapes: Shapes,
+        group: Group, q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets,
+        cells: Cells, tape: Tape,
+    ):  # fmt: skip
+        for lane in range(wp.static(L)):
+            if run.on[lane] > S(0.0):
+                tops = solve_lane(
+                    lane, at, pace, tops, top, shapes, group, q, bodies, contacts, sheets, cells,
+                    tape,
+                )  # fmt: skip
         return tops
 
     return SimpleNamespace(solve_bodies=solve_bodies)

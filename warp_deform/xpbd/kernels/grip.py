@@ -10,6 +10,7 @@ from ..bodies.box_particle import box_particle
 from ..bodies.box_table import box_table
 from ..contact.sphere_contact import sphere_contact
 from ..lanes.algebra import add, mul, sub  # noqa: F401  (operators are found by name)
+from ..lanes.group_state import group_state
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from ..lanes.tape import Kind
@@ -29,8 +30,8 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
     `lower_end` the descent ends where the held thing meets anything; the rest of the path (the
     dwell) is then shifted to that place. Held things are kinematic: their inverse mass is 0.
     """
-    t = structures(scalar, lanes)
-    S, R3 = t.S, t.R3
+    t = group_state(scalar, lanes)
+    S, R3, Span, Topology = t.S, t.R3, t.Span, t.Topology
     Shapes, Pairs, Particles = t.Shapes, t.Pairs, t.Particles
     Bodies, Grips, Near = t.Bodies, t.Grips, t.Near
     touches = sphere_contact(scalar, lanes).touches
@@ -60,15 +61,19 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def reached(
-        w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int, radius: S,
-        q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
+        w: int, lane: int, at: Span, near_count: int, top: Topology, q: Particles, pairs: Pairs,
+        shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
     ):  # fmt: skip
         """Whether a held particle touches another one or a box, or a held body anything."""
         hit = bool(False)
+        b0 = at.b0 + lane * at.bodies
+        first = at.shape0 + lane * at.shapes
+        last = first + at.shapes
         particle = grips.particle[w]
         if particle >= 0:
-            hit = touches(particle, lane, p0, start, n, q, pairs, near)
-            x = q.x[p0 + particle]
+            radius = top.radius[at.radii + particle]
+            hit = touches(particle, lane, at.p0, at.near0, near_count, q, pairs, near)
+            x = q.x[at.p0 + particle]
             p = R3(x.x[lane], x.y[lane], x.z[lane])
             for shape in range(first, last):
                 gap = particle_gap(p, shape, b0 + shapes.body[shape], shapes, bodies)
@@ -90,17 +95,14 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def follow_path(
-        met: bool, w: int, lane: int, p0: int, b0: int, first: int, last: int, start: int, n: int,
-        radius: S, dt: S, q: Particles, pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies,
-        grips: Grips,
+        lane: int, met: bool, at: Span, near_count: int, dt: S, top: Topology, q: Particles,
+        pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips,
     ):  # fmt: skip
+        w = at.w0 + lane
         tick = grips.tick[w] + 1
         clock = S(tick) * dt
         if clock > grips.lower_start[w] and clock < grips.lower_end[w]:
-            if met or reached(
-                w, lane, p0, b0, first, last, start, n, radius, q, pairs, shapes, near, bodies,
-                grips,
-            ):  # fmt: skip
+            if met or reached(w, lane, at, near_count, top, q, pairs, shapes, near, bodies, grips):
                 set_knot(w, clock - dt, grips)
                 here = tip_position(w, clock - dt, grips)
                 tick = int(grips.lower_end[w] / dt)
@@ -114,14 +116,14 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
         held = position + wp.quat_rotate(rotation, grips.offset[w])
         particle = grips.particle[w]
         if particle >= 0:
-            i = p0 + particle
+            i = at.p0 + particle
             x = q.x[i]
             x.x[lane] = held[0]
             x.y[lane] = held[1]
             x.z[lane] = held[2]
             q.x[i] = x
         else:
-            b = b0 + grips.body[w]
+            b = at.b0 + lane * at.bodies + grips.body[w]
             bodies.x[b] = held
             bodies.q[b] = wp.normalize(rotation * grips.turn[w])
         return clock < grips.time[grips.knot_end[w] - 1]

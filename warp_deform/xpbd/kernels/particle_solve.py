@@ -13,7 +13,7 @@ from ..contact.sphere_contact import sphere_contact, sphere_contact_adjoint
 from ..contact.triangle_contact import triangle_contact
 from ..contact.triangle_contact_adjoint import triangle_contact_adjoint
 from ..lanes.algebra import any_less, sub  # noqa: F401  (operators are found by name)
-from ..lanes.structures import structures
+from ..lanes.group_state import group_state
 from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS
 from ..springs.bending import bending, bending_adjoint
 from ..springs.distance import distance, distance_adjoint
@@ -29,7 +29,7 @@ def particle_solve(
     """`solve_particles(g, ...)`: the constraints of a group once; `taped`, each leaves what its
     adjoint needs on the tape from `tops` on. Returns the tops after that.
     """
-    t = structures(scalar, lanes)
+    t = group_state(scalar, lanes)
     S, V, L = t.S, t.V, t.L
     project_distance = distance(scalar, lanes, with_sheets).project_distance
     record_distance = distance_adjoint(scalar, lanes, with_sheets).record_distance
@@ -43,18 +43,23 @@ def particle_solve(
     record_triangles = triangle_contact_adjoint(scalar, lanes).record_triangles
     project_edges = edge_contact(scalar, lanes).project_edges
     record_edges = edge_contact_adjoint(scalar, lanes).record_edges
+    Span, Pace, Run = t.Span, t.Pace, t.Run
     Particles, Springs, Pairs, Near = t.Particles, t.Springs, t.Pairs, t.Near
     Grips, Sheets, Cells, Tape = t.Grips, t.Sheets, t.Cells, t.Tape
 
     @wp.func
     def solve_particles(
-        g: int, n: int, p0: int, s0: int, s1: int, near_start: int, near_count: int,
-        triangles: int, inverse_dt2: V, contact_mu: V, push: S, holding: V, on: V, tops: wp.vec4i,
-        q: Particles, springs: Springs, pairs: Pairs, near: Near, grips: Grips, sheets: Sheets,
-        cells: Cells, tape: Tape,
+        at: Span, pace: Pace, run: Run, tops: wp.vec4i, q: Particles, springs: Springs,
+        pairs: Pairs, near: Near, grips: Grips, sheets: Sheets, cells: Cells, tape: Tape,
     ):  # fmt: skip
         zero = V(S(0.0))
-        w0 = g * wp.static(L)
+        p0 = at.p0
+        w0 = at.w0
+        inverse_dt2 = pace.inverse_dt2
+        contact_mu = pace.contact_mu
+        push = pace.push
+        holding = run.holding
+        on = run.on
         tx = int(tops[0])
         tv = int(tops[1])
         tk = int(tops[2])
@@ -62,7 +67,7 @@ def particle_solve(
         mark = int(tk)
         # always in the same order: sweeping backwards in every other substep makes tight heaps
         # crawl for ever, and shells jitter
-        for s in range(s0, s1):
+        for s in range(at.s0, at.s1):
             if wp.static(taped):
                 if springs.mode[s] == wp.static(int(SpringMode.BEND)):
                     record_bend(s, p0, tx, inverse_dt2, q, springs, tape)
@@ -93,7 +98,7 @@ def particle_solve(
                         held.z[lane] = x.z[lane]
                 if wp.static(taped):
                     mark = int(tk)
-                for i in range(n):
+                for i in range(at.particles):
                     if wp.static(taped):
                         if record_tether(p0 + i, tx, holding, held, q, tape):
                             tape.k[tk] = i
@@ -109,7 +114,7 @@ def particle_solve(
                         tk += 1
         if wp.static(taped):
             mark = int(tk)
-        for c in range(near_start, near_start + near_count):
+        for c in range(at.near0, at.near0 + run.near_count):
             if wp.static(taped):
                 if record_contact(
                     c, p0, tx, tv, contact_mu, push, q, pairs, near, tape
@@ -124,12 +129,12 @@ def particle_solve(
             tape.k[tk] = tk - mark
             tk += 1
         if wp.static(with_sheets):
-            if triangles > 0:
+            if at.triangles > 0:
                 for lane in range(wp.static(L)):
                     if on[lane] > S(0.0):
                         if wp.static(taped):
                             found = record_triangles(
-                                g, lane, p0, grips.particle[w0 + lane], tk, ts,
+                                at.g, lane, p0, grips.particle[w0 + lane], tk, ts,
                                 contact_mu[lane], push, sheets, cells, tape,
                             )  # fmt: skip
                             cells.met[w0 + lane] = found % 2
@@ -140,7 +145,7 @@ def particle_solve(
                             tk += 1
                             if wp.static(with_edges):
                                 found = record_edges(
-                                    g, lane, p0, tk, ts, push, sheets, cells, tape
+                                    at.g, lane, p0, tk, ts, push, sheets, cells, tape
                                 )  # fmt: skip
                                 tk += wp.static(TRIANGLE_WORDS) * found
                                 ts += wp.static(TRIANGLE_SCALARS) * found
@@ -148,12 +153,12 @@ def particle_solve(
                                 tk += 1
                         else:
                             hit = project_triangles(
-                                g, lane, p0, grips.particle[w0 + lane], contact_mu[lane],
+                                at.g, lane, p0, grips.particle[w0 + lane], contact_mu[lane],
                                 push, sheets, cells,
                             )  # fmt: skip
                             cells.met[w0 + lane] = wp.where(hit, 1, 0)
                             if wp.static(with_edges):
-                                project_edges(g, lane, p0, push, sheets, cells)
+                                project_edges(at.g, lane, p0, push, sheets, cells)
         return wp.vec4i(tx, tv, tk, ts)
 
     return SimpleNamespace(solve_particles=solve_particles)

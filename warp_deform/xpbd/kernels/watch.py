@@ -8,18 +8,18 @@ import warp as wp
 
 from ..bodies.box_overlap import box_overlap
 from ..lanes.algebra import add, length, mul, nonfinite, sub  # noqa: F401  (operators are found by name)
-from ..lanes.structures import structures
+from ..lanes.group_state import group_state
 
 __all__ = ["watch"]
 
 
 @functools.cache
 def watch(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
-    """`watch_group(g, ...)`: a look at all worlds of a group."""
-    t = structures(scalar, lanes)
-    S, V, L = t.S, t.V, t.L
+    """`watch_group(at, ...)`: a look at all worlds of a group."""
+    t = group_state(scalar, lanes)
+    S, V, L, Span = t.S, t.V, t.L, t.Span
     Springs, Particles, Bodies, Watch = t.Springs, t.Particles, t.Bodies, t.Watch
-    Topology, Shapes, Group = t.Topology, t.Shapes, t.Group
+    Shapes, Group = t.Shapes, t.Group
     boxes = box_overlap(scalar, lanes)
     overlap_share, corner_depth = boxes.overlap_share, boxes.corner_depth
 
@@ -52,14 +52,15 @@ def watch(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
 
     @wp.func
     def watch_group(
-        g: int, k: int, top: Topology, springs: Springs, shapes: Shapes, group: Group,
-        q: Particles, bodies: Bodies, watch: Watch,
+        at: Span, springs: Springs, shapes: Shapes, group: Group, q: Particles,
+        bodies: Bodies, watch: Watch,
     ):  # fmt: skip
         """Worst values of the guards, once every `check_every` substeps."""
-        p0 = group.particle_start[g]
-        n = top.particle_count[k]
-        b0 = group.body_start[g]
-        body_count = top.body_count[k]
+        g = at.g
+        p0 = at.p0
+        n = at.particles
+        b0 = at.b0
+        body_count = at.bodies
         zero = V(S(0.0))
         bad = watch.nonfinite[g]
         lowest = V(S(1.0e9))
@@ -80,15 +81,15 @@ def watch(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
             for lane in range(wp.static(L)):
                 # depths of what is no number mean nothing
                 if on[lane] > S(0.0) and bad[lane] == S(0.0):
-                    first = group.shape_start[g] + lane * top.shape_count[k]
+                    first = at.shape0 + lane * at.shapes
                     watch_boxes(
-                        g, lane, b0 + lane * body_count, first, first + top.shape_count[k], shapes,
+                        g, lane, b0 + lane * body_count, first, first + at.shapes, shapes,
                         bodies, watch,
                     )  # fmt: skip
         watch.nonfinite[g] = bad
         watch.depth[g] = wp.max(watch.depth[g], wp.max(zero - lowest, zero))
         stretch = watch.stretch[g]
-        for s in range(top.spring_start[k], top.spring_start[k + 1]):
+        for s in range(at.s0, at.s1):
             if springs.watched[s] > 0:
                 ij = springs.ij[s]
                 l = length(q.x[p0 + ij[0]] - q.x[p0 + ij[1]])

@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from .structures import structures
+from .group_state import group_state
 
 __all__ = ["BODY_SCALARS", "BODY_WORDS", "BOX_PARTICLE_SCALARS", "BOX_TRIANGLE_SCALARS",
            "COUNTERS", "GRIP_WORDS", "STATE", "TRIANGLE_SCALARS", "TRIANGLE_WORDS", "Kind",
@@ -78,14 +78,13 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
     """`fetch_ahead(x, begin, bytes)`: have a part of the stack of V3 brought near the processor, as
     the sweep reads backwards, which hardware foresees badly.
 
-    `has_room(...)`: whether a substep with so many springs, particles, near pairs and listed
-    pairs of triangles and edges fits on the tape, and the grips of the next substep with it;
-    `bodies`, `solid`: pairs of boxes with particles or triangles in all lanes.
+    `has_room(...)`: whether a substep with so many `listed` pairs of triangles and edges fits on
+    the tape, and the grips of the next substep with it.
 
-    `load_state(g, tape)`, `save_state(g, ..., tape)`: the kernel's own state between launches.
+    `load_state(g, tape)`, `save_state(g, run, tape)`: a group's `Run` between launches.
     """
-    t = structures(scalar, lanes)
-    L, V, V3, Tape = t.L, t.V, t.V3, t.Tape
+    t = group_state(scalar, lanes)
+    L, V3, Tape, Span, Run = t.L, t.V3, t.Tape, t.Span, t.Run
     far = "const char* p = (const char*)(x.data + (begin > 0 ? begin : 0));"
     lines = "for (int i = 0; i < bytes; i += 64) __builtin_prefetch(p + i, 0, 2);"
 
@@ -93,11 +92,13 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
     def fetch_ahead(x: wp.array(dtype=V3), begin: int, bytes: int): ...
 
     @wp.func
-    def has_room(
-        g: int, tops: wp.vec4i, springs: int, particles: int, near: int, listed: int,
-        bodies: int, solid: int, tape: Tape,
-    ):  # fmt: skip
-        end = tape.end[g]
+    def has_room(at: Span, run: Run, listed: int, tops: wp.vec4i, tape: Tape):
+        springs = at.s1 - at.s0
+        particles = at.particles
+        near = run.near_count
+        bodies = at.bodies * wp.static(L)
+        solid = at.shapes * (at.particles + at.triangles) * wp.static(L)
+        end = tape.end[at.g]
         words = springs + particles + near + wp.static(TRIANGLE_WORDS) * listed
         words += wp.static(2 * L * (GRIP_WORDS + 4) + 8) + wp.static(BODY_WORDS) * (bodies + solid)
         return (
@@ -113,34 +114,47 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def load_state(g: int, tape: Tape):
+        run = Run()
         at = g * wp.static(STATE)
-        return (
-            tape.state[at], tape.state[at + 1], tape.state[at + 2], tape.state[at + 3],
-            tape.state[at + 4], tape.state[at + 5], tape.state[at + 6], tape.state[at + 7],
-            tape.state[at + 8], tape.state[at + 9], tape.state[at + 10],
-            V3(tape.state[at + 11], tape.state[at + 12], tape.state[at + 13]),
-        )  # fmt: skip
+        run.on = tape.state[at]
+        run.steps = tape.state[at + 1]
+        run.quiet = tape.state[at + 2]
+        run.holding = tape.state[at + 3]
+        run.calm = tape.state[at + 4]
+        run.stale = tape.state[at + 5]
+        run.fresh = tape.state[at + 6]
+        run.travel = tape.state[at + 7]
+        run.clamped = tape.state[at + 8]
+        run.free_time = tape.state[at + 9]
+        run.least = tape.state[at + 10]
+        run.drift = V3(tape.state[at + 11], tape.state[at + 12], tape.state[at + 13])
+        at = g * wp.static(COUNTERS)
+        run.substep = tape.counters[at]
+        run.near_count = tape.counters[at + 1]
+        run.longest_push = tape.counters[at + 2]
+        return run
 
     @wp.func
-    def save_state(
-        g: int, on: V, steps: V, quiet: V, holding: V, calm: V, stale: V, fresh: V, travel: V,
-        clamped: V, free_time: V, least: V, drift: V3, tape: Tape,
-    ):  # fmt: skip
+    def save_state(g: int, run: Run, tape: Tape):
         at = g * wp.static(STATE)
-        tape.state[at] = on
-        tape.state[at + 1] = steps
-        tape.state[at + 2] = quiet
-        tape.state[at + 3] = holding
-        tape.state[at + 4] = calm
-        tape.state[at + 5] = stale
-        tape.state[at + 6] = fresh
-        tape.state[at + 7] = travel
-        tape.state[at + 8] = clamped
-        tape.state[at + 9] = free_time
-        tape.state[at + 10] = least
-        tape.state[at + 11] = drift.x
-        tape.state[at + 12] = drift.y
-        tape.state[at + 13] = drift.z
+        tape.state[at] = run.on
+        tape.state[at + 1] = run.steps
+        tape.state[at + 2] = run.quiet
+        tape.state[at + 3] = run.holding
+        tape.state[at + 4] = run.calm
+        tape.state[at + 5] = run.stale
+        tape.state[at + 6] = run.fresh
+        tape.state[at + 7] = run.travel
+        tape.state[at + 8] = run.clamped
+        tape.state[at + 9] = run.free_time
+        tape.state[at + 10] = run.least
+        tape.state[at + 11] = run.drift.x
+        tape.state[at + 12] = run.drift.y
+        tape.state[at + 13] = run.drift.z
+        at = g * wp.static(COUNTERS)
+        tape.counters[at] = run.substep
+        tape.counters[at + 1] = run.near_count
+        tape.counters[at + 2] = run.longest_push
 
     return SimpleNamespace(
         has_room=has_room, fetch_ahead=fetch_ahead, load_state=load_state, save_state=save_state
