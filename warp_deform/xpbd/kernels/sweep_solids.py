@@ -158,10 +158,11 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
         ba: BodyAdjoint, adj: Adjoint,
     ):  # fmt: skip
         """Returns the tops of the tape, and in which lanes anything depends on the contacts."""
+        unit = wp.grad(itself)(pace.push)  # as above
         matters = V(S(0.0))
         for r in range(wp.static(L)):
             lane = wp.static(L) - 1 - r
-            if now.on[lane] > S(0.0):
+            if now.on[lane] * unit > S(0.0):
                 for rb in range(at.bodies):
                     b = at.b0 + lane * at.bodies + at.bodies - 1 - rb
                     tops[2] -= 1
@@ -208,9 +209,10 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     def sweep_predicted_bodies(
         at: Span, pace: Pace, now: Substep, by: By, bodies: Bodies, ba: BodyAdjoint
     ):
+        unit = wp.grad(itself)(pace.push)  # as above
         by_kept = by.kept
         for lane in range(wp.static(L)):
-            if now.on[lane] > S(0.0):
+            if now.on[lane] * unit > S(0.0):
                 pull = R3(pace.gravity.x[lane], pace.gravity.y[lane], pace.gravity.z[lane])
                 for b in range(at.b0 + lane * at.bodies, at.b0 + (lane + 1) * at.bodies):
                     by_kept[lane] = by_kept[lane] + sweep_predict_body(
