@@ -141,6 +141,22 @@ def test_imports_point_one_way(path: Path) -> None:
         assert "sys.path." not in source
 
 
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_for_annotations_alone_stand_last_in_one_block(path: Path) -> None:
+    body = ast.parse(path.read_text()).body
+    blocks = [
+        at
+        for at, node in enumerate(body)
+        if isinstance(node, ast.If)
+        and ast.unparse(node.test) == "TYPE_CHECKING"
+        and isinstance(node.body[0], ast.Import | ast.ImportFrom)
+    ]
+    assert len(blocks) <= 1
+    assert not any(
+        isinstance(node, ast.Import | ast.ImportFrom) for at in blocks for node in body[at:]
+    )
+
+
 def modules(package: str) -> dict[str, set[str]]:
     """By dotted name, the modules of `package` that each of them imports, lazily or not."""
     found = {}

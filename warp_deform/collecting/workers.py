@@ -12,7 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from multiprocessing import resource_tracker
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError, _ExecutorManagerThread
@@ -22,9 +22,7 @@ from ..quiet import quiet_warp
 from ..support.extras import install_extra
 from ..tasks.registration import register_task
 from ..tasks.registry import registered
-
-if TYPE_CHECKING:
-    from ..tasks.task import Task
+from ..tasks.task import Task
 
 __all__ = ["Workers", "single_threaded", "worker_count"]
 

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
+from ..objects.cable import Cable
 
 if TYPE_CHECKING:
-    from ..objects.cable import Cable
     from ..xpbd.launches import FusedXPBD
 
 __all__ = ["Jaw", "JawConfig", "JawContact", "between", "squeezed_width"]

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,12 +21,10 @@ from ..objects.bag import Bag
 from ..objects.box import Box
 from ..objects.cable import Cable
 from ..objects.cloth import Cloth
+from ..objects.scene_object import SceneObject
 from ..rollout.launch import GripPath
 from ..support.quaternion import quat_from_yaw, quat_inverse, quat_multiply, quat_rotate
-
-if TYPE_CHECKING:
-    from ..objects.scene_object import SceneObject
-    from .arm import Robot
+from .arm import Robot
 
 __all__ = ["Grasp", "Motion", "Outcome", "PrimitiveConfig", "approach", "carry",
            "find_grasp", "solve_joints"]  # fmt: skip

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
 from ..errors import InputError
+from ..objects.push import Push
+from ..xpbd.guards import WatchValues
+from ..xpbd.launches import FusedXPBD
 from .differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
-
-if TYPE_CHECKING:
-    from ..objects.push import Push
-    from ..xpbd.guards import WatchValues
-    from ..xpbd.launches import FusedXPBD
-    from .launch import GripPath
+from .launch import GripPath
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
 

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
+from ..objects.push import Push
 from ..support.checked import POSITIVE, check_number
 from ..support.quaternion import quat_rotate_vjp, quat_tangent
+from ..xpbd.guards import WatchValues
 from ..xpbd.lanes.tape import Kind
+from ..xpbd.launches import FusedXPBD
 from ..xpbd.recording.recorder import Recorder
 from .launch import GripPath, prepare
-
-if TYPE_CHECKING:
-    from ..objects.push import Push
-    from ..xpbd.guards import WatchValues
-    from ..xpbd.launches import FusedXPBD
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
 

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..objects.push import MOST_PUSHES
+from ..objects.push import MOST_PUSHES, Push
 from ..support.checked import NOT_NEGATIVE, Interval, check_number, real_array
 from ..support.quaternion import quat_same_side
+from ..xpbd.guards import WatchValues
 
 if TYPE_CHECKING:
-    from ..objects.push import Push
-    from ..xpbd.guards import WatchValues
     from ..xpbd.launches import FusedXPBD
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import newton
 import numpy as np
@@ -17,10 +17,8 @@ import warp as wp
 from ..errors import InputError, WarpDeformError
 from ..rollout.differentiable import DifferentiableRollout
 from ..rollout.launch import GripPath
-
-if TYPE_CHECKING:
-    from ..xpbd.guards import WatchValues
-    from ..xpbd.launches import FusedXPBD
+from ..xpbd.guards import WatchValues
+from ..xpbd.launches import FusedXPBD
 
 __all__ = ["TapedStep", "recording", "refuse_lost_derivatives", "unrecorded"]
 

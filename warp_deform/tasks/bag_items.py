@@ -28,8 +28,6 @@ from .task import Action, Layout, Snapshot, Stage
 
 if TYPE_CHECKING:
     import newton
-
-if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = ["BagItems1", "BagItems2"]

@@ -23,8 +23,6 @@ from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:
     import newton
-
-if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = ["BlockNotarget"]

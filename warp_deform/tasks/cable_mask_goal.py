@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from ..objects.cable import Cable, CableConfig, add_cable
-from ..rendering.drawables import WORKSPACE_SEGMENT
+from ..rendering.drawables import WORKSPACE_SEGMENT, Drawables
 from ..rendering.images import Images
 from ..rendering.pixels import SHAPE, PixelGrid
 from ..rendering.strand_mask import MaskLook, strand_mask
@@ -40,7 +40,6 @@ from .task import Action, Layout, Snapshot, Stage, Task
 if TYPE_CHECKING:
     import newton
 
-    from ..rendering.drawables import Drawables
     from ..rendering.topdown import TopDown
 
 __all__ = ["CableMaskGoal"]

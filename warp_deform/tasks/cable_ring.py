@@ -18,15 +18,13 @@ from .cable_physics import CABLE_SLOPE_DAMPING, CABLE_SOLVER, CABLE_STAGE
 from .demonstrators import best_map, met_particle, pick_place, ring_maps
 from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows
+from .losses import mean_distance
 from .metrics import hull_area
 from .shapes import chain_yaw
 from .task import Action, Layout, Snapshot, Task
 
 if TYPE_CHECKING:
     import newton
-from .losses import mean_distance
-
-if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = ["CableRing", "CableRingNotarget"]

@@ -18,15 +18,13 @@ from .cable_physics import CABLE_SLOPE_DAMPING, CABLE_SOLVER, CABLE_STAGE
 from .demonstrators import met_particle, pick_place, visible_point
 from .free_space import FreeSpace
 from .ground_truth import Row, Rows, pose_rows
+from .losses import mean_distance
 from .metrics import share_in_zone, wrap_angle
 from .shapes import chain_yaw, sample_shape, to_world
 from .task import Action, Layout, Snapshot, Task
 
 if TYPE_CHECKING:
     import newton
-from .losses import mean_distance
-
-if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = ["CableShape", "CableShapeNotarget"]

@@ -18,15 +18,13 @@ from .demonstrators import pick_place
 from .fabric_pull import beyond, corners, first_taken, on_table
 from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows
+from .losses import cover_distance
 from .metrics import wrap_angle
 from .shapes import to_world
 from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:
     import newton
-from .losses import cover_distance
-
-if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = ["FabricCover"]

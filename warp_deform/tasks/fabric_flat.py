@@ -18,14 +18,12 @@ from .fabric_pull import beyond, corners, first_taken, on_table
 from .fabric_shape import fold_corner, square_corners, square_mask
 from .free_space import FreeSpace, NoFreeSpace
 from .ground_truth import Row, Rows, pose_rows
+from .losses import grid_maps, mean_distance
 from .metrics import coverage, mask_iou, wrap_angle
 from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:
     import newton
-from .losses import grid_maps, mean_distance
-
-if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = ["FabricFlat", "FabricFlatNotarget"]

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from ..errors import InputError
 from .checking import check_task
 from .elsewhere import offered, offered_version
 from .registry import FURTHER_TASKS, TASKS, add_task, registered
-
-if TYPE_CHECKING:
-    from .task import Task
+from .task import Task
 
 __all__ = ["env_id", "register_environments", "register_task"]
 

@@ -14,9 +14,19 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from ..objects.bag import BagConfig
+from ..objects.box import BoxConfig
+from ..objects.push import Push
+from ..objects.scene_object import SceneObject
+from ..objects.zone import Zone
+from ..rendering.drawables import Drawables
+from ..rendering.images import Images
 from ..rendering.pixels import TABLE_GRID, PixelGrid
+from ..rendering.strand_mask import MaskLook
+from ..robots.jaw_primitive import JawActionConfig
 from ..robots.primitive import PrimitiveConfig, Stage
 from ..xpbd.config import SolverConfig
+from .free_space import FreeSpace
 from .ground_truth import Rows, row_count
 from .past import PastAction
 
@@ -24,17 +34,7 @@ if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     import newton
     from torch import Tensor
 
-    from ..objects.bag import BagConfig
-    from ..objects.box import BoxConfig
-    from ..objects.push import Push
-    from ..objects.scene_object import SceneObject
-    from ..objects.zone import Zone
-    from ..rendering.drawables import Drawables
-    from ..rendering.images import Images
-    from ..rendering.strand_mask import MaskLook
     from ..rendering.topdown import TopDown
-    from ..robots.jaw_primitive import JawActionConfig
-    from .free_space import FreeSpace
 
 __all__ = ["PHYSICS", "Action", "Layout", "Snapshot", "Stage", "Task"]
 

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..packing.data import WATCHED
-
-if TYPE_CHECKING:
-    from ..packing.data import SolverData
-    from ..packing.mirrored import Mirrored
+from ..packing.data import WATCHED, SolverData
+from ..packing.mirrored import Mirrored
 
 __all__ = ["Checkpoints"]
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from ...errors import InputError
+from ...xpbd.launches import FusedXPBD
 from ..bodies.body_contact import PASSES, VISIT
+from ..guards import WatchValues
 from ..kernels.adjoint import adjoint_kernel
 from ..kernels.forward import forward_kernel
 from ..lanes.tape import COUNTERS, STATE, Kind
@@ -18,10 +20,6 @@ from ..packing.data import KERNEL_ARGUMENTS
 from ..packing.mirrored import Mirrored
 from .checkpoint import Checkpoints
 from .tape_room import Stacks, TapeRoom, new_stacks
-
-if TYPE_CHECKING:
-    from ...xpbd.launches import FusedXPBD
-    from ..guards import WatchValues
 
 __all__ = ["Recorder"]
 

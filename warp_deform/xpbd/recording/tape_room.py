@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -18,10 +18,8 @@ from ..lanes.tape import (
     TRIANGLE_SCALARS,
     TRIANGLE_WORDS,
 )
-
-if TYPE_CHECKING:
-    from ..packing.data import SolverData
-    from ..packing.mirrored import Mirrored
+from ..packing.data import SolverData
+from ..packing.mirrored import Mirrored
 
 __all__ = ["Stacks", "TapeRoom", "new_stacks"]
 
