@@ -117,10 +117,12 @@ def judge(name: str, options: argparse.Namespace) -> dict[str, Any]:
     collect(CollectConfig(task=options.task, episodes=options.demos, out=data["training"]))
     collect(
         CollectConfig(
-            task=options.task, episodes=options.held_out, seed=VALIDATION_SEED,
+            task=options.task,
+            episodes=options.held_out,
+            seed=VALIDATION_SEED,
             out=data["validation"],
         )
-    )  # fmt: skip
+    )
     changes = dict(VARIANTS[name])
     soft = changes.pop("soft", None)
     plan = changes.pop("schedule", PLAN)
@@ -130,9 +132,15 @@ def judge(name: str, options: argparse.Namespace) -> dict[str, Any]:
     run = RunFolder(options.folder / label)
     began = time.process_time()
     config = TrainConfig(
-        task=options.task, agent=agent, data=data["training"], out=run.path, seed=options.seed,
-        preset="fast", schedule=plan, **changes,
-    )  # fmt: skip
+        task=options.task,
+        agent=agent,
+        data=data["training"],
+        out=run.path,
+        seed=options.seed,
+        preset="fast",
+        schedule=plan,
+        **changes,
+    )
     with soft_labels(soft) if soft else contextlib.nullcontext():
         train(config)
     row = {**what, "agent": agent, "cpu_s": time.process_time() - began}

@@ -93,10 +93,14 @@ def measure(name: str, grid: str, episodes: int) -> Row:
     scores = np.array([run.rows[-1] if run.rows else 0.0 for run in runs])
     solved = sum(run.ended == SOLVED for run in runs)
     return Row(
-        name, grid, episodes, solved, float(scores.mean()),
+        name,
+        grid,
+        episodes,
+        solved,
+        float(scores.mean()),
         float(1.96 * scores.std(ddof=1) / math.sqrt(episodes)),
         float(np.mean([len(run.actions) for run in runs])),
-    )  # fmt: skip
+    )
 
 
 def main() -> None:

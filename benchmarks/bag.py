@@ -30,7 +30,7 @@ from bag_scenes import (
     pull,
     throw,
     timed,
-)  # fmt: skip
+)
 from cloth_scenes import edge_ratios
 from solver_scenes import G, spring_energy
 
@@ -202,8 +202,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=_AS_WRITTEN)
     parser.add_argument("--drops", type=int, default=200)
     parser.add_argument("--items", type=int, default=64)
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=NUMBER",
-                        help="a value of BagConfig, e.g. --set edge_contact=0.2")  # fmt: skip
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=NUMBER",
+        help="a value of BagConfig, e.g. --set edge_contact=0.2",
+    )
     parser.add_argument("--quick", action="store_true", help="8 drops, 8 items of each kind")
     options = parser.parse_args()
     if options.quick:

@@ -134,11 +134,21 @@ class Watch:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
-    parser.add_argument("--by", nargs="+", default=["scripted", "visible", "mpc"],
-                        choices=[*DEMONSTRATORS, *METHODS, *REFINED, *WITH_MORE])  # fmt: skip
+    parser.add_argument(
+        "--by",
+        nargs="+",
+        default=["scripted", "visible", "mpc"],
+        choices=[*DEMONSTRATORS, *METHODS, *REFINED, *WITH_MORE],
+    )
     parser.add_argument("--budget", type=int, default=64, help="simulated actions a choice")
-    parser.add_argument("--depth", type=int, nargs="+", default=[2], choices=[1, 2],
-                        help="actions that searches look ahead")  # fmt: skip
+    parser.add_argument(
+        "--depth",
+        type=int,
+        nargs="+",
+        default=[2],
+        choices=[1, 2],
+        help="actions that searches look ahead",
+    )
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--quick", action="store_true", help="a smoke run; not for publication")
@@ -159,8 +169,10 @@ def main() -> None:
     rows = []
     in_lines = not (options.json or options.compact)
     if in_lines:
-        print("| task | by | successes / attempts | 95 % | mean actions | mean score "
-              "| CPU s an attempt | pierced edges, mean / worst state |")  # fmt: skip
+        print(
+            "| task | by | successes / attempts | 95 % | mean actions | mean score "
+            "| CPU s an attempt | pierced edges, mean / worst state |"
+        )
         print("|---|---|---|---|---|---|---|---|")
     for task, name in itertools.product(options.tasks, options.by):
         searches = name in (*METHODS, *REFINED, *WITH_MORE)
@@ -246,8 +258,11 @@ def refined(
         for n, seed, by in ((1, WARM_UP, warm), (count, first, search)):
             began = time.process_time()
             collect(CollectConfig(task=task, episodes=n, seed=seed, out=demos / str(n), workers=1))
-            refine(RefineConfig(source=demos / str(n), out=out / str(n), search=by,
-                                accept="solved", workers=1))  # fmt: skip
+            refine(
+                RefineConfig(
+                    source=demos / str(n), out=out / str(n), search=by, accept="solved", workers=1
+                )
+            )
             cpu = time.process_time() - began
         infos = EpisodeReader(out / str(count)).infos()
     return (
@@ -310,8 +325,10 @@ def _pool(parts: list[Row]) -> Pooled:
 
 def hardness(rows: list[Row]) -> str:
     """The scripted demonstrators beside the paper's: success, and actions of the successes."""
-    lines = ["| task | attempts | success | paper | ratio | enclosed | actions | paper | ratio |",
-             "|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        "| task | attempts | success | paper | ratio | enclosed | actions | paper | ratio |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
     mine = {row.task: row for row in pooled(rows) if row.by == "scripted"}
     for task, (success, actions) in PAPER.items():
         row = mine[task]
@@ -328,8 +345,10 @@ def hardness(rows: list[Row]) -> str:
 
 def bags(rows: list[Row]) -> str:
     """The bags' demonstrators: successes, how many enclosed, mean actions, CPU seconds."""
-    lines = ["| task | by | solved / attempts | 95 % | enclosed | actions | CPU s an attempt |",
-             "|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        "| task | by | solved / attempts | 95 % | enclosed | actions | CPU s an attempt |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for row in pooled(rows):
         if row.task.startswith("bag-"):
             n, solved = row.attempts, row.successes

@@ -52,9 +52,10 @@ _UNIT = r"CPU s\b|CPU seconds|CPU minutes|CPU hours|CPU-hours|ms\b|us\b|minutes\
 _TOTAL = r"\d+(?:,\d{3})*\b(?!\.\d| ?%| x )"
 _MEASUREMENT = re.compile(
     rf"{_NUMBER} ± [\d.]+|{_NUMBER} \([\d.]+ to [\d.]+\)|{_NUMBER} -> {_NUMBER}"
-    rf"|{_NUMBER} / \d{{2,}}\b|{_LIST} of (?:the )?{_TOTAL}|{_LIST} ?(?:{_UNIT})"
-    .replace(" ", r"\s+").replace(r"\s+?", r"\s?")
-)  # fmt: skip
+    rf"|{_NUMBER} / \d{{2,}}\b|{_LIST} of (?:the )?{_TOTAL}|{_LIST} ?(?:{_UNIT})".replace(
+        " ", r"\s+"
+    ).replace(r"\s+?", r"\s?")
+)
 _PRINTED = re.compile(r"(?<![\w.])(?:(?<![\w)])[-+])?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?")
 _FILE = re.compile(r"(?:benchmarks|tests|examples|learning|hardware|warp_deform)/[\w/.-]*\w")
 _PLACEHOLDER = re.compile(r"\b[A-Z]{2,}\b")
@@ -136,8 +137,11 @@ def _blocks(page: str, text: str, wrong: list[str]) -> Iterator[_Block]:
     taken = 0
     for first, last in zip(ends, [*(start for start, _ in heads), len(text)], strict=True):
         names = [name for name in _FILE.findall(seen[first:last]) if not _PLACEHOLDER.search(name)]
-        wrong += [f"{page} names {each}, which is not there"
-                  for each in names if not (ROOT / each).exists()]  # fmt: skip
+        wrong += [
+            f"{page} names {each}, which is not there"
+            for each in names
+            if not (ROOT / each).exists()
+        ]
         parts = re.finditer(
             r"(?:^[ ]*\|.*\n?)+|(?:^(?![ ]*\|).*\S.*\n?)+", seen[first:last], re.MULTILINE
         )
@@ -218,8 +222,10 @@ def _of_table(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
             if wanted is None:
                 wrong.append(f"{page}: {len(numbers)} numbers in {cell.strip()}")
                 continue
-            results = [_compare(page, each, number, cells, wrong)
-                       for each, number in zip(wanted, numbers, strict=True)]  # fmt: skip
+            results = [
+                _compare(page, each, number, cells, wrong)
+                for each, number in zip(wanted, numbers, strict=True)
+            ]
             figures.append(_figure(page, cell.strip(), numbers, results, bool(inside)))
     return figures
 
@@ -286,9 +292,12 @@ def _offsets(text: str, at: int) -> list[tuple[int, str]]:
 
 
 def _compare(
-    page: str, wanted: _Wanted, number: tuple[int, str], cells: tuple[str, ...] | list[str],
+    page: str,
+    wanted: _Wanted,
+    number: tuple[int, str],
+    cells: tuple[str, ...] | list[str],
     wrong: list[str],
-) -> float | str:  # fmt: skip
+) -> float | str:
     """What the file says of a number, or why no file does."""
     source, expression = wanted
     if not source:

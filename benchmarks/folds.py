@@ -72,9 +72,11 @@ def main() -> None:
         return
     print("| rows | edge contact | fold | pierced | of | shortest | CPU ms |\n" + "|---" * 7 + "|")
     for row in found:
-        print(f"| {row.rows} | {row.edge_contact} | {row.fold} | {row.pierced_least} to "
-              f"{row.pierced_most} | {row.edges} | {row.shortest:.2f} "
-              f"| {row.cpu_ms_per_second:.1f} |")  # fmt: skip
+        print(
+            f"| {row.rows} | {row.edge_contact} | {row.fold} | {row.pierced_least} to "
+            f"{row.pierced_most} | {row.edges} | {row.shortest:.2f} "
+            f"| {row.cpu_ms_per_second:.1f} |"
+        )
 
 
 def folded(rows: int, sheets: int, edge_contact: float) -> list[Row]:
@@ -100,16 +102,20 @@ def folded(rows: int, sheets: int, edge_contact: float) -> list[Row]:
         pierced = [piercing(x, cloth.faces) for x in ends]
         found.append(
             Row(
-                rows=rows, edge_contact=edge_contact, fold=fold, sheets=sheets,
+                rows=rows,
+                edge_contact=edge_contact,
+                fold=fold,
+                sheets=sheets,
                 edges=len(edges_of(cloth.faces)),
-                pierced_least=min(pierced), pierced_most=max(pierced),
+                pierced_least=min(pierced),
+                pierced_most=max(pierced),
                 shortest=min(float(edge_ratios(x, flat, cloth.faces).min()) for x in ends),
                 guards=sum(
                     results[w].watch.problems(w, solver.config.limits) != () for w in range(sheets)
                 ),
                 cpu_ms_per_second=1e3 * cpu / sum(results[w].seconds for w in range(sheets)),
             )
-        )  # fmt: skip
+        )
     return found
 
 

@@ -73,8 +73,10 @@ def main() -> None:
         print(f"| {row.method} | {cells} | {row.rollouts} |")
     print("\n| pull | off the line | fastest | rollouts |\n|---|---|---|---|")
     for pull in pulls:
-        print(f"| {pull.method} | {1e3 * pull.off:.1f} mm | {pull.speed:.2f} m/s "
-              f"| {pull.rollouts:.0f} |")  # fmt: skip
+        print(
+            f"| {pull.method} | {1e3 * pull.off:.1f} mm | {pull.speed:.2f} m/s "
+            f"| {pull.rollouts:.0f} |"
+        )
 
 
 def identify(*, quick: bool) -> list[Identified]:
@@ -102,8 +104,14 @@ def _without_slopes(method: str, evaluations: int) -> Callable[..., np.ndarray]:
         stages = [(frames, 6 * noise, evaluations) for frames in range(2, seen.shape[1], 2)]
         for frames, scale, most in [*stages, (seen.shape[1], noise, 10 * evaluations)]:
             key = "maxfev" if method == "Nelder-Mead" else "maxfun"
-            logs = minimize(loss, logs, (seen[:, :frames], scale), method, bounds=[(-4, 3)] * 4,
-                            options={key: most}).x  # fmt: skip
+            logs = minimize(
+                loss,
+                logs,
+                (seen[:, :frames], scale),
+                method,
+                bounds=[(-4, 3)] * 4,
+                options={key: most},
+            ).x
         return np.exp(logs)
 
     return fit

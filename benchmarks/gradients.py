@@ -124,11 +124,15 @@ def _add_bag_and_boxes(builder: newton.ModelBuilder) -> None:
 SCENES = {
     "cable": Scene(
         lambda b: add_cable(b, CABLE, cable_line(CABLE, (0.4, 0.0), (0.6, 0.0))),
-        SolverConfig(), 1.0, _crumpled,
+        SolverConfig(),
+        1.0,
+        _crumpled,
     ),
     "heap": Scene(
         lambda b: add_cable(b, CABLE, cable_line(CABLE, (0.4, 0.0), (0.6, 0.0))),
-        SolverConfig(), 1.0, _heap,
+        SolverConfig(),
+        1.0,
+        _heap,
     ),
     "cloth10": Scene(
         lambda b: add_cloth(b, CLOTH, cloth_sheet(CLOTH, (0.5, 0.0))), CLOTH_SOLVER, 0.5, _sheet
@@ -137,9 +141,12 @@ SCENES = {
     "bag-cube": Scene(_add_bag_and_boxes, BAG_SOLVER, 0.25, _bag, _boxes),
     "block": Scene(
         lambda b: add_box(b, BLOCK, (0.5, 0.0, -BLOCK.lowest)),
-        SolverConfig(table_friction=1.0, contact_friction=1.0), 1.0, _no_particles, _sliding,
+        SolverConfig(table_friction=1.0, contact_friction=1.0),
+        1.0,
+        _no_particles,
+        _sliding,
     ),
-}  # fmt: skip
+}
 
 
 def measure(name: str, repeats: int) -> list[Cost]:

@@ -38,9 +38,11 @@ def main() -> None:
             name += f"-{run.settings['preset']}"
         steps = run.settings["schedule"]["steps"]
         usual = preset_schedule(
-            run.settings["preset"], task=run.task, demos=run.demos,
+            run.settings["preset"],
+            task=run.task,
+            demos=run.demos,
             sees_state=run.agent.startswith("gt-"),
-        )  # fmt: skip
+        )
         if steps != usual.steps:
             name += f"-{steps}-steps"
         target = RunFolder(options.out / "runs" / name)

@@ -131,8 +131,10 @@ def main() -> None:
             )
         if python:
             peer += tensorflow_steps(python, agent, arguments.repeats)
-            print(f"{agent:12} {'TensorFlow':24} step {np.median(peer):6.3f} s, "
-                  f"{min(peer):.3f} to {max(peer):.3f}")  # fmt: skip
+            print(
+                f"{agent:12} {'TensorFlow':24} step {np.median(peer):6.3f} s, "
+                f"{min(peer):.3f} to {max(peer):.3f}"
+            )
         for name, row in found.items():
             row["tensorflow_step_s"] = float(np.median(peer)) if peer else TENSORFLOW_STEP
             row["tensorflow_ratio"] = row["tensorflow_step_s"] / row["step_s"]

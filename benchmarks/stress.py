@@ -175,10 +175,18 @@ def table(tallies: list[Tally]) -> str:
         "wall [s]",
     ]
     rows = [
-        [t.task, t.actions, *(t.outcomes[name] for name in names), t.solved, t.restless,
-         f"{t.longest:.1f}", len(t.broken), f"{t.seconds:.1f}"]
+        [
+            t.task,
+            t.actions,
+            *(t.outcomes[name] for name in names),
+            t.solved,
+            t.restless,
+            f"{t.longest:.1f}",
+            len(t.broken),
+            f"{t.seconds:.1f}",
+        ]
         for t in tallies
-    ]  # fmt: skip
+    ]
     lines = ["| " + " | ".join(map(str, row)) + " |" for row in (head, ["---"] * len(head), *rows)]
     for title, name in (("problems", "problems"), ("invalid after", "kinds_of_invalid")):
         total: Counter[str] = sum((getattr(t, name) for t in tallies), Counter())

@@ -63,8 +63,12 @@ class Played:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--agents", nargs="+", default=["planner", "scripted", "random"],
-                        choices=["planner", "scripted", "random", "policy"])  # fmt: skip
+    parser.add_argument(
+        "--agents",
+        nargs="+",
+        default=["planner", "scripted", "random"],
+        choices=["planner", "scripted", "random", "policy"],
+    )
     parser.add_argument("--policy", type=Path, help="training run of cable-mask-goal")
     parser.add_argument("--budget", type=int, help="of the planner")
     parser.add_argument("--goals", type=int, default=10)
@@ -85,8 +89,10 @@ def main() -> None:
                         file.write(json.dumps(asdict(rows[-1])) + "\n")
                 print(f"\r{agent} goal {goal} toss {toss}  ", end="", file=sys.stderr)
     print(file=sys.stderr)
-    print("| agent | successes / episodes | 95 % | mean actions | of the solved "
-          "| last overlap, median | CPU s an action |\n|---|---|---|---|---|---|---|")  # fmt: skip
+    print(
+        "| agent | successes / episodes | 95 % | mean actions | of the solved "
+        "| last overlap, median | CPU s an action |\n|---|---|---|---|---|---|---|"
+    )
     for agent in dict.fromkeys(r.agent for r in rows):
         print(_line(agent, [r for r in rows if r.agent == agent]))
     print(f"\nThe paper's Goal-Split policy on a Franka: {PAPER}.")
@@ -135,11 +141,22 @@ def _result(
         chooser = make_chooser(
             agent, rig, seen, seed=seed, policy=policy if agent == "policy" else None, budget=budget
         )
-        config = RecorderConfig(robot_id="sim", camera_id="sim", actor=chooser.name,
-                                calibration=rig.calibration.digest())  # fmt: skip
+        config = RecorderConfig(
+            robot_id="sim",
+            camera_id="sim",
+            actor=chooser.name,
+            calibration=rig.calibration.digest(),
+        )
         with EpisodeRecorder(Path(folder, "episode"), config, goal_mask=seen.mask) as recorder:
-            return run_episode(rig.robot, rig.camera, rig.calibration, chooser,
-                               recorder=recorder, goal=seen.mask, toss=rig.toss)  # fmt: skip
+            return run_episode(
+                rig.robot,
+                rig.camera,
+                rig.calibration,
+                chooser,
+                recorder=recorder,
+                goal=seen.mask,
+                toss=rig.toss,
+            )
 
 
 def _read(path: Path | None) -> list[Played]:
@@ -185,8 +202,9 @@ def _plot(rows: Sequence[Played], path: Path) -> None:
         1, len(agents), figsize=(3.2 * len(agents), 3), sharey=True, squeeze=False
     )
     for axes, agent in zip(all_axes[0], agents, strict=True):
-        runs = [np.pad(r.overlaps, (0, 11 - len(r.overlaps)), "edge") for r in rows
-                if r.agent == agent]  # fmt: skip
+        runs = [
+            np.pad(r.overlaps, (0, 11 - len(r.overlaps)), "edge") for r in rows if r.agent == agent
+        ]
         axes.plot(np.transpose(runs), color="tab:blue", alpha=0.15, linewidth=1)
         axes.plot(np.median(runs, axis=0), color="black", linewidth=2)
         axes.axhline(0.25, color="tab:green", linestyle="--", linewidth=1)

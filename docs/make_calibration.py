@@ -87,9 +87,15 @@ def board_on_foam() -> np.ndarray:
     placed = board_on_table(corners, BOARD, np.array(TOUCHED), touched)
     fit = fit_homography(corners.pixels, placed, INTRINSICS)
     calibration = Calibration(
-        robot_id="", camera_id="", home_q=np.array(HOME_Q), intrinsics=INTRINSICS,
-        base_H_pixel=fit.base_H_pixel, table=TABLE, method="charuco", error_m=fit.error_m,
-    )  # fmt: skip
+        robot_id="",
+        camera_id="",
+        home_q=np.array(HOME_Q),
+        intrinsics=INTRINSICS,
+        base_H_pixel=fit.base_H_pixel,
+        table=TABLE,
+        method="charuco",
+        error_m=fit.error_m,
+    )
     view = TopDownView()
     (x0, x1), (y0, y1) = view.x, view.y
     rim = calibration.base_to_pixel(np.array([(x0, y0), (x0, y1), (x1, y1), (x1, y0)]))
@@ -100,8 +106,16 @@ def board_on_foam() -> np.ndarray:
         cv2.circle(picture, at, 9 if number in TOUCHED else 4, GOOD, -1, cv2.LINE_AA)
         if number in TOUCHED:  # its number beside the board
             side = 90 if pixel[0] > corners.pixels[:, 0].mean() else -130
-            cv2.putText(picture, str(number), (at[0] + side, at[1] + 12),
-                        cv2.FONT_HERSHEY_SIMPLEX, 1.3, BAD, 3, cv2.LINE_AA)  # fmt: skip
+            cv2.putText(
+                picture,
+                str(number),
+                (at[0] + side, at[1] + 12),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                1.3,
+                BAD,
+                3,
+                cv2.LINE_AA,
+            )
     small = np.asarray(cv2.resize(picture, (640, 360), interpolation=cv2.INTER_AREA))
     _label(small, f"from home; left out {1e3 * fit.error_m:.1f} mm", GOOD)
     above = np.asarray(cv2.resize(view.rectify(rgb, calibration), (180, 360)))

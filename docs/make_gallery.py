@@ -89,8 +89,9 @@ def draw(moment: Moment) -> np.ndarray:
     side = SceneView(SIDE, camera=camera).render(episode.drawables, particle_q, body_q)
     tile = np.ascontiguousarray(np.concatenate([above, side], axis=1))
     for color, width in (((20, 20, 20), 4), ((255, 255, 255), 1)):
-        cv2.putText(tile, moment.label, (10, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.7, color, width,
-                    cv2.LINE_AA)  # fmt: skip
+        cv2.putText(
+            tile, moment.label, (10, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.7, color, width, cv2.LINE_AA
+        )
     return tile
 
 

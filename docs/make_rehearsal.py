@@ -29,8 +29,16 @@ def frame(folder: Path, index: int, overlap: float) -> np.ndarray:
         sides.append(cv2.resize(picture, (width, HEIGHT), interpolation=cv2.INTER_AREA))
     image = np.hstack(sides)
     text = f"after {index} actions: overlap {overlap:.2f}"
-    cv2.putText(image, text, (12, HEIGHT - 16), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 255), 1,
-                cv2.LINE_AA)  # fmt: skip
+    cv2.putText(
+        image,
+        text,
+        (12, HEIGHT - 16),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        0.7,
+        (255, 255, 255),
+        1,
+        cv2.LINE_AA,
+    )
     return image
 
 

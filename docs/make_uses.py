@@ -46,11 +46,14 @@ def draw_identification(path: Path) -> None:
         x = pull.simulate(values)[0]
         tiles = [
             cv2.addWeighted(
-                view.render(looks[0], x[t], NO_BODIES), 0.5,
-                view.render(looks[1], seen[0, t], NO_BODIES), 0.5, 0,
+                view.render(looks[0], x[t], NO_BODIES),
+                0.5,
+                view.render(looks[1], seen[0, t], NO_BODIES),
+                0.5,
+                0,
             )
             for t in (4, 10, 14)
-        ]  # fmt: skip
+        ]
         tiles[0] = annotate(tiles[0], lines=[label])
         rows.append(np.hstack(tiles))
     write_png(path, np.vstack(rows))

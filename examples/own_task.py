@@ -43,8 +43,7 @@ class CableGather(Task):
         beads = cable_line(CABLE, tuple(middle - half), tuple(middle + half))
         angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
         rim = middle + RADIUS * np.column_stack([np.cos(angle), np.sin(angle)])
-        return Layout(beads, np.zeros((0, 7)), middle, (ring_zone(rim),),
-                      settle_seconds=0.5)  # fmt: skip
+        return Layout(beads, np.zeros((0, 7)), middle, (ring_zone(rim),), settle_seconds=0.5)
 
     def score(self, layout, snapshot):
         distance = np.linalg.norm(snapshot.particle_q[:, :2] - layout.targets, axis=1)

@@ -18,9 +18,16 @@ BAG = BagConfig()
 SHELL = bag_shell(BAG)
 CENTRE = np.array([0.5, 0.0])
 BAG_SOLVER = SolverConfig(
-    damping=1.0, table_friction=0.8, contact_friction=0.4, recovery=0.1, viscosity=30.0,
-    dry_friction=2.0, sleep_speed=0.006, sleep_ramp=20.0, margin=0.006,
-)  # fmt: skip
+    damping=1.0,
+    table_friction=0.8,
+    contact_friction=0.4,
+    recovery=0.1,
+    viscosity=30.0,
+    dry_friction=2.0,
+    sleep_speed=0.006,
+    sleep_ramp=20.0,
+    margin=0.006,
+)
 CUBE = BoxConfig(parts=(BoxPart((0.036,) * 3),), mass=0.02, friction=1.5)
 PARK = (0.5, 0.35)
 """Where boxes wait [m]."""
@@ -182,8 +189,9 @@ def poke(x: np.ndarray, faces: np.ndarray, pose: np.ndarray, size: Sequence[floa
     for corner in corners:
         hit = crossing(
             np.broadcast_to(pose[:3].astype(float), (len(near), 3)),
-            np.broadcast_to(corner, (len(near), 3)), tri,
-        )  # fmt: skip
+            np.broadcast_to(corner, (len(near), 3)),
+            tri,
+        )
         at = np.isfinite(hit)
         if at.any():
             deep = np.abs(((corner - tri[:, 0]) * normal).sum(1))[at]

@@ -69,9 +69,12 @@ def recorder(folder: Path, *, goal: np.ndarray | None = GOAL) -> EpisodeRecorder
     """A recorder whose folder `replay` can read, too."""
     config = {"episode": EpisodeConfig().to_record()}
     described = RecorderConfig(
-        robot_id="test", camera_id="test", actor="listed", calibration=CALIBRATION.digest(),
+        robot_id="test",
+        camera_id="test",
+        actor="listed",
+        calibration=CALIBRATION.digest(),
         config=config,
-    )  # fmt: skip
+    )
     made = EpisodeRecorder(folder, described, goal_mask=goal)
     CALIBRATION.save(folder / "calibration.json")
     return made
@@ -82,10 +85,15 @@ def main() -> None:
     robot = SafeRobot(DryRunRobot(DryRunConfig(object_width_m=0.005)), LIMITS)
     with recorder(Path(sys.argv[1])) as made, drawn_camera(lambda: 0.45) as camera:
         run_episode(
-            robot, camera, CALIBRATION, Listed([ACTION] * 900), recorder=made, goal=GOAL,
+            robot,
+            camera,
+            CALIBRATION,
+            Listed([ACTION] * 900),
+            recorder=made,
+            goal=GOAL,
             config=EpisodeConfig(max_actions=900),
             say=lambda line: print(line, flush=True),
-        )  # fmt: skip
+        )
 
 
 def frame_of(rgb: np.ndarray) -> Frame:

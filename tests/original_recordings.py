@@ -121,9 +121,14 @@ def recording(
         for _ in range(steps)
     ]
     return {
-        "color": colors[:-1], "depth": depths[:-1], "action": actions, "info": infos[:-1],
-        "last_color": colors[-1], "last_depth": depths[-1], "last_info": infos[-1],
-    }  # fmt: skip
+        "color": colors[:-1],
+        "depth": depths[:-1],
+        "action": actions,
+        "info": infos[:-1],
+        "last_color": colors[-1],
+        "last_depth": depths[-1],
+        "last_info": infos[-1],
+    }
 
 
 def write(folder: Path, number: int, parts: dict[str, Any], *, multiarray: str = NUMPY_2) -> Path:

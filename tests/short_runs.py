@@ -22,9 +22,13 @@ def train_shortly(root: Path) -> Path:
     """A baseline that knows nothing, over blocks, with snapshots of steps 1 and 2."""
     data = write_demonstrations(root / "demos", 2, task=TASK)
     config = TrainConfig(
-        task=TASK, agent="gt-mlp", data=data, out=root / "run", preset="fast",
+        task=TASK,
+        agent="gt-mlp",
+        data=data,
+        out=root / "run",
+        preset="fast",
         schedule=Schedule(steps=2, batch=4, lr=1e-3, snapshots=2),
-    )  # fmt: skip
+    )
     train(config)
     return config.out
 

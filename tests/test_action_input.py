@@ -52,9 +52,12 @@ def test_what_is_no_action_is_refused_in_one_line_everywhere(env, envs, action) 
     stacks = isinstance(action, np.ndarray)
     both = np.stack([action, action]) if stacks else [action, action]
     calls = (
-        lambda: env.step(action), lambda: envs.step(both), lambda: env.worlds.step({0: action}),
-        lambda: envs.worlds.step({1: action}), lambda: env.worlds.lead({0: action}),
-    )  # fmt: skip
+        lambda: env.step(action),
+        lambda: envs.step(both),
+        lambda: env.worlds.step({0: action}),
+        lambda: envs.worlds.step({1: action}),
+        lambda: env.worlds.lead({0: action}),
+    )
     hashes = env.worlds.hash(0), envs.worlds.hash(0), envs.worlds.hash(1)
     for call in calls:
         with pytest.raises(InputError) as caught:

@@ -71,13 +71,20 @@ class Check:
         at = {"positions": self.x, "velocities": self.v, "inverse_masses": self.w, **self.values}
         at |= start
         run = DifferentiableRollout(self.solver)
-        parameters = {n: at[n].reshape(1, -1) if n == "inverse_masses" else at[n] for n in at
-                      if n not in ("positions", "velocities")}  # fmt: skip
+        parameters = {
+            n: at[n].reshape(1, -1) if n == "inverse_masses" else at[n]
+            for n in at
+            if n not in ("positions", "velocities")
+        }
         path = path or self.path
         run.forward(
-            [0], [self.steps * DT], paths={} if path is None else {0: path}, parameters=parameters,
-            positions=at["positions"][None], velocities=at["velocities"][None],
-        )  # fmt: skip
+            [0],
+            [self.steps * DT],
+            paths={} if path is None else {0: path},
+            parameters=parameters,
+            positions=at["positions"][None],
+            velocities=at["velocities"][None],
+        )
         x, v = state(self.solver)
         # the change only: less is lost to rounding
         self.loss = float((self.gx * (x - self.x)).sum() + (self.gv * (v - self.v)).sum())
@@ -129,15 +136,19 @@ class Check:
         assert path is not None
         along = self.rng.normal(size=path.positions.shape)
         wrong, right = self.error(
-            "way_points", 1e-8, along,
+            "way_points",
+            1e-8,
+            along,
             lambda d: self.run(replace(path, positions=path.positions + d)),
-        )  # fmt: skip
+        )
         assert wrong < 1e-6 * right + floor / 1e-8
         along = np.arange(len(path.times)) > 0
         wrong, right = self.error(
-            "knot_times", 1e-8, along.astype(float),
+            "knot_times",
+            1e-8,
+            along.astype(float),
             lambda d: self.run(replace(path, times=path.times + d)),
-        )  # fmt: skip
+        )
         assert wrong < 1e-6 * right + floor / 1e-8
 
 
@@ -237,9 +248,12 @@ def test_mass_and_stiffness_of_a_hanging_particle() -> None:
     builder, mass, stiffness, rest, drag = new_builder(), 0.1, 100.0, 0.2, 30.0
     pull = G * (1 - drag * DT)  # drag slows what a substep adds, too
     add_particles(
-        builder, [[0.0, 0.0, 1.0], [0.0, 0.0, 0.79]], masses=[0.0, mass], links=[(0, 1, rest)],
+        builder,
+        [[0.0, 0.0, 1.0], [0.0, 0.0, 0.79]],
+        masses=[0.0, mass],
+        links=[(0, 1, rest)],
         stiffness=stiffness,
-    )  # fmt: skip
+    )
     solver = finalize(builder, ideal(damping=drag), precision="float64")
     run = DifferentiableRollout(solver)
     end = run.forward([0], [1.5])
@@ -347,16 +361,23 @@ def test_states_at_the_times_that_were_asked_for() -> None:
     start = [solver.particle_q(0)[None], solver.particle_qd(0)[None]]
     bodies = [b[None] for b in solver.data.body_poses(0)]
     x = run.forward([0], [0.05, 0.1])
-    for values, now in ((x, solver.particle_q(0)), (run.velocities, solver.particle_qd(0)),
-                        (run.body_poses, solver.body_q(0)),
-                        (run.body_velocities, solver.body_qd(0))):  # fmt: skip
+    for values, now in (
+        (x, solver.particle_q(0)),
+        (run.velocities, solver.particle_qd(0)),
+        (run.body_poses, solver.body_q(0)),
+        (run.body_velocities, solver.body_qd(0)),
+    ):
         assert values.shape == (1, 2, *now.shape)
         assert np.array_equal(values[0, 1], now)
     early, poses, twists = run.velocities[0, 0], run.body_poses[0, 0], run.body_velocities[0, 0]
     run.forward(
-        [0], [0.05], positions=start[0], velocities=start[1], body_poses=bodies[0],
+        [0],
+        [0.05],
+        positions=start[0],
+        velocities=start[1],
+        body_poses=bodies[0],
         body_velocities=bodies[1],
-    )  # fmt: skip
+    )
     assert np.array_equal(solver.particle_qd(0), early)
     assert np.array_equal(solver.body_q(0), poses) and np.array_equal(solver.body_qd(0), twists)
 

@@ -75,9 +75,12 @@ class Check:
             path = replace(path, positions=at.get("way_points", path.positions))
             path = replace(path, rotations=at.get("knot_rotations", path.rotations))
         run.forward(
-            [0], [self.steps * DT], paths={} if path is None else {0: path}, parameters=parameters,
+            [0],
+            [self.steps * DT],
+            paths={} if path is None else {0: path},
+            parameters=parameters,
             **state,
-        )  # fmt: skip
+        )
         poses, twists = data.body_poses(0)
         assert np.array_equal(run.body_poses[0, 0], poses)
         # the change only: less is lost to rounding
@@ -195,9 +198,13 @@ def carried(release: bool) -> tuple[SolverFusedXPBD, GripPath, int]:
     turns = np.array([[0, 0, 0, 1], [0.01, 0.02, 0.1, 0.99], [0.0, 0.01, 0.2, 0.97]])
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     path = GripPath(
-        times, knots, body=0, rotations=turns, offset=np.array([0.003, -0.002, 0.001]),
+        times,
+        knots,
+        body=0,
+        rotations=turns,
+        offset=np.array([0.003, -0.002, 0.001]),
         turn=np.array([0.0, 0.0, 0.6, 0.8]),
-    )  # fmt: skip
+    )
     return solver, path, 16 if release else 4
 
 

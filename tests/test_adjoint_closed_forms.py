@@ -124,7 +124,7 @@ def pendulum(dt: float, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     arm = LENGTH * np.array([np.sin(ANGLE), 0.0, -np.cos(ANGLE)])
     add_particles(
         builder, [top, top + arm], masses=[0.0, mass], links=[(0, 1, LENGTH)], stiffness=STIFF
-    )  # fmt: skip
+    )
     solver = finalize(builder, ideal(dt=dt))
     run = DifferentiableRollout(solver)
     end = run.forward([0], [seconds])[0, 0, 1]

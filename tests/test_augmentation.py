@@ -175,8 +175,9 @@ def test_what_moves_together_moves_as_alone() -> None:
     """Also among mirror images, and with a grid of its own."""
     rng = np.random.default_rng(4)
     fine = PixelGrid((0.3, -0.2), PIXEL_SIZE / 2)
-    transforms = [RigidTransform(0.7 * i, (3.0 * i, -i), (TABLE_GRID, fine)[i % 2], i > 2)
-                  for i in range(6)]  # fmt: skip
+    transforms = [
+        RigidTransform(0.7 * i, (3.0 * i, -i), (TABLE_GRID, fine)[i % 2], i > 2) for i in range(6)
+    ]
     states = rng.uniform(-0.2, 0.2, (6, TASKS["bag-color-goal"].ground_truth_size))
     states = states.astype(np.float32)
     actions = rng.uniform(-0.3, 0.3, (6, 7))

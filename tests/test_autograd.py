@@ -34,9 +34,11 @@ def cables(worlds: int = 1, lanes: int = 1, precision: str = "float64") -> Solve
     add_cable(one, TINY, cable_line(TINY, (0.4, 0.0), (0.6, 0.0)))
     builder.replicate(one, worlds)
     return SolverFusedXPBD(
-        builder.finalize(device="cpu"), SolverConfig(damping=5.0, limits=LOOSE), lanes=lanes,
+        builder.finalize(device="cpu"),
+        SolverConfig(damping=5.0, limits=LOOSE),
+        lanes=lanes,
         precision=precision,
-    )  # fmt: skip
+    )
 
 
 def tensor(values: object, *, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -64,17 +66,30 @@ def test_torch_agrees_on_a_cable_that_is_led_through_the_air() -> None:
 
     def ends(x, v, w, damping, stiffness, knots, times):
         out = rollout_tensors(
-            solver, [0], [3 * DT, 8 * DT], positions=x, velocities=v, inverse_masses=1e3 * w,
-            damping=damping, stiffness=stiffness, paths={0: path}, way_points={0: knots},
+            solver,
+            [0],
+            [3 * DT, 8 * DT],
+            positions=x,
+            velocities=v,
+            inverse_masses=1e3 * w,
+            damping=damping,
+            stiffness=stiffness,
+            paths={0: path},
+            way_points={0: knots},
             knot_times={0: times / 100 * torch.tensor([0.0, 1.0, 1.0])},
-        )  # fmt: skip
+        )
         return 100 * out.positions, out.velocities
 
     rng = np.random.default_rng(1)
     inputs = (
-        tensor(x), tensor(rng.normal(0, 0.1, x.shape)), tensor(masses / 1e3), tensor([5.0]),
-        tensor([1.0]), tensor(path.positions), tensor(100 * path.times),
-    )  # fmt: skip
+        tensor(x),
+        tensor(rng.normal(0, 0.1, x.shape)),
+        tensor(masses / 1e3),
+        tensor([5.0]),
+        tensor([1.0]),
+        tensor(path.positions),
+        tensor(100 * path.times),
+    )
     assert torch.autograd.gradcheck(ends, inputs, eps=1e-7, atol=2e-5, rtol=1e-5, fast_mode=True)
 
 
@@ -101,18 +116,26 @@ def test_torch_agrees_on_a_box_that_flies_and_slides() -> None:
     def ends(pose, twist, damping):
         turn = pose[..., 3:] / pose[..., 3:].norm(dim=-1, keepdim=True)
         out = rollout_tensors(
-            solver, [0], [2 * DT, 5 * DT], body_poses=torch.cat([pose[..., :3], turn], -1),
-            body_velocities=twist, damping=damping,
-        )  # fmt: skip
+            solver,
+            [0],
+            [2 * DT, 5 * DT],
+            body_poses=torch.cat([pose[..., :3], turn], -1),
+            body_velocities=twist,
+            damping=damping,
+        )
         return out.body_poses, out.body_velocities
 
     inputs = tensor(pose), tensor(twist), tensor([1.0])
     assert torch.autograd.gradcheck(ends, inputs, eps=1e-7, atol=1e-5, rtol=1e-4)
     sliding, speed = tensor([[[0.0, 0.0, 0.02, 0, 0, 0, 1]]]), tensor([[[0.6, 0, 0, 0, 0, 0]]])
     end = rollout_tensors(
-        solver, [0], [0.3], body_poses=sliding, body_velocities=speed,
+        solver,
+        [0],
+        [0.3],
+        body_poses=sliding,
+        body_velocities=speed,
         damping=torch.zeros(1, dtype=torch.float64),
-    )  # fmt: skip
+    )
     end.body_poses[0, -1, 0, 0].backward()
     assert speed.grad is not None and sliding.grad is not None
     assert speed.grad[0, 0, 0] == pytest.approx(0.6 / (0.4 * CUBE.friction * 9.81), rel=0.03)
@@ -125,9 +148,14 @@ def test_two_actions_are_one_of_both_lengths(storage: str) -> None:
     start, v = tensor(lines(2, 0.02)), tensor(np.zeros((2, 4, 3)))
     damping = tensor([5.0, 7.0])
     first = rollout_tensors(
-        solver, [0, 1], [0.03, 0.05], positions=start, velocities=v, damping=damping,
+        solver,
+        [0, 1],
+        [0.03, 0.05],
+        positions=start,
+        velocities=v,
+        damping=damping,
         storage=storage,
-    )  # fmt: skip
+    )
     second = rollout_tensors(solver, [0, 1], [0.1], damping=damping, storage=storage, **first.end)
     weights = np.random.default_rng(0).normal(size=(2, 2, 1, 4, 3))
     loss = (torch.tensor(weights[0]) * second.positions).sum()
@@ -141,8 +169,10 @@ def test_two_actions_are_one_of_both_lengths(storage: str) -> None:
     assert np.allclose(second.positions.detach(), ends, rtol=0, atol=1e-12)
     assert np.allclose(second.velocities.detach(), run.velocities, rtol=0, atol=1e-10)
     for ours, right in (
-        (start, expected.positions), (v, expected.velocities), (damping, expected.damping)
-    ):  # fmt: skip
+        (start, expected.positions),
+        (v, expected.velocities),
+        (damping, expected.damping),
+    ):
         assert ours.grad is not None
         assert np.allclose(ours.grad, right, rtol=1e-9, atol=1e-9 * np.abs(right).max())
         assert ours.grad.any()
@@ -188,10 +218,16 @@ def test_what_happens_to_the_worlds_in_between_does_not_matter(storage: str) -> 
         x, knots, friction = tensor(lines(1, 0.01)), tensor(led(lines()[0, 1]).positions), [0.3]
         mu = tensor(friction)
         out = rollout_tensors(
-            solver, [1], [0.05, 0.4], positions=x, velocities=torch.zeros_like(x),
-            paths={1: led(lines()[0, 1])}, way_points={1: knots}, table_friction=mu,
+            solver,
+            [1],
+            [0.05, 0.4],
+            positions=x,
+            velocities=torch.zeros_like(x),
+            paths={1: led(lines()[0, 1])},
+            way_points={1: knots},
+            table_friction=mu,
             storage=storage,
-        )  # fmt: skip
+        )
         return x, knots, mu, out
 
     undisturbed = act()
@@ -237,9 +273,14 @@ def test_a_flipped_quaternion_flips_its_derivative() -> None:
     def slopes(signs: np.ndarray) -> np.ndarray:
         rotations = tensor(turns * signs)
         out = rollout_tensors(
-            solver, [0], [4 * DT], body_poses=pose, body_velocities=torch.zeros(1, 1, 6).double(),
-            paths={0: path}, knot_rotations={0: rotations},
-        )  # fmt: skip
+            solver,
+            [0],
+            [4 * DT],
+            body_poses=pose,
+            body_velocities=torch.zeros(1, 1, 6).double(),
+            paths={0: path},
+            knot_rotations={0: rotations},
+        )
         out.body_poses[..., 3:5].sum().backward()
         assert rotations.grad is not None and rotations.grad.any()
         return rotations.grad.numpy()

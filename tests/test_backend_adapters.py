@@ -109,8 +109,10 @@ def test_an_fr3s_speeds_and_reactions(franky: SimpleNamespace) -> None:
     # Each of three axes may be at its limit at once: a slanting line went 1.7 times too fast.
     assert np.sqrt(3.0) * motion.factor * 2.0 == pytest.approx(0.05)
     said = motion.reactions[0].condition.text
-    assert all(f"{axis} > 8" in said and f"{axis} < -8" in said for axis in
-               ("FORCE_X", "FORCE_Y", "FORCE_Z"))  # fmt: skip
+    assert all(
+        f"{axis} > 8" in said and f"{axis} < -8" in said
+        for axis in ("FORCE_X", "FORCE_Y", "FORCE_Z")
+    )
     turns = np.array([0.05, -0.02, 0.0, 0.05, 0.1, 0.0, 0.2])
     robot.move_joints(np.array([HOME + turns, HOME]), speed=0.1)
     for motion in franky.moves[-2:]:
@@ -192,8 +194,11 @@ def test_an_fr3_recovers_whatever_its_state_says_and_not_from_the_user_stop(
     assert franky.recoveries == 3
     robot.stop()
     assert franky.stops == 1
-    for call in (lambda: robot.move_joints(HOME + 0.1, speed=0.1),
-                 lambda: robot.move_linear(LOWER, speed=0.1), robot.open_gripper):  # fmt: skip
+    for call in (
+        lambda: robot.move_joints(HOME + 0.1, speed=0.1),
+        lambda: robot.move_linear(LOWER, speed=0.1),
+        robot.open_gripper,
+    ):
         with pytest.raises(MotionError, match="holds until recover"):
             call()
     assert franky.moves == []
@@ -255,8 +260,11 @@ def test_frankapys_stop_holds(frankapy: SimpleNamespace) -> None:
     robot = slow_free()
     robot.stop()
     made = len(frankapy.calls)
-    for call in (lambda: robot.move_joints(HOME + 0.1, speed=0.1),
-                 lambda: robot.move_linear(LOWER, speed=0.1), robot.open_gripper):  # fmt: skip
+    for call in (
+        lambda: robot.move_joints(HOME + 0.1, speed=0.1),
+        lambda: robot.move_linear(LOWER, speed=0.1),
+        robot.open_gripper,
+    ):
         with pytest.raises(MotionError, match="holds until recover"):
             call()
     assert len(frankapy.calls) == made

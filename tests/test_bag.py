@@ -74,11 +74,19 @@ def test_only_edges_are_guarded_against_stretch():
 @pytest.mark.parametrize(
     "values",
     [
-        {"radius": 0.0}, {"cut": 1.0}, {"mass": np.nan}, {"bead_mass": -1.0}, {"longest": 1.0},
-        {"shortest": 1.0}, {"shortest_diagonal": -0.1}, {"edge_contact": 2.0},
-        {"thickness": 0.0}, {"friction": np.inf}, {"longest_diagonal": 0.9},
+        {"radius": 0.0},
+        {"cut": 1.0},
+        {"mass": np.nan},
+        {"bead_mass": -1.0},
+        {"longest": 1.0},
+        {"shortest": 1.0},
+        {"shortest_diagonal": -0.1},
+        {"edge_contact": 2.0},
+        {"thickness": 0.0},
+        {"friction": np.inf},
+        {"longest_diagonal": 0.9},
     ],
-)  # fmt: skip
+)
 def test_a_bad_configuration_is_refused(values):
     with pytest.raises(InputError, match=next(iter(values))):
         BagConfig(**values)
@@ -89,8 +97,9 @@ def test_energy_counts_every_kind_of_spring():
     links = [(0, 1, 0.01), (0, 1, 0.03), (0, 1, 0.03), (0, 2, 0.005)]
     add_particles(builder, [(0, 0, 0), (0.02, 0, 0), (0.04, 0, 0), (0.02, 0, 0.01)], links=links,
                   stiffness=10.0)  # fmt: skip
-    for k, mode in enumerate((SpringMode.EQUAL, SpringMode.AT_LEAST, SpringMode.AT_MOST,
-                              SpringMode.BEND)):  # fmt: skip
+    for k, mode in enumerate(
+        (SpringMode.EQUAL, SpringMode.AT_LEAST, SpringMode.AT_MOST, SpringMode.BEND)
+    ):
         builder.custom_attributes[attribute("spring_mode")].values[k] = int(mode)
     builder.custom_attributes[attribute("spring_middle")].values[3] = 3
     solver = finalize(builder, ideal(), gravity=0.0)

@@ -28,9 +28,11 @@ SEED = 3
 
 
 def past(
-    lift: float = CARRY.lift, outcome: Outcome = Outcome.PLACED, held: int | None = BAG,
+    lift: float = CARRY.lift,
+    outcome: Outcome = Outcome.PLACED,
+    held: int | None = BAG,
     aloft: Aloft | None = None,
-) -> PastAction:  # fmt: skip
+) -> PastAction:
     return PastAction(np.array([0.0] * 6 + [lift]), outcome, held, aloft)
 
 
@@ -194,10 +196,16 @@ def test_a_search_goes_on_where_a_solution_would_lose_the_item() -> None:
     assert len(kept.tried) == 4, "nothing is left to search for"
 
 
-@pytest.mark.parametrize(("early", "late", "chosen", "tries"), [
-    ({0: 4}, {}, 0, 8), ({2: 2}, {9: 4}, 2, 8), ({0: 3}, {9: 4}, 9, 32), ({0: 3}, {9: 2}, 0, 32),
-    ({}, {20: 2}, 20, 32),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("early", "late", "chosen", "tries"),
+    [
+        ({0: 4}, {}, 0, 8),
+        ({2: 2}, {9: 4}, 2, 8),
+        ({0: 3}, {9: 4}, 9, 32),
+        ({0: 3}, {9: 2}, 0, 32),
+        ({}, {20: 2}, 20, 32),
+    ],
+)
 def test_mpc_tries_more_where_the_best_would_end_badly(
     monkeypatch, early, late, chosen, tries
 ) -> None:

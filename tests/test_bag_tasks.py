@@ -46,9 +46,12 @@ def objects(cls: type[Task]) -> tuple:
 
 
 def snapshot(
-    task: Task, layout: Layout, points: np.ndarray | None = None, body_q: np.ndarray | None = None,
+    task: Task,
+    layout: Layout,
+    points: np.ndarray | None = None,
+    body_q: np.ndarray | None = None,
     lifts: tuple[float, ...] = (),
-) -> Snapshot:  # fmt: skip
+) -> Snapshot:
     """State at rest, rendered, after actions that carried the bag with these lifts [m]."""
     points = np.asarray(layout.particle_q if points is None else points, np.float32)
     body_q = np.asarray(layout.body_q if body_q is None else body_q, np.float32)

@@ -88,7 +88,7 @@ INSIDE = {
     "inside a bigger one": [(box(0.1, 0.1, 0.1), MIDDLE), (box(0.02, 0.02, 0.02), (0.48, 0, 0.05))],
     "sunk face on face": [(BRICK, MIDDLE), (BRICK, (0.5, 0.0, 0.06))],
     "thin and coincident": [(PLATE, MIDDLE), (PLATE, MIDDLE)],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("scene", INSIDE.values(), ids=INSIDE)

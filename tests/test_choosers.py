@@ -47,13 +47,19 @@ def test_a_persons_points_are_grasped_across_the_cable(tmp_path: Path) -> None:
     chooser = HumanChooser(points)
     with recorder(tmp_path / "a") as made, drawn_camera(lambda: 0.45) as camera:
         result = run_episode(
-            SafeRobot(Arm(), LIMITS), camera, CALIBRATION, chooser, recorder=made, goal=GOAL,
+            SafeRobot(Arm(), LIMITS),
+            camera,
+            CALIBRATION,
+            chooser,
+            recorder=made,
+            goal=GOAL,
             config=EpisodeConfig(max_actions=1),
-        )  # fmt: skip
+        )
     assert result.outcomes == ("placed",) and shown[0].shape == (960, 480, 3)
     x, y, yaw, *place = Recording.read(tmp_path / "a").actions[0]["action"]
-    np.testing.assert_allclose([x, y, abs(yaw), *place[:2]], [0.45, 0.1, np.pi / 2, 0.5, 0.2],
-                               atol=0.02)  # fmt: skip
+    np.testing.assert_allclose(
+        [x, y, abs(yaw), *place[:2]], [0.45, 0.1, np.pi / 2, 0.5, 0.2], atol=0.02
+    )
 
 
 def test_random_actions_pick_the_cable_and_stay_inside() -> None:
@@ -121,9 +127,14 @@ def test_the_scripted_and_the_planned_action_approach_the_goal(tmp_path: Path) -
         folder = tmp_path / chooser.name
         with recorder(folder, goal=goal) as made, SimCamera(twin.look, config=SMALL) as camera:
             result = run_episode(
-                robot, camera, CALIBRATION, chooser, recorder=made, goal=goal,
+                robot,
+                camera,
+                CALIBRATION,
+                chooser,
+                recorder=made,
+                goal=goal,
                 config=EpisodeConfig(max_actions=1),
-            )  # fmt: skip
+            )
         assert result.outcomes == ("placed",)
         after = twin.look().beads[:, :2]
         ways = [np.linalg.norm(after - targets[::way], axis=1).mean() for way in (1, -1)]

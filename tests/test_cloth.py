@@ -67,12 +67,23 @@ def test_springs_know_when_they_act():
 @pytest.mark.parametrize(
     "values",
     [
-        {"rows": 1}, {"columns": 0}, {"side": 0.0}, {"mass": -1.0}, {"radius": np.nan},
-        {"thickness": 0.0}, {"structural_stiffness": 0.0}, {"shear_stiffness": -1.0},
-        {"bend_stiffness": np.inf}, {"shortest": 1.0}, {"shortest_diagonal": -0.1},
-        {"longest": 1.0}, {"edge_contact": 2.0}, {"exclusion": -1.0}, {"friction": np.nan},
+        {"rows": 1},
+        {"columns": 0},
+        {"side": 0.0},
+        {"mass": -1.0},
+        {"radius": np.nan},
+        {"thickness": 0.0},
+        {"structural_stiffness": 0.0},
+        {"shear_stiffness": -1.0},
+        {"bend_stiffness": np.inf},
+        {"shortest": 1.0},
+        {"shortest_diagonal": -0.1},
+        {"longest": 1.0},
+        {"edge_contact": 2.0},
+        {"exclusion": -1.0},
+        {"friction": np.nan},
     ],
-)  # fmt: skip
+)
 def test_a_bad_configuration_is_refused(values):
     with pytest.raises(InputError, match=next(iter(values))):
         ClothConfig(**values)

@@ -141,10 +141,11 @@ def test_no_near_pair_is_ever_missing():
         assert (np.linalg.norm(x - xr, axis=1) < slack + 0.001).all()
         top = solver.data.topologies[0]
         tight = {
-            (i, t) for i, t in near(solver, x)
+            (i, t)
+            for i, t in near(solver, x)
             if distance(x, i, top.sheet_triangle[t])
             < top.sheet_skin[i] + top.sheet_skin[top.sheet_triangle[t][0]]
-        }  # fmt: skip
+        }
         seen += len(tight)
         assert tight <= listed(solver)
     assert seen > 1000

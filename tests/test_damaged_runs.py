@@ -87,10 +87,15 @@ def test_damaged_settings_of_a_run_are_one_line(
 
 @pytest.mark.parametrize(
     "text",
-    ['{}', '{"episodes": 3}', '{"episodes": [3]}', '{"episodes": [{"seed": 50000}]}',
-     '{"episodes": [{"seed": 50000, "success": false, "score": 0.0, "actions": 1, "reason": "",'
-     ' "goal_l2": ["a"]}]}'],
-)  # fmt: skip
+    [
+        "{}",
+        '{"episodes": 3}',
+        '{"episodes": [3]}',
+        '{"episodes": [{"seed": 50000}]}',
+        '{"episodes": [{"seed": 50000, "success": false, "score": 0.0, "actions": 1, "reason": "",'
+        ' "goal_l2": ["a"]}]}',
+    ],
+)
 def test_damaged_results_are_one_line(
     run: RunFolder, capsys: pytest.CaptureFixture[str], text: str
 ) -> None:

@@ -107,8 +107,9 @@ def test_a_command_speaks_for_its_section_and_a_comment_for_its_paragraph() -> N
     assert kinds(f"142 / 200\n{source}") == ["compared"]
     assert kinds(f"142 / 200\n{source}\n\n142 / 200") == ["compared", "bare"]
     assert kinds(f"Of 20 %, 142 of 200\n<!-- from: -setting {CELL} n_success n_episodes -->") == [
-        "setting", "compared"
-    ]  # fmt: skip
+        "setting",
+        "compared",
+    ]
 
 
 @pytest.mark.parametrize(

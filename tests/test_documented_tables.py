@@ -57,8 +57,15 @@ def test_rows_of_neighbouring_seeds_count_as_one() -> None:
     module, lines = measured("demonstrators", "results")
     row = module.Row(**lines[0])
     few = replace(row, first_seed=0, attempts=10, successes=5, mean_actions_solved=2.0, enclosed=4)
-    more = replace(few, first_seed=10, attempts=30, successes=15, mean_actions=8.0,
-                   mean_actions_solved=4.0, enclosed=10)  # fmt: skip
+    more = replace(
+        few,
+        first_seed=10,
+        attempts=30,
+        successes=15,
+        mean_actions=8.0,
+        mean_actions_solved=4.0,
+        enclosed=10,
+    )
     (both,) = module.pooled([more, few])
     assert (both.attempts, both.successes, both.enclosed) == (40, 20, 14)
     assert both.mean_actions_solved == pytest.approx(3.5)

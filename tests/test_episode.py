@@ -91,9 +91,15 @@ def episode(
     chooser = Listed(actions)
     with recorder(folder) as made, drawn_camera(where) as camera:
         result = run_episode(
-            SafeRobot(arm, LIMITS, home_q=home_q), camera, CALIBRATION, chooser, recorder=made,
-            goal=GOAL, config=EpisodeConfig(**settings), operator=operator,
-        )  # fmt: skip
+            SafeRobot(arm, LIMITS, home_q=home_q),
+            camera,
+            CALIBRATION,
+            chooser,
+            recorder=made,
+            goal=GOAL,
+            config=EpisodeConfig(**settings),
+            operator=operator,
+        )
     return result, chooser
 
 
@@ -124,9 +130,16 @@ def test_a_start_at_the_goal_is_tossed_again(tmp_path: Path) -> None:
     said: list[str] = []
     with recorder(tmp_path / "a") as made, drawn_camera(lambda: places["x"]) as camera:
         result = run_episode(
-            SafeRobot(Arm(), LIMITS), camera, CALIBRATION, Listed([ACTION]), recorder=made,
-            goal=GOAL, config=EpisodeConfig(max_actions=1), toss=toss, say=said.append,
-        )  # fmt: skip
+            SafeRobot(Arm(), LIMITS),
+            camera,
+            CALIBRATION,
+            Listed([ACTION]),
+            recorder=made,
+            goal=GOAL,
+            config=EpisodeConfig(max_actions=1),
+            toss=toss,
+            say=said.append,
+        )
     assert tosses == [1, 2, 3] and "no success" in said[0]
     assert result.outcome == "limit" and result.score is not None and not result.score.success
     assert len(Recording.read(tmp_path / "a").observations) == 2
@@ -264,9 +277,14 @@ def test_a_picture_without_foam_is_asked_about(tmp_path: Path) -> None:
     person = Person()
     with recorder(tmp_path / "a") as made:
         result = run_episode(
-            SafeRobot(Arm(), LIMITS), Hidden(), CALIBRATION, Listed([None]), recorder=made,
-            goal=GOAL, operator=person,
-        )  # fmt: skip
+            SafeRobot(Arm(), LIMITS),
+            Hidden(),
+            CALIBRATION,
+            Listed([None]),
+            recorder=made,
+            goal=GOAL,
+            operator=person,
+        )
     assert result.outcome == "stopped" and len(person.problems) == 1
 
 
@@ -318,9 +336,13 @@ def test_goal_and_calibration_must_fit(tmp_path: Path) -> None:
         pytest.raises(InputError, match="pixels"),
     ):
         run_episode(
-            SafeRobot(Arm(), LIMITS), camera, CALIBRATION, Listed([]), recorder=made,
+            SafeRobot(Arm(), LIMITS),
+            camera,
+            CALIBRATION,
+            Listed([]),
+            recorder=made,
             goal=GOAL[:-1],
-        )  # fmt: skip
+        )
     assert not RigConfig(robot="panda").moves and RigConfig(robot="panda", execute=True).real
 
 
@@ -350,9 +372,14 @@ def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
         ):
             limits = replace(LIMITS, max_joint_speed=0.2)
             result = run_episode(
-                SafeRobot(panda, limits), camera, calibration, chooser, recorder=made, goal=goal,
+                SafeRobot(panda, limits),
+                camera,
+                calibration,
+                chooser,
+                recorder=made,
+                goal=goal,
                 config=EpisodeConfig(max_actions=2),
-            )  # fmt: skip
+            )
         beads = look().beads[:, :2]
     assert result.outcomes == ("placed", "placed") and result.score is not None
     ways = [np.linalg.norm(beads - targets[::way], axis=1).mean() for way in (1, -1)]

@@ -74,9 +74,12 @@ def test_a_user_stop_while_choosing_is_asked_about(tmp_path: Path) -> None:
 def test_only_recoveries_without_an_operator_count(tmp_path: Path) -> None:
     many = LIMITS.max_recoveries + 2
     result, _ = episode(
-        tmp_path / "a", Arm(*[REFLEX] * many), [ACTION] * many, operator=Person(),
+        tmp_path / "a",
+        Arm(*[REFLEX] * many),
+        [ACTION] * many,
+        operator=Person(),
         max_actions=many,
-    )  # fmt: skip
+    )
     assert result.error is None and result.outcomes == ("aborted",) * many
 
 

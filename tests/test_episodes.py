@@ -150,12 +150,23 @@ def test_writer_refuses_a_bad_step(
 @pytest.mark.parametrize(
     "changes",
     [
-        {"seed": -1}, {"seed": 10**9}, {"seed": 1.0}, {"actions": 1}, {"score": float("inf")},
-        {"score": 10**400}, {"task": ""}, {"config": {"f": print}}, {"config": {"x": float("nan")}},
-        {"versions": None}, {"success": 1}, {"goal": {"kind": "constructed"}}, {"format": 2},
-        {"state_hash": "no"}, {"sim_seconds": "3"},
+        {"seed": -1},
+        {"seed": 10**9},
+        {"seed": 1.0},
+        {"actions": 1},
+        {"score": float("inf")},
+        {"score": 10**400},
+        {"task": ""},
+        {"config": {"f": print}},
+        {"config": {"x": float("nan")}},
+        {"versions": None},
+        {"success": 1},
+        {"goal": {"kind": "constructed"}},
+        {"format": 2},
+        {"state_hash": "no"},
+        {"sim_seconds": "3"},
     ],
-)  # fmt: skip
+)
 def test_writer_refuses_bad_metadata(tmp_path: Path, changes: dict[str, object]) -> None:
     with pytest.raises(InputError) as caught:
         EpisodeWriter(tmp_path).write(with_info(make_episode(), **changes))

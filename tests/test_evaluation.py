@@ -51,9 +51,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     root = tmp_path_factory.mktemp("run")
     data = write_demonstrations(root / "demos", 2, task="block-notarget")
     config = TrainConfig(
-        task="block-notarget", agent="gt-mlp", data=data, out=root / "run", preset="fast",
+        task="block-notarget",
+        agent="gt-mlp",
+        data=data,
+        out=root / "run",
+        preset="fast",
         schedule=SCHEDULE,
-    )  # fmt: skip
+    )
     train(config)
     return RunFolder(root / "run")
 
@@ -163,8 +167,14 @@ def test_a_run_is_reported_once(run: RunFolder, capsys: pytest.CaptureFixture[st
     assert report["test"]["n_episodes"] == 4 and report["paper"] is None
     assert report["selected"] in (1, 2)
     assert run.chosen_snapshot() == run.snapshot(report["selected"])
-    for key in ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "mean_score",
-                "mean_actions"):  # fmt: skip
+    for key in (
+        "n_episodes",
+        "n_success",
+        "pc_success",
+        "pc_success_ci95",
+        "mean_score",
+        "mean_actions",
+    ):
         assert all(key in row for row in (*report["snapshots"].values(), report["test"]))
     again = evaluate_run(run.path, episodes=4, validation_episodes=3, workers=1)
     assert again["test"] == report["test"] and again["snapshots"] == report["snapshots"]
@@ -190,9 +200,13 @@ def test_a_shared_run_is_the_chosen_snapshot_in_half_its_bytes(
     assert main(arguments) == 2
     assert "exists" in capsys.readouterr().err
     more = TrainConfig(
-        task="block-notarget", agent="gt-mlp", data=run.path.parent / "demos", out=shared,
-        preset="fast", schedule=SCHEDULE,
-    )  # fmt: skip
+        task="block-notarget",
+        agent="gt-mlp",
+        data=run.path.parent / "demos",
+        out=shared,
+        preset="fast",
+        schedule=SCHEDULE,
+    )
     with pytest.raises(InputError, match="shared policy"):
         train(more)
 
@@ -209,9 +223,15 @@ def test_training_stops_when_validation_brings_nothing_better(
 ) -> None:
     """A baseline that knows nothing scores 0 from the first snapshot on."""
     config = TrainConfig(
-        task="block-notarget", agent="gt-mlp", data=run.path.parent / "demos", out=tmp_path,
-        preset="fast", schedule=replace(SCHEDULE, steps=6, snapshots=6), validate=2, patience=2,
-    )  # fmt: skip
+        task="block-notarget",
+        agent="gt-mlp",
+        data=run.path.parent / "demos",
+        out=tmp_path,
+        preset="fast",
+        schedule=replace(SCHEDULE, steps=6, snapshots=6),
+        validate=2,
+        patience=2,
+    )
     report = train(config)
     assert report.stopped_early and report.snapshots == (1, 2, 3)
     again = train(config)
@@ -221,9 +241,13 @@ def test_training_stops_when_validation_brings_nothing_better(
 def test_the_untrained_network_is_played_and_never_chosen(tmp_path: Path) -> None:
     data = write_demonstrations(tmp_path / "demos", 2, task="block-notarget")
     plain = TrainConfig(
-        task="block-notarget", agent="gt-mlp", data=data, out=tmp_path / "plain", preset="fast",
+        task="block-notarget",
+        agent="gt-mlp",
+        data=data,
+        out=tmp_path / "plain",
+        preset="fast",
         schedule=SCHEDULE,
-    )  # fmt: skip
+    )
     first = train(plain)
     with_it = train(replace(plain, out=tmp_path / "both", untrained=True))
     assert with_it.weights_hash == first.weights_hash

@@ -50,9 +50,12 @@ ONE = PastAction(np.zeros(7), Outcome.PLACED, held=0)
 
 
 def snapshot(
-    task: Task, layout: Layout, points: np.ndarray | None = None, body_q: np.ndarray | None = None,
+    task: Task,
+    layout: Layout,
+    points: np.ndarray | None = None,
+    body_q: np.ndarray | None = None,
     actions: int = 0,
-) -> Snapshot:  # fmt: skip
+) -> Snapshot:
     """State at rest with the fabric at `points`, rendered."""
     points = np.asarray(layout.particle_q if points is None else points, np.float32)
     body_q = np.asarray(layout.body_q if body_q is None else body_q, np.float32)

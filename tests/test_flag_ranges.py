@@ -126,9 +126,13 @@ def test_every_number_has_a_range(verb: str, name: str, hint: Any) -> None:
 
 @pytest.mark.parametrize(("verb", "name", "hint"), FLAGS, ids=lambda value: str(value)[:20])
 def test_what_cannot_be_meant_is_one_line_and_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
-    verb: str, name: str, hint: Any,
-) -> None:  # fmt: skip
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    verb: str,
+    name: str,
+    hint: Any,
+) -> None:
     monkeypatch.chdir(tmp_path)
     allowed = flag_range(hint)
     assert allowed is not None

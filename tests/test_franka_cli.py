@@ -58,9 +58,21 @@ def test_a_simulated_episode_is_run_scored_replayed_and_packed(
 ) -> None:
     out = tmp_path / "demos"
     code, data, _ = run(
-        capfd, "collect", "-n", "1", "--robot", "sim", "--agent", "scripted", "--seed", "2",
-        "--max-actions", "2", "--out", str(out),
-    )  # fmt: skip
+        capfd,
+        "collect",
+        "-n",
+        "1",
+        "--robot",
+        "sim",
+        "--agent",
+        "scripted",
+        "--seed",
+        "2",
+        "--max-actions",
+        "2",
+        "--out",
+        str(out),
+    )
     assert code == 0 and data["episodes"] == 1 and data["actions"] == 2
     assert data["demonstrations"] == 0 and not list(out.glob("*.parquet"))  # the goal is too far
     folder = str(out / "live" / "0000")
@@ -147,9 +159,13 @@ def tampered(folder: Path, name: str, change: Callable[[dict[str, Any]], None]) 
     ids=["overlap", "outcome", "calibration"],
 )
 def test_what_is_recorded_and_computed_otherwise_is_exit_code_1(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str],
-    name: str, change: Callable[[dict[str, Any]], None], message: str, verbs: str,
-) -> None:  # fmt: skip
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    name: str,
+    change: Callable[[dict[str, Any]], None],
+    message: str,
+    verbs: str,
+) -> None:
     folder, untouched = tmp_path / "a", tmp_path / "b"
     for each in (folder, untouched):
         episode(each, Arm(), [ACTION], max_actions=1)
@@ -227,9 +243,12 @@ def test_a_goal_is_captured_and_read(tmp_path: Path, capfd: pytest.CaptureFixtur
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_bad_input_is_one_line_and_exit_code_2(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
-    arguments: list[str], message: str,
-) -> None:  # fmt: skip
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["franka", *arguments]) == 2
     said = capfd.readouterr().err.strip().splitlines()

@@ -153,9 +153,10 @@ def test_what_a_body_met_before_ends_its_descent_and_no_later_one() -> None:
     for lift, touching in ((0.1, 1), (0.1, 0)):
         state = replace(draw.state, body_x=draw.state.body_x + np.array([0, 0, lift]))
         path = replace(
-            draw.path, positions=draw.path.positions + np.array([0, 0, lift]),
+            draw.path,
+            positions=draw.path.positions + np.array([0, 0, lift]),
             lower=(0.0, 0.5 * draw.path.times[-1]),
-        )  # fmt: skip
+        )
         ends = Draw(state, path, np.full_like(draw.touching, touching))
         samples = compare(run, worlds, ends, 1, np.random.default_rng(1), bound=1e-6)
         assert (samples[0].fired[Kind.REACHED] > 0) == touching

@@ -137,9 +137,12 @@ class Bench:
         T[0, 3] += 0.03 * (self.seen in self.pushed)
         seen = np.linalg.inv(self.robot.state().base_T_tcp @ TCP_T_CAMERA) @ T
         pixels, _ = cv2.projectPoints(
-            BOARD.corners_m, cv2.Rodrigues(seen[:3, :3])[0], seen[:3, 3],
-            INTRINSICS.matrix, INTRINSICS.distortion,
-        )  # fmt: skip
+            BOARD.corners_m,
+            cv2.Rodrigues(seen[:3, :3])[0],
+            seen[:3, 3],
+            INTRINSICS.matrix,
+            INTRINSICS.distortion,
+        )
         noise = self.rng.normal(0.0, 0.15, (len(pixels), 2))
         return Corners(np.arange(len(pixels)), pixels.reshape(-1, 2) + noise)
 
@@ -156,9 +159,13 @@ class Bench:
     def measure(self, folder: Path, *, board: BoardSpec = BOARD) -> dict[str, object]:
         self.asked.clear()
         return measure_hand_eye(
-            setup(folder), board, views=VIEWS, camera=BlindCamera(),
-            robot=SafeRobot(self.robot, SafetyLimits(table=TABLE)), operator=Terminal(self.answer),
-        )  # fmt: skip
+            setup(folder),
+            board,
+            views=VIEWS,
+            camera=BlindCamera(),
+            robot=SafeRobot(self.robot, SafetyLimits(table=TABLE)),
+            operator=Terminal(self.answer),
+        )
 
     @property
     def views(self) -> list[str]:
@@ -213,9 +220,11 @@ def test_a_refused_hand_eye_keeps_its_views_and_goes_on_from_them(
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt(), CameraError("no picture"), None])
 def test_an_interrupted_hand_eye_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
     failure: BaseException | None,
-) -> None:  # fmt: skip
+) -> None:
     bench = Bench(monkeypatch)
 
     def fail(text: str) -> str | None:
@@ -319,9 +328,12 @@ class Desk:
         R = rotation(*self.rng.uniform(-0.5, 0.5, 3))
         at = [*self.rng.uniform([-0.12, -0.06], [0.12, 0.06]), self.rng.uniform(0.35, 0.6)]
         pixels, _ = cv2.projectPoints(
-            BOARD.corners_m, cv2.Rodrigues(R)[0], at - R @ BOARD.corners_m.mean(axis=0),
-            INTRINSICS.matrix, INTRINSICS.distortion,
-        )  # fmt: skip
+            BOARD.corners_m,
+            cv2.Rodrigues(R)[0],
+            at - R @ BOARD.corners_m.mean(axis=0),
+            INTRINSICS.matrix,
+            INTRINSICS.distortion,
+        )
         noise = self.rng.normal(0.0, 20.0 if self.seen in self.moved else 0.1, (len(pixels), 2))
         return Corners(np.arange(len(pixels)), pixels.reshape(-1, 2) + noise)
 
@@ -332,9 +344,12 @@ class Desk:
     def measure(self, folder: Path) -> dict[str, object]:
         self.asked.clear()
         return measure_lens(
-            RigConfig(setup=folder, camera="uvc"), BOARD, views=VIEWS, camera=BlindCamera(),
+            RigConfig(setup=folder, camera="uvc"),
+            BOARD,
+            views=VIEWS,
+            camera=BlindCamera(),
             operator=Terminal(self.answer),
-        )  # fmt: skip
+        )
 
     @property
     def views(self) -> list[str]:

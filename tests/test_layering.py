@@ -188,9 +188,10 @@ def upward(arrows: dict[str, set[str]], floors: list[str]) -> list[str]:
         f"{module} imports {other}"
         for module, others in sorted(arrows.items())
         for other in sorted(others)
-        if room(module) and room(module) != room(other)
+        if room(module)
+        and room(module) != room(other)
         and (not room(other) or level[room(module)] >= level[room(other)])
-    ]  # fmt: skip
+    ]
 
 
 def circle(arrows: dict[str, set[str]]) -> list[str]:

@@ -47,10 +47,15 @@ def test_held_out_places_are_learnt_in_three_minutes(tmp_path: Path) -> None:
     out = tmp_path / "run"
     train(
         TrainConfig(
-            task=TASK, agent="transporter", data=tmp_path / "demos", out=out, preset="fast",
-            schedule=schedule, untrained=True,
+            task=TASK,
+            agent="transporter",
+            data=tmp_path / "demos",
+            out=out,
+            preset="fast",
+            schedule=schedule,
+            untrained=True,
         )
-    )  # fmt: skip
+    )
     held_out = Demonstrations(tmp_path / "held-out", task=TASK)
     before, after = (place_errors(RunFolder(out).snapshot(step), held_out) for step in (0, 200))
     assert len(before) > 30

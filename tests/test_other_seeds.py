@@ -81,8 +81,9 @@ def test_an_evaluation_tells_of_every_episode(
         shown.clear()
         evaluate_run(run.path, episodes=3, **ONE)
         assert [(what, total) for what, total, _ in shown] == [
-            (f"eval {TASK}, validation", 2), (f"eval {TASK}, test", 3)
-        ]  # fmt: skip
+            (f"eval {TASK}, validation", 2),
+            (f"eval {TASK}, test", 3),
+        ]
         assert "3 of 3 episodes, step " in shown[1][2].line()
         assert ": 0 of 3 solved, " in shown[1][2].line()
 

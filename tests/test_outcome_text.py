@@ -93,14 +93,21 @@ def test_the_commands_say_it(
     ("stored", "expected"),
     [
         (0, "interrupted; no step is kept yet, the same command begins again"),
-        (2, "interrupted; steps up to 2 are kept, the same command goes on and ends with the same "
-            "bits"),
+        (
+            2,
+            "interrupted; steps up to 2 are kept, the same command goes on and ends with the same "
+            "bits",
+        ),
     ],
-)  # fmt: skip
+)
 def test_an_interrupted_training_says_which_steps_are_kept(
-    stored: int, expected: str, run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    stored: int,
+    expected: str,
+    run: RunFolder,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     """Before the first state is stored nothing is; afterwards all up to it."""
     steps: list[int] = []
     batch = training._batch

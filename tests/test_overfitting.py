@@ -36,10 +36,16 @@ def test_one_demonstration_is_learned_by_heart(agent: str, tmp_path: Path) -> No
     data = write_demonstrations(tmp_path / "data", 1, task=task, actions=1)
     train(
         TrainConfig(
-            task=task, agent=agent, data=data, out=tmp_path / "run", preset="fast",
-            schedule=schedule, augment=False, untrained=True,
+            task=task,
+            agent=agent,
+            data=data,
+            out=tmp_path / "run",
+            preset="fast",
+            schedule=schedule,
+            augment=False,
+            untrained=True,
         )
-    )  # fmt: skip
+    )
     before, after = (
         distance(tmp_path / "run", step, block_episode(0, task=task, actions=1))
         for step in (0, schedule.steps)

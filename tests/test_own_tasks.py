@@ -185,8 +185,9 @@ def test_a_module_that_is_named_is_imported(
     registry._REGISTERED.clear()
     tasks = reported(capfd, "list", "--task-module", "named_tasks")["tasks"]
     assert [each["name"] for each in tasks if not each["benchmark"]] == [
-        "cable-mask-goal", "box-away",
-    ]  # fmt: skip
+        "cable-mask-goal",
+        "box-away",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -246,8 +247,12 @@ def test_a_broken_distribution_is_one_line_that_names_it(
 
 def test_a_name_that_two_distributions_offer_is_nobody_s(tmp_path: Path) -> None:
     for name in "one", "two":
-        install(tmp_path / name, f"boxes-{name}", f"box-away = {name}_tasks:BoxAway",
-                **{f"{name}_tasks": BOX})  # fmt: skip
+        install(
+            tmp_path / name,
+            f"boxes-{name}",
+            f"box-away = {name}_tasks:BoxAway",
+            **{f"{name}_tasks": BOX},
+        )
     with pytest.raises(InputError, match="boxes-one and boxes-two both offer a task 'box-away'"):
         find_task("box-away")
     assert is_known("box-away")
@@ -298,7 +303,7 @@ def variant(**attributes: Any) -> type[Task]:
         (type("Goal", (CableRing,), {"name": "goal", "goal_conditioned": True}), "goal_layout"),
         (variant(__init__=lambda self, size: None), "made without arguments"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_task_is_refused_in_one_line(task: Any, expected: str) -> None:
     with pytest.raises(InputError) as caught:
         warp_deform.register_task(task)
@@ -368,9 +373,12 @@ def test_an_installed_task_has_the_id_of_the_version_that_its_entry_point_says(
 
 @pytest.mark.parametrize(
     ("point", "text", "wanted"),
-    [("box-away", second(), "'box-away-v2'"), ("box-away-v3", second(), "'box-away-v2'"),
-     ("box-away-v2", BOX, "'box-away'")],
-)  # fmt: skip
+    [
+        ("box-away", second(), "'box-away-v2'"),
+        ("box-away-v3", second(), "'box-away-v2'"),
+        ("box-away-v2", BOX, "'box-away'"),
+    ],
+)
 def test_an_entry_point_of_another_version_is_refused(
     point: str, text: str, wanted: str, tmp_path: Path
 ) -> None:

@@ -69,9 +69,11 @@ def test_way_points_point_down_along_the_tangents() -> None:
 
 @settings(derandomize=True, deadline=None, max_examples=300)
 @given(
-    pick=st.floats(-10, 10), turn=st.floats(-1.55, 1.55),
-    x=st.floats(0.35, 0.6), y=st.floats(-0.3, 0.3),
-)  # fmt: skip
+    pick=st.floats(-10, 10),
+    turn=st.floats(-1.55, 1.55),
+    x=st.floats(0.35, 0.6),
+    y=st.floats(-0.3, 0.3),
+)
 def test_the_hand_turns_the_cable_as_asked(pick: float, turn: float, x: float, y: float) -> None:
     poses = way_points(PickPlaceAction((x, y), pick, (0.5, 0.0), pick + turn), TABLE)
     a, b = poses["lift"][:3, :3], poses["carry"][:3, :3]
@@ -94,8 +96,10 @@ def test_placing() -> None:
     assert result.base_T_place is not None
     np.testing.assert_allclose(result.base_T_place[:2, 3], ACTION.place_xy, atol=1e-4)
     assert [entry for entry in spy.log if entry in {"open_gripper", "grasp"}] == [
-        "open_gripper", "grasp", "open_gripper",
-    ]  # fmt: skip
+        "open_gripper",
+        "grasp",
+        "open_gripper",
+    ]
     np.testing.assert_allclose(spy.q, HOME, atol=1e-9)
     assert_within(LIMITS, spy)
 
@@ -188,15 +192,27 @@ yaws = st.floats(-7.0, 7.0)
 
 @settings(derandomize=True, deadline=None, max_examples=100)
 @given(
-    pick=pixels, place=pixels, pick_yaw=yaws, place_yaw=yaws,
+    pick=pixels,
+    place=pixels,
+    pick_yaw=yaws,
+    place_yaw=yaws,
     table=tables,
-    height=st.floats(0.3, 1.5), tilt=st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
-    object_width=st.sampled_from([0.0, 0.004, 0.03]), contact=st.sampled_from([None, 0.01, 0.05]),
-)  # fmt: skip
+    height=st.floats(0.3, 1.5),
+    tilt=st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
+    object_width=st.sampled_from([0.0, 0.004, 0.03]),
+    contact=st.sampled_from([None, 0.01, 0.05]),
+)
 def test_no_action_and_no_calibration_gets_past_the_limits(
-    pick: tuple, place: tuple, pick_yaw: float, place_yaw: float, table: TablePlane,
-    height: float, tilt: tuple, object_width: float, contact: float | None,
-) -> None:  # fmt: skip
+    pick: tuple,
+    place: tuple,
+    pick_yaw: float,
+    place_yaw: float,
+    table: TablePlane,
+    height: float,
+    tilt: tuple,
+    object_width: float,
+    contact: float | None,
+) -> None:
     limits = SafetyLimits(table=table)
     spy = SpyRobot(object_width=object_width)
     spy.contact_at = None if contact is None else table.height_m + contact
@@ -224,8 +240,9 @@ def test_no_action_and_no_calibration_gets_past_the_limits(
 @given(
     pick=st.tuples(st.floats(0.36, 0.63), st.floats(-0.3, 0.3)),
     place=st.tuples(st.floats(0.36, 0.63), st.floats(-0.3, 0.3)),
-    pick_yaw=st.floats(-1.5, 1.5), turn=st.floats(-0.7, 0.7),
-)  # fmt: skip
+    pick_yaw=st.floats(-1.5, 1.5),
+    turn=st.floats(-0.7, 0.7),
+)
 def test_the_whole_workspace_is_within_reach(
     pick: tuple, place: tuple, pick_yaw: float, turn: float
 ) -> None:

@@ -98,8 +98,12 @@ def test_the_pages_have_the_commands_that_were_timed() -> None:
     timed = module.commands(module.parser().parse_args([]))
     page = (ROOT / "docs" / "learning.md").read_text()
     shown = [shlex.split(line) for line in page.splitlines() if line.startswith("    warp-deform ")]
-    folders = {"demos", "runs/line", str(Path("runs/benchmark/demos") / TASK),
-               str(Path(f"runs/benchmark/runs/{TASK}-goal-split-10"))}  # fmt: skip
+    folders = {
+        "demos",
+        "runs/line",
+        str(Path("runs/benchmark/demos") / TASK),
+        str(Path(f"runs/benchmark/runs/{TASK}-goal-split-10")),
+    }
 
     def essence(arguments: list[str]) -> list[str]:
         return sorted(each for each in arguments if each not in folders)

@@ -194,8 +194,12 @@ def test_who_demonstrated_and_how_long_is_a_variant(tmp_path: Path) -> None:
     write_run(tmp_path / "e", trained=patient, trained_steps=2000)
     write_run(tmp_path / "f", seed=1, trained=patient, trained_steps=3000)
     write_run(tmp_path / "g", schedule={**SCHEDULE, "steps": 8000})
-    write_run(tmp_path / "h", seed=2, trained={"rounded": "bfloat16"}, snapshots={
-        "4000": result(LINE, [1.0, 1.0, 0.5, 0.5])})  # fmt: skip
+    write_run(
+        tmp_path / "h",
+        seed=2,
+        trained={"rounded": "bfloat16"},
+        snapshots={"4000": result(LINE, [1.0, 1.0, 0.5, 0.5])},
+    )
     assert {cell.variant: cell.seeds for cell in cells(tmp_path)} == {
         "fast": (0, 1, 2),
         "fast, refined demonstrations": (0,),
@@ -234,7 +238,7 @@ def test_steps_are_told_where_they_are_not_the_presets(tmp_path: Path) -> None:
         ({}, {"snapshots": {"4000": result(LINE, [1.0] * 5)}}, "validation episodes"),
         ({}, {"paper": {**PLAYED_TOO, "stage_rule": "privileged"}}, "who chooses the lift"),
     ],
-)  # fmt: skip
+)
 def test_runs_of_a_cell_are_alike(
     tmp_path: Path, trained: dict[str, Any], info: dict[str, Any], told: str
 ) -> None:

@@ -143,17 +143,16 @@ BOMBS = {
     ),
     "an array without bytes": (
         array_opcodes(
-            opcodes(1)
-            + opcodes((10**15,))
-            + dtype(np.dtype("f8"))
-            + opcodes(False)
-            + opcodes(b"")
+            opcodes(1) + opcodes((10**15,)) + dtype(np.dtype("f8")) + opcodes(False) + opcodes(b"")
         ),
         "0 bytes for an array",
     ),
     "a negative length": (
         array_opcodes(
-            opcodes(1) + opcodes((-1, -24)) + dtype(np.dtype("u1")) + opcodes(False)
+            opcodes(1)
+            + opcodes((-1, -24))
+            + dtype(np.dtype("u1"))
+            + opcodes(False)
             + opcodes(bytes(24))
         ),
         "impossible shape",
@@ -179,7 +178,8 @@ BOMBS = {
     "a huge number": (b"\x8b" + (10**6).to_bytes(4, "little") + b"\x7f" * 10**6, "type int"),
     "doublings": (b"]" + b"".join(b"q%c](h%ch%ce" % (i, i, i) for i in range(40)), "levels"),
     "a hundred of a hundred of": (
-        b"]" + b"".join(b"q%c](" % i + b"h%c" % i * 100 + b"e" for i in range(6)), "values"
+        b"]" + b"".join(b"q%c](" % i + b"h%c" % i * 100 + b"e" for i in range(6)),
+        "values",
     ),
     "depth": (b"]" * 10**5 + b"a" * (10**5 - 1), "levels"),
     "a list in itself": (b"]q\x00h\x00a", "levels"),
@@ -189,7 +189,7 @@ BOMBS = {
     "keys of another kind": (b"}(N" + b"K\x01u", "keys"),
     "two values": (b"N.N", "more than one value"),
     "no end": (b"(K\x01", "damaged"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", BOMBS)

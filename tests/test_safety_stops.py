@@ -30,8 +30,21 @@ FAST = replace(FLAT, max_joint_speed=0.2)
 
 # Arguments that are none.
 
-JUNK: list[Any] = [0.0, -1.0, float("nan"), float("inf"), 1e-300, True, None, "0.05", 1j, [0.05],
-                   np.array([0.05]), {}, 10**400]  # fmt: skip
+JUNK: list[Any] = [
+    0.0,
+    -1.0,
+    float("nan"),
+    float("inf"),
+    1e-300,
+    True,
+    None,
+    "0.05",
+    1j,
+    [0.05],
+    np.array([0.05]),
+    {},
+    10**400,
+]
 
 
 @pytest.mark.parametrize("junk", JUNK, ids=[repr(junk)[:12] for junk in JUNK])
@@ -58,11 +71,20 @@ def test_numbers_that_are_none_are_refused_by_name(junk: object) -> None:
 @pytest.mark.parametrize(
     "bent",
     [
-        pose() * 1j, pose().astype(str), pose()[:3], None, "here", [[1.0], [1.0, 2.0]],
-        np.eye(4, dtype=bool), 1.001 * pose(), pose() * 1e200, np.full((4, 4), np.inf), object,
+        pose() * 1j,
+        pose().astype(str),
+        pose()[:3],
+        None,
+        "here",
+        [[1.0], [1.0, 2.0]],
+        np.eye(4, dtype=bool),
+        1.001 * pose(),
+        pose() * 1e200,
+        np.full((4, 4), np.inf),
+        object,
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_poses_that_are_none_are_refused(bent: object) -> None:
     robot, spy = SafeRobot(spy := SpyRobot(), FLAT), spy
     with pytest.raises(InputError, match="base_T_tcp"):
@@ -124,8 +146,13 @@ def test_limits_stay_as_the_robot_was_made_with_them() -> None:
         robot._checks.limits = None
     with pytest.raises(ValueError, match="read-only"):
         DQ_MAX[0] = 99.0
-    for wrong in ({"table": None}, {"x": "ab"}, {"x": 1.0}, {"max_speed": "0.1"},
-                  {"max_recoveries": True}):  # fmt: skip
+    for wrong in (
+        {"table": None},
+        {"x": "ab"},
+        {"x": 1.0},
+        {"max_speed": "0.1"},
+        {"max_recoveries": True},
+    ):
         with pytest.raises(InputError, match="safety limit"):
             SafetyLimits(**{"table": TablePlane(0.0), **wrong})
     with pytest.raises(InputError, match="SafetyLimits"):

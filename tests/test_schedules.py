@@ -70,9 +70,7 @@ def test_snapshots_are_as_many_as_asked_for_and_evenly_spread(numbers: tuple[int
 @settings(derandomize=True, deadline=None, max_examples=200)
 @given(st.integers(1, 12), st.integers(1, 5000))
 def test_doubling_snapshots_come_after_twice_the_steps(n: int, steps: int) -> None:
-    found = Schedule(
-        steps=steps, batch=1, lr=1.0, snapshots=n, doubling=True
-    ).snapshot_steps()  # fmt: skip
+    found = Schedule(steps=steps, batch=1, lr=1.0, snapshots=n, doubling=True).snapshot_steps()
     assert found[-1] == steps and found[0] >= 1 and list(found) == sorted(set(found))
     assert len(found) <= n and (len(found) == n or steps < 2**n)
     assert all(abs(2 * a - b) <= 1 for a, b in pairwise(found))

@@ -103,9 +103,13 @@ def test_a_camera_on_the_hand_is_found_by_someone_who_forgets_the_user_stop(tmp_
         return ""
 
     found = measure_hand_eye(
-        setup(tmp_path), BOARD, views=VIEWS, camera=HandCamera(robot, rng),
-        robot=SafeRobot(robot, SafetyLimits(table=TABLE)), operator=Terminal(guide),
-    )  # fmt: skip
+        setup(tmp_path),
+        BOARD,
+        views=VIEWS,
+        camera=HandCamera(robot, rng),
+        robot=SafeRobot(robot, SafetyLimits(table=TABLE)),
+        operator=Terminal(guide),
+    )
     assert len(said) >= VIEWS + 2 and robot.log.count("move_joints") == 1
     assert "release the user stop; the arm then goes home" in said[-2]
     assert "the user stop is pressed" in said[-1]
@@ -150,9 +154,14 @@ def test_the_board_s_corners_are_touched_with_closed_fingers(tmp_path: Path) -> 
         robot = TouchingRobot(object_width=width)
         camera = HandCamera(robot, np.random.default_rng(0))
         measure = functools.partial(
-            measure_camera, config, BOARD, corner_ids=(0, 5, 18, 23), camera=camera,
-            robot=SafeRobot(robot, SafetyLimits(table=TABLE)), operator=Terminal(robot.answer),
-        )  # fmt: skip
+            measure_camera,
+            config,
+            BOARD,
+            corner_ids=(0, 5, 18, 23),
+            camera=camera,
+            robot=SafeRobot(robot, SafetyLimits(table=TABLE)),
+            operator=Terminal(robot.answer),
+        )
         if width:
             with pytest.raises(GraspError, match="not closed; take out"):
                 measure()
@@ -193,9 +202,11 @@ def test_the_table_is_asked_for_then_touched_with_homed_fingers(
         return ""
 
     found = measure_table(
-        RigConfig(setup=tmp_path, robot="fr3"), provisional_z=-0.015,
-        robot=SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015))), operator=Terminal(answer),
-    )  # fmt: skip
+        RigConfig(setup=tmp_path, robot="fr3"),
+        provisional_z=-0.015,
+        robot=SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015))),
+        operator=Terminal(answer),
+    )
     table = read_table(tmp_path / "table.json")
     assert table.z(np.array([0.5, 0.1])) == pytest.approx(
         spy.true.z(np.array([0.5, 0.1])), abs=1e-4
@@ -216,7 +227,9 @@ def test_a_table_that_is_not_confirmed_moves_nothing(tmp_path: Path) -> None:
     safe = SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015)))
     with pytest.raises(InputError, match="nothing was written"):
         measure_table(
-            RigConfig(setup=tmp_path), provisional_z=-0.015, robot=safe,
+            RigConfig(setup=tmp_path),
+            provisional_z=-0.015,
+            robot=safe,
             operator=Terminal(lambda _: "q"),
-        )  # fmt: skip
+        )
     assert spy.log == ["recover", "stop", "close"] and not list(tmp_path.iterdir())

@@ -147,9 +147,10 @@ def on_slope(
     """Acceleration and distance [m] down a slope with tan(angle) = ratio * friction."""
     angle = np.arctan(ratio * config.friction)
     solver = box_solver(
-        (config, (0, 0, -config.lowest)), config=solver_config or ideal(table_friction=1.0),
+        (config, (0, 0, -config.lowest)),
+        config=solver_config or ideal(table_friction=1.0),
         gravity=tilt(angle),
-    )  # fmt: skip
+    )
     solver.run(240)
     x, v = x_of(solver)[0], solver.data.views["bodies.v"][0, 0]
     solver.run(round(seconds / DT))

@@ -147,9 +147,12 @@ def two_beads(distance: float, speed: float, *, masses=(0.1, 0.1), mu=0.0, **cha
     """Two beads in the air without gravity that approach with `speed` along x."""
     builder = new_builder()
     add_particles(
-        builder, [(0, 0, 1), (distance, 0, 1)], velocities=[(speed, 0, 0), (0, 0, 0)],
-        masses=masses, colliding=True,
-    )  # fmt: skip
+        builder,
+        [(0, 0, 1), (distance, 0, 1)],
+        velocities=[(speed, 0, 0), (0, 0, 0)],
+        masses=masses,
+        colliding=True,
+    )
     return finalize(builder, ideal(contact_friction=mu, **changes), gravity=0.0)
 
 

@@ -254,11 +254,21 @@ def test_a_bundle_that_is_not_there_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "values",
     [
-        {"dt": 0.0}, {"dt": -1e-3}, {"dt": np.nan}, {"damping": -1.0}, {"table_friction": -0.1},
-        {"contact_friction": np.nan}, {"stiffness": 0.0}, {"recovery": -0.1}, {"max_speed": 0.0},
-        {"calm_speed": -1.0}, {"margin": 0.0}, {"rest_speed": 0.0}, {"rest_seconds": -1.0},
+        {"dt": 0.0},
+        {"dt": -1e-3},
+        {"dt": np.nan},
+        {"damping": -1.0},
+        {"table_friction": -0.1},
+        {"contact_friction": np.nan},
+        {"stiffness": 0.0},
+        {"recovery": -0.1},
+        {"max_speed": 0.0},
+        {"calm_speed": -1.0},
+        {"margin": 0.0},
+        {"rest_speed": 0.0},
+        {"rest_seconds": -1.0},
     ],
-)  # fmt: skip
+)
 def test_a_bad_configuration_names_its_field(values):
     with pytest.raises(InputError, match=next(iter(values))):
         SolverConfig(**values)

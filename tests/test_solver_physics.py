@@ -193,9 +193,13 @@ def test_positions_converge_with_the_first_order_of_dt():
     # phi'' = -g/L sin(phi), integrated to 1e-10
     seconds, steps = 0.5, np.array([1 / 600, 1 / 1200, 1 / 2400])
     exact = solve_ivp(
-        lambda _, y: [y[1], -G / LENGTH * np.sin(y[0])], (0, 1), [SWING, 0], rtol=1e-11, atol=1e-12,
+        lambda _, y: [y[1], -G / LENGTH * np.sin(y[0])],
+        (0, 1),
+        [SWING, 0],
+        rtol=1e-11,
+        atol=1e-12,
         dense_output=True,
-    ).sol  # fmt: skip
+    ).sol
     errors = []
     for dt in steps:
         t, angle, _ = pendulum(dt, seconds)
@@ -212,9 +216,12 @@ def test_springs_converge_to_hooke():
     for dt in (1 / 2400, 1 / 4800, 1 / 9600):
         builder = new_builder()
         add_particles(
-            builder, [(0, 0, 1), (0, 0, 1 - rest)], masses=[0, mass], links=[(0, 1, rest)],
+            builder,
+            [(0, 0, 1), (0, 0, 1 - rest)],
+            masses=[0, mass],
+            links=[(0, 1, rest)],
             stiffness=stiffness,
-        )  # fmt: skip
+        )
         path = frames(finalize(builder, ideal(dt=dt)), round(period / dt))[:, 1, 2]
         t = np.arange(len(path)) * dt
         exact = 1 - rest - mass * G / stiffness * (1 - np.cos(np.sqrt(stiffness / mass) * t))

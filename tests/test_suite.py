@@ -50,8 +50,13 @@ GOAL_SCORE = {"fabric-flat-notarget": 0.97, "bag-color-goal": 0.97}
 # How many of how many seeds the demonstrator solves at least, the visible one where there are bags.
 SOLVED = {"bag-items-1": (6, 8), "bag-items-2": (2, 4), "bag-color-goal": (4, 4)}
 # One task of each kind of scene: what gymnasium's checker looks at is the same code for all.
-CHECKED = ("cable-ring", "cable-line-notarget", "fabric-flat-notarget", "bag-alone-open",
-           "block-notarget")  # fmt: skip
+CHECKED = (
+    "cable-ring",
+    "cable-line-notarget",
+    "fabric-flat-notarget",
+    "bag-alone-open",
+    "block-notarget",
+)
 every_task = pytest.mark.parametrize("name", TASKS)
 goal_task = pytest.mark.parametrize("name", [n for n, t in TASKS.items() if t.goal_conditioned])
 
@@ -207,8 +212,11 @@ def test_a_constructed_goal_shows_the_solved_task(name: str) -> None:
         assert np.array_equal(episode.layout.targets, targets[slot])
         assert episode.goal is not None and episode.goal.kind == "constructed"
         assert not np.array_equal(episode.goal.color, episode.snapshot.images.color)
-    side._start({s: task.goal_layout(side.episodes[s].layout) for s in range(side.count)},
-                dict(enumerate(seeds)), {})  # fmt: skip
+    side._start(
+        {s: task.goal_layout(side.episodes[s].layout) for s in range(side.count)},
+        dict(enumerate(seeds)),
+        {},
+    )
     for slot in range(side.count):
         episode = side.episodes[slot]
         assert episode.physics_ok

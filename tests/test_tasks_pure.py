@@ -27,8 +27,13 @@ from warp_deform.tasks.task import Layout, Snapshot
 
 quick = settings(derandomize=True, deadline=None, max_examples=40)
 PURE = (
-    CableRing, CableRingNotarget, CableShape, CableShapeNotarget, CableLineNotarget, BlockNotarget,
-)  # fmt: skip
+    CableRing,
+    CableRingNotarget,
+    CableShape,
+    CableShapeNotarget,
+    CableLineNotarget,
+    BlockNotarget,
+)
 CABLES = PURE[:-1]
 SHAPES = PURE[2:-1]
 EMPTY = FreeSpace()

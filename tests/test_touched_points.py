@@ -91,9 +91,12 @@ class Person:
         self.shown.clear()
         robot = SafeRobot(self.robot, SafetyLimits(table=TABLE))
         return measure_points(
-            setup(folder, None), camera=BlindCamera(), robot=robot, operator=Terminal(self.answer),
+            setup(folder, None),
+            camera=BlindCamera(),
+            robot=robot,
+            operator=Terminal(self.answer),
             **{"show": self.show, **options},
-        )  # fmt: skip
+        )
 
 
 def test_touched_marks_find_the_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -110,8 +113,11 @@ def test_touched_marks_find_the_camera(tmp_path: Path, capsys: pytest.CaptureFix
     left = [float(line.split("left out ")[1].split()[0]) for line in lines]
     np.testing.assert_allclose(left, 1e3 * np.array(found["left_out_m"]), atol=0.006)
     assert {path.name for path in tmp_path.iterdir()} == {
-        "table.json", "calibration.json", "points_seen.png", "workplace.json",
-    }  # fmt: skip
+        "table.json",
+        "calibration.json",
+        "points_seen.png",
+        "workplace.json",
+    }
 
 
 def test_pixels_and_millimetres_may_be_typed(tmp_path: Path) -> None:

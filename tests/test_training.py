@@ -289,10 +289,14 @@ def test_a_goal_agent_needs_a_goal(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cable-ring has none; use --agent transporter"):
         train(
             TrainConfig(
-                task="cable-ring", agent="goal-split", data=tmp_path, out=tmp_path / "run",
-                preset="fast", schedule=SHORT,
+                task="cable-ring",
+                agent="goal-split",
+                data=tmp_path,
+                out=tmp_path / "run",
+                preset="fast",
+                schedule=SHORT,
             )
-        )  # fmt: skip
+        )
 
 
 @pytest.mark.parametrize(

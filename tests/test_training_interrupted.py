@@ -255,8 +255,10 @@ def test_weights_are_looked_at_too(ema: float, value: float, tmp_path: Path) -> 
 
 def test_a_state_of_another_run_is_refused(folder: Path, tmp_path: Path) -> None:
     """Settings that were lost, a state that was copied here, and one of other weights."""
-    one, other = (train(config(folder, tmp_path / name, seed=k)) and RunFolder(tmp_path / name)
-                  for k, name in enumerate(("one", "other")))  # fmt: skip
+    one, other = (
+        train(config(folder, tmp_path / name, seed=k)) and RunFolder(tmp_path / name)
+        for k, name in enumerate(("one", "other"))
+    )
     kept = one.state.read_bytes()
     one.state.write_bytes(other.state.read_bytes())
     with pytest.raises(InputError, match=r"state\.safetensors is another run's"):

@@ -251,8 +251,9 @@ def test_a_picture_depends_on_scene_and_seed_only(twin: CableTwin) -> None:
     one, same, other = (SimCamera(twin.look, seed=seed).read().rgb for seed in (0, 0, 1))
     np.testing.assert_array_equal(one, same)
     assert 0 < np.abs(one.astype(int) - other).mean() < 10
-    clean = SimCameraConfig(noise=0.0, grain=0.0, blur_px=0.0, shade=0.0, size=(640, 360),
-                            focal_px=305.0)  # fmt: skip
+    clean = SimCameraConfig(
+        noise=0.0, grain=0.0, blur_px=0.0, shade=0.0, size=(640, 360), focal_px=305.0
+    )
     camera = SimCamera(twin.look, config=clean)
     np.testing.assert_array_equal(camera.read().rgb, camera.read().rgb)
     assert segment_cable(

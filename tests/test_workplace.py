@@ -191,9 +191,11 @@ def test_the_table_is_touched_within_the_workspace_and_stores_it(tmp_path: Path)
     config = RigConfig(setup=tmp_path, robot="fr3", home=TILTED, workspace=PAPER_ENDS)
     limits = PAPER.limits(TablePlane(-0.015))
     measure_table(
-        config, provisional_z=-0.015, robot=SafeRobot(spy, limits, home_q=TILTED),
+        config,
+        provisional_z=-0.015,
+        robot=SafeRobot(spy, limits, home_q=TILTED),
         operator=Terminal(lambda text: ""),
-    )  # fmt: skip
+    )
     later = replace(config, home=None, workspace=None)
     stored = workplace_of(later)
     assert (stored.x, stored.y, stored.home_q) == (PAPER.x, PAPER.y, TILTED)

@@ -46,17 +46,34 @@ class _Measure:
 def make_franky() -> tuple[ModuleType, SimpleNamespace]:
     """The package, and what its robot is and does."""
     world = SimpleNamespace(
-        q=np.array(HOME_Q), T=ARM.pose(np.array(HOME_Q)), force=np.zeros(6), mode="Idle",
-        width=0.08, object=0.0, moves=[], grasps=[], fail=None, contact=False, offset=0.0,
-        connect=None, thresholds=None, stops=0, recoveries=0,
-    )  # fmt: skip
+        q=np.array(HOME_Q),
+        T=ARM.pose(np.array(HOME_Q)),
+        force=np.zeros(6),
+        mode="Idle",
+        width=0.08,
+        object=0.0,
+        moves=[],
+        grasps=[],
+        fail=None,
+        contact=False,
+        offset=0.0,
+        connect=None,
+        thresholds=None,
+        stops=0,
+        recoveries=0,
+    )
     franky = ModuleType("franky")
 
     class Base(Exception):
         pass
 
-    names = ("ControlException", "CommandException", "NetworkException", "ModelException",
-             "IncompatibleVersionException")  # fmt: skip
+    names = (
+        "ControlException",
+        "CommandException",
+        "NetworkException",
+        "ModelException",
+        "IncompatibleVersionException",
+    )
     for name in names:
         setattr(franky, name, type(name, (Base,), {}))
     franky.Exception = Base
@@ -126,9 +143,11 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
         @property
         def state(self) -> SimpleNamespace:
             return SimpleNamespace(
-                q=world.q, O_T_EE=Affine(world.T), O_F_ext_hat_K=world.force,
+                q=world.q,
+                O_T_EE=Affine(world.T),
+                O_F_ext_hat_K=world.force,
                 robot_mode=SimpleNamespace(name=world.mode),
-            )  # fmt: skip
+            )
 
         def set_collision_behavior(self, torque: float, force: float) -> None:
             world.thresholds = (torque, force)
@@ -138,9 +157,14 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
             if world.fail is not None:
                 raise world.fail
             if isinstance(motion, JointMotion):
-                motion.limits = [np.array(limit.get()) for limit in
-                                 (self.joint_velocity_limit, self.joint_acceleration_limit,
-                                  self.joint_jerk_limit)]  # fmt: skip
+                motion.limits = [
+                    np.array(limit.get())
+                    for limit in (
+                        self.joint_velocity_limit,
+                        self.joint_acceleration_limit,
+                        self.joint_jerk_limit,
+                    )
+                ]
                 motion.start = world.q
                 world.q = motion.target.position
                 world.T = ARM.pose(world.q)
@@ -172,9 +196,13 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
             return True
 
         def grasp(
-            self, width: float, speed: float, force: float, epsilon_inner: float,
+            self,
+            width: float,
+            speed: float,
+            force: float,
+            epsilon_inner: float,
             epsilon_outer: float,
-        ) -> bool:  # fmt: skip
+        ) -> bool:
             world.grasps.append((width, speed, force, epsilon_inner, epsilon_outer))
             world.width = world.object
             return False  # outside of a tolerance; the width decides
@@ -193,9 +221,19 @@ def make_franky() -> tuple[ModuleType, SimpleNamespace]:
 def make_frankapy() -> tuple[dict[str, ModuleType], SimpleNamespace]:
     """The modules by name, and what the robot does."""
     world = SimpleNamespace(
-        q=np.array(HOME_Q), T=ARM.pose(np.array(HOME_Q)), force=np.zeros(6), width=0.08,
-        object=0.0, calls=[], fail=None, offset=0.0, settling=2, busy=False, absent=(), made=0,
-    )  # fmt: skip
+        q=np.array(HOME_Q),
+        T=ARM.pose(np.array(HOME_Q)),
+        force=np.zeros(6),
+        width=0.08,
+        object=0.0,
+        calls=[],
+        fail=None,
+        offset=0.0,
+        settling=2,
+        busy=False,
+        absent=(),
+        made=0,
+    )
 
     class RigidTransform:
         def __init__(
@@ -205,8 +243,11 @@ def make_frankapy() -> tuple[dict[str, ModuleType], SimpleNamespace]:
             self.from_frame, self.to_frame = from_frame, to_frame
 
     exceptions = ModuleType("frankapy.exceptions")
-    for name in ("FrankaArmCommException", "FrankaArmFrankaInterfaceNotReadyException",
-                 "FrankaArmException"):  # fmt: skip
+    for name in (
+        "FrankaArmCommException",
+        "FrankaArmFrankaInterfaceNotReadyException",
+        "FrankaArmException",
+    ):
         setattr(exceptions, name, type(name, (Exception,), {}))
 
     class FrankaArm:
@@ -239,9 +280,15 @@ def make_frankapy() -> tuple[dict[str, ModuleType], SimpleNamespace]:
             return not world.busy
 
         def goto_pose(
-            self, tool_pose: RigidTransform, *, duration: float, use_impedance: bool,
-            force_thresholds: list[float] | None, block: bool, ignore_errors: bool,
-        ) -> None:  # fmt: skip
+            self,
+            tool_pose: RigidTransform,
+            *,
+            duration: float,
+            use_impedance: bool,
+            force_thresholds: list[float] | None,
+            block: bool,
+            ignore_errors: bool,
+        ) -> None:
             assert (tool_pose.from_frame, tool_pose.to_frame) == ("franka_tool", "world")
             assert ignore_errors is False and block and not use_impedance
             world.calls.append(("goto_pose", duration, force_thresholds))
@@ -252,9 +299,14 @@ def make_frankapy() -> tuple[dict[str, ModuleType], SimpleNamespace]:
             follow(world, target)
 
         def goto_joints(
-            self, joints: list[float], *, duration: float, use_impedance: bool, block: bool,
+            self,
+            joints: list[float],
+            *,
+            duration: float,
+            use_impedance: bool,
+            block: bool,
             ignore_errors: bool,
-        ) -> None:  # fmt: skip
+        ) -> None:
             assert ignore_errors is False and block and not use_impedance
             world.calls.append(("goto_joints", duration))
             if world.fail is not None:

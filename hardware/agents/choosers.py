@@ -26,8 +26,7 @@ from ..vision.task_frame import PIXEL_RATIO, fits_task, to_base
 from ..vision.top_down_view import TopDownView
 from .finger_room import has_finger_room
 
-__all__ = ["PolicyChooser", "RandomChooser", "ScriptedChooser", "Tried", "tangent_at",
-           "to_action"]  # fmt: skip
+__all__ = ["PolicyChooser", "RandomChooser", "ScriptedChooser", "Tried", "tangent_at", "to_action"]
 
 _SHIFTED = 0.01
 """A cable has moved if more of it than this share lies beside where it lay, or the other way

@@ -19,9 +19,14 @@ __all__ = ["make_chooser"]
 
 
 def make_chooser(
-    agent: AgentName, rig: Rig, goal: GoalSeen | None, *, seed: int, policy: Path | None = None,
+    agent: AgentName,
+    rig: Rig,
+    goal: GoalSeen | None,
+    *,
+    seed: int,
+    policy: Path | None = None,
     budget: int | None = None,
-) -> Chooser:  # fmt: skip
+) -> Chooser:
     """Return who chooses.
 
     Raises:

@@ -24,8 +24,15 @@ from .path_speed import fitting_share
 from .robot import SafetyViolation, check_number, check_pose
 from .straight_line import StraightLine, distance, straight_line
 
-__all__ = ["LEVEL", "CheckedLine", "CheckedPath", "MotionChecks", "Planner",
-           "as_lines", "sunk_after"]  # fmt: skip
+__all__ = [
+    "LEVEL",
+    "CheckedLine",
+    "CheckedPath",
+    "MotionChecks",
+    "Planner",
+    "as_lines",
+    "sunk_after",
+]
 
 Planner = Callable[..., StraightLine]
 """What solves a straight line: the signature of `straight_line`."""
@@ -85,13 +92,15 @@ class MotionChecks:
 
     def check_share(self, speed: float) -> float:
         """Return a share of the joints' speeds; refuse one beyond `max_joint_speed`."""
-        return _within("max_joint_speed", "speed", speed, _SLOWEST_SHARE,
-                       self.limits.max_joint_speed)  # fmt: skip
+        return _within(
+            "max_joint_speed", "speed", speed, _SLOWEST_SHARE, self.limits.max_joint_speed
+        )
 
     def check_grasp_force(self, force_N: float) -> float:
         """Return a force of the fingers [N]; refuse one beyond `max_grasp_force_N`."""
-        return _within("max_grasp_force_N", "force_N", force_N, _SOFTEST,
-                       self.limits.max_grasp_force_N, " N")  # fmt: skip
+        return _within(
+            "max_grasp_force_N", "force_N", force_N, _SOFTEST, self.limits.max_grasp_force_N, " N"
+        )
 
     def check_start(self, base_T_tcp: np.ndarray) -> None:
         """Refuse to move from a measured pose (4, 4) that is farther out than an arrival may be."""
@@ -186,8 +195,14 @@ class MotionChecks:
         limits = self.limits
         speed = _within("max_speed", "speed", speed, _SLOWEST, limits.max_speed, " m/s")
         if stop_force_N is not None:
-            _within("max_contact_force_N", "stop_force_N", stop_force_N, _SOFTEST,
-                    limits.max_contact_force_N, " N")  # fmt: skip
+            _within(
+                "max_contact_force_N",
+                "stop_force_N",
+                stop_force_N,
+                _SOFTEST,
+                limits.max_contact_force_N,
+                " N",
+            )
         self._check_poses(target[None], _ROUNDING, what="a way-point is beyond")
         height = float(limits.height(target))
         stops = stop_force_N is not None

@@ -25,8 +25,14 @@ from .robot import MotionError, check_number
 from .safe_robot import SafeRobot
 from .table_plane import TablePlane
 
-__all__ = ["PickPlaceAction", "PickPlaceConfig", "PickPlaceOutcome", "PickPlaceResult",
-           "execute", "way_points"]  # fmt: skip
+__all__ = [
+    "PickPlaceAction",
+    "PickPlaceConfig",
+    "PickPlaceOutcome",
+    "PickPlaceResult",
+    "execute",
+    "way_points",
+]
 
 # Joint 7 turns so far either way, less the safety limits' margin [rad].
 _MAX_JOINT_7 = 2.6

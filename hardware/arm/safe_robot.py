@@ -178,9 +178,13 @@ class SafeRobot:
         with self._lock:
             state = self._ready()
             line = self._checks.check_line(
-                state.q, state.base_T_tcp, target, speed=speed, stop_force_N=stop_force_N,
+                state.q,
+                state.base_T_tcp,
+                target,
+                speed=speed,
+                stop_force_N=stop_force_N,
                 sunk=self._sunk,
-            )  # fmt: skip
+            )
             try:
                 result = self._move(
                     state,

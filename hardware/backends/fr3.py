@@ -160,8 +160,11 @@ class FR3Robot(Closing):
         franky, robot = self._franky, self._robot
         # A joint that stays needs a limit above 0; it gets there at once.
         ways = np.maximum(ways, 1e-6 * ways.max())
-        limits = (robot.joint_velocity_limit, robot.joint_acceleration_limit,
-                  robot.joint_jerk_limit)  # fmt: skip
+        limits = (
+            robot.joint_velocity_limit,
+            robot.joint_acceleration_limit,
+            robot.joint_jerk_limit,
+        )
         before = [self._quick(limit.get) for limit in limits]
         tops = (speed * DQ_MAX, *(speed * np.array(limit) for limit in before[1:]))
         try:

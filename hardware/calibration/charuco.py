@@ -18,8 +18,14 @@ from warp_deform.errors import InputError
 from ..cameras.camera import CameraIntrinsics
 from .poor_fit import PoorFit
 
-__all__ = ["MIN_VIEWS", "BoardSpec", "Corners", "board_pose", "calibrate_intrinsics",
-           "find_corners"]  # fmt: skip
+__all__ = [
+    "MIN_VIEWS",
+    "BoardSpec",
+    "Corners",
+    "board_pose",
+    "calibrate_intrinsics",
+    "find_corners",
+]
 
 _MIN_CORNERS = 6
 _MAX_POSE_ERROR = 2.0  # [px], root mean square

@@ -22,8 +22,16 @@ from ..cameras.camera import CameraIntrinsics
 from .charuco import BoardSpec, Corners
 from .poor_fit import PoorFit
 
-__all__ = ["MAX_ERROR", "MIN_POINTS", "HomographyFit", "apply_homography",
-           "board_on_table", "fit_homography", "plane_homography", "solve_homography"]  # fmt: skip
+__all__ = [
+    "MAX_ERROR",
+    "MIN_POINTS",
+    "HomographyFit",
+    "apply_homography",
+    "board_on_table",
+    "fit_homography",
+    "plane_homography",
+    "solve_homography",
+]
 
 MIN_POINTS = 5
 """Fewest points that give a result: four always fit, a fifth says whether they fit well."""

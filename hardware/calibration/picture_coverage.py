@@ -100,8 +100,9 @@ def _cures(
     most = math.floor(math.degrees(limits.max_tilt_rad)) - 1
     degrees = [(a, b) for a in range(-most, most + 1) for b in range(-most, most + 1)]
     tilts = sorted((t for t in degrees if 0 < math.hypot(*t) <= most), key=lambda t: math.hypot(*t))
-    tilted = [(f"tilt the hand there by {math.hypot(*t):.0f} degrees", _tilted(home, *t))
-              for t in tilts]  # fmt: skip
+    tilted = [
+        (f"tilt the hand there by {math.hypot(*t):.0f} degrees", _tilted(home, *t)) for t in tilts
+    ]
     rises = np.arange(_RISE, limits.max_z_m - home[2, 3], _RISE)
     raised = [(f"raise it by {100 * rise:.0f} cm", _raised(home, rise)) for rise in rises]
     for ways in (tilted, raised):

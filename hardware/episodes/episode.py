@@ -195,9 +195,18 @@ def run_episode(
     if goal is not None and goal.shape != config.view.shape:
         raise InputError(f"the goal has {goal.shape} pixels, the view {config.view.shape}")
     episode = _Episode(
-        robot, camera, calibration, chooser, recorder, goal, config, operator or Unattended(),
-        empty, toss, say,
-    )  # fmt: skip
+        robot,
+        camera,
+        calibration,
+        chooser,
+        recorder,
+        goal,
+        config,
+        operator or Unattended(),
+        empty,
+        toss,
+        say,
+    )
     robot.begin_episode()
     chooser.reset()
     error: WarpDeformError | None = None

@@ -24,8 +24,7 @@ from ..rig.rig import open_robot, read_intrinsics, read_table
 from ..rig.workplace import workplace_of
 from ..support.json_file import read_json, read_numbers
 
-__all__ = ["confirm", "keep", "lens_of", "make_calibration", "marked", "open_arm",
-           "touched_table"]  # fmt: skip
+__all__ = ["confirm", "keep", "lens_of", "make_calibration", "marked", "open_arm", "touched_table"]
 
 
 def confirm(operator: Terminal, text: str) -> None:

@@ -45,8 +45,14 @@ from .kept_measurements import gather
 from .steps import confirm, keep, lens_of, make_calibration, marked, open_arm, touched_table
 from .touch_off import close_fingers, touch_off
 
-__all__ = ["measure_camera", "measure_hand_eye", "measure_lens", "measure_table",
-           "photograph_empty", "print_board"]  # fmt: skip
+__all__ = [
+    "measure_camera",
+    "measure_hand_eye",
+    "measure_lens",
+    "measure_table",
+    "photograph_empty",
+    "print_board",
+]
 
 _PIXELS_PER_METRE = 10_000.0  # 254 dots an inch
 _INSET = 0.05  # [m] from the workspace's rim, where the foam lies flat

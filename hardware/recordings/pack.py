@@ -20,9 +20,12 @@ __all__ = ["pack"]
 
 
 def pack(
-    folder: Path, *, seed: int, task: str = "cable-mask-goal",
+    folder: Path,
+    *,
+    seed: int,
+    task: str = "cable-mask-goal",
     images: Literal["mask", "view"] = "mask",
-) -> Episode:  # fmt: skip
+) -> Episode:
     """Return the recording as an episode of the dataset format.
 
     Actions are those of the task's table at the same pixels, see `task_frame`.

@@ -19,8 +19,16 @@ from warp_deform.tasks.metrics import mask_iou
 
 from .recording import Recording
 
-__all__ = ["MAX_ACTIONS", "ROUNDING", "SUCCESS_IOU", "EpisodeScore", "StartAtGoal",
-           "outcome_difference", "score_masks", "score_recording"]  # fmt: skip
+__all__ = [
+    "MAX_ACTIONS",
+    "ROUNDING",
+    "SUCCESS_IOU",
+    "EpisodeScore",
+    "StartAtGoal",
+    "outcome_difference",
+    "score_masks",
+    "score_recording",
+]
 
 SUCCESS_IOU = 0.25
 """Overlap above which an episode succeeds."""

@@ -29,8 +29,15 @@ from ..twin.twin import TwinConfig, TwinLook
 from ..vision.top_down_view import TopDownView
 from .config import REAL_ROBOTS, RigConfig
 
-__all__ = ["Rig", "open_camera", "open_rig", "open_robot", "read_calibration", "read_intrinsics",
-           "read_table"]  # fmt: skip
+__all__ = [
+    "Rig",
+    "open_camera",
+    "open_rig",
+    "open_robot",
+    "read_calibration",
+    "read_intrinsics",
+    "read_table",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +243,9 @@ def read_calibration(config: RigConfig) -> Calibration:
     if config.robot in REAL_ROBOTS:
         pairs = [("robot", "--robot and --host", calibration.robot_id, config.robot_id)]
         if config.camera != "file":
-            pairs.append(("camera", "--camera and --device", calibration.camera_id,
-                          config.camera_id))  # fmt: skip
+            pairs.append(
+                ("camera", "--camera and --device", calibration.camera_id, config.camera_id)
+            )
         for what, flags, calibrated, named in pairs:
             if calibrated != named:
                 raise InputError(

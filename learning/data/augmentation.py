@@ -19,8 +19,14 @@ from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE, TABLE_GRID, PixelGrid
 from warp_deform.tasks.ground_truth import YAW_SCALE, Row, Rows, row_kinds, rows_of
 
-__all__ = ["RigidTransform", "draw_transform", "move_actions", "move_picture",
-           "move_points", "move_states"]  # fmt: skip
+__all__ = [
+    "RigidTransform",
+    "draw_transform",
+    "move_actions",
+    "move_picture",
+    "move_points",
+    "move_states",
+]
 
 _TURN = 2 * math.pi / 6
 """Standard deviation of the turn [rad]."""

@@ -34,8 +34,17 @@ from .paper_results import partial_credit
 from .play import Played, play_policy
 from .protocol import Protocol, goals_for, goals_of
 
-__all__ = ["Evaluation", "best", "evaluate_snapshot", "known", "measure", "stopped_early",
-           "summarise", "trained_steps", "wilson"]  # fmt: skip
+__all__ = [
+    "Evaluation",
+    "best",
+    "evaluate_snapshot",
+    "known",
+    "measure",
+    "stopped_early",
+    "summarise",
+    "trained_steps",
+    "wilson",
+]
 
 _CHUNK = 2 * SLOTS
 """Episodes that a process is given at a time: what a kill loses, against idle lanes at the end."""
@@ -293,9 +302,15 @@ def _described(protocol: Protocol, task: str) -> dict[str, Any]:
 
 
 _PLAYED: Fields = {
-    "seed": int, "success": bool, "score": float, "actions": int, "reason": str,
-    "failure": (str, type(None)), "goal_l2": (list, type(None)), "enclosed": (bool, type(None)),
-}  # fmt: skip
+    "seed": int,
+    "success": bool,
+    "score": float,
+    "actions": int,
+    "reason": str,
+    "failure": (str, type(None)),
+    "goal_l2": (list, type(None)),
+    "enclosed": (bool, type(None)),
+}
 
 
 def _read_played(path: Path) -> dict[int, Played]:

@@ -30,8 +30,15 @@ from warp_deform.tasks.bag_physics import CARRY, OPEN
 from warp_deform.worlds.loop import SOLVED, Run
 from warp_deform.worlds.worlds import Worlds
 
-__all__ = ["FAILURES", "bag_holds_items", "bag_opening", "closed", "failure", "puts_back",
-           "took_nothing"]  # fmt: skip
+__all__ = [
+    "FAILURES",
+    "bag_holds_items",
+    "bag_opening",
+    "closed",
+    "failure",
+    "puts_back",
+    "took_nothing",
+]
 
 FAILURES = ("physics", "missed grasp", "destructive bag action", "item not enclosed",
             "opening covered", "back and forth", "other")  # fmt: skip

@@ -32,8 +32,17 @@ from torch.nn import functional
 from warp_deform.errors import InputError
 from warp_deform.tasks.ground_truth import YAW_SCALE
 
-__all__ = ["GtState", "GtState2Step", "GtStateConfig", "GtStateLosses", "Mixture", "MixtureMLP",
-           "encode_action", "mixture_loss", "sample_mixture"]  # fmt: skip
+__all__ = [
+    "GtState",
+    "GtState2Step",
+    "GtStateConfig",
+    "GtStateLosses",
+    "Mixture",
+    "MixtureMLP",
+    "encode_action",
+    "mixture_loss",
+    "sample_mixture",
+]
 
 _POSE = 3
 _CLIP = (1e-8, 1e8)

@@ -33,8 +33,17 @@ from .lift import LiftHead
 from .resnet import STRIDE, NetworkConfig
 from .transport import Transport
 
-__all__ = ["PRESETS", "Batch", "GoalSplit", "GoalStack", "Losses", "Picture", "PixelActions",
-           "Transporter", "TransporterConfig"]  # fmt: skip
+__all__ = [
+    "PRESETS",
+    "Batch",
+    "GoalSplit",
+    "GoalStack",
+    "Losses",
+    "Picture",
+    "PixelActions",
+    "Transporter",
+    "TransporterConfig",
+]
 
 Picture = tuple[np.ndarray, np.ndarray]
 """Colour (320, 160, 3) uint8 and height (320, 160) float32 [m], as in an observation."""

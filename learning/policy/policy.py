@@ -30,8 +30,17 @@ from ..models.transporter import GoalSplit, GoalStack, Transporter, TransporterC
 from ..runs.folder import RunFolder, read_snapshot
 from .memory import Memory
 
-__all__ = ["AGENTS", "Agent", "AgentDescription", "ImagePolicy", "Policy", "RetryingPolicy",
-           "StatePolicy", "load_policy", "make_agent"]  # fmt: skip
+__all__ = [
+    "AGENTS",
+    "Agent",
+    "AgentDescription",
+    "ImagePolicy",
+    "Policy",
+    "RetryingPolicy",
+    "StatePolicy",
+    "load_policy",
+    "make_agent",
+]
 
 Agent = Transporter | GtState | GtState2Step
 

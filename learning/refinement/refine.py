@@ -43,8 +43,16 @@ from warp_deform.worlds.worlds import Worlds
 
 from .settings import RefineSettings
 
-__all__ = ["ACCEPT", "RECORDED", "REFINED", "REFINEMENT", "RefineConfig", "RefineReport", "refine",
-           "seeds_by_task"]  # fmt: skip
+__all__ = [
+    "ACCEPT",
+    "RECORDED",
+    "REFINED",
+    "REFINEMENT",
+    "RefineConfig",
+    "RefineReport",
+    "refine",
+    "seeds_by_task",
+]
 
 ACCEPT = ("score", "solved")
 """When a new episode takes the place of the original. `score`: no lower last score, no more

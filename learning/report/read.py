@@ -114,7 +114,9 @@ def _steps(info: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     usual = None
     if info["preset"] in SCHEDULES:
         usual = preset_schedule(
-            info["preset"], task=info["task"], demos=info["demos"],
+            info["preset"],
+            task=info["task"],
+            demos=info["demos"],
             sees_state=settings["agent"].get("state_size") is not None,
-        )  # fmt: skip
+        )
     return [] if usual is not None and planned == usual.steps else [f"{planned} steps"]

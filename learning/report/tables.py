@@ -13,8 +13,7 @@ from ..evaluation.paper_results import SUCCESS, PaperResults
 from .cells import Cell
 from .origins import origins
 
-__all__ = ["Rows", "compared", "csv_text", "details", "failed", "latex_text",
-           "markdown_text"]  # fmt: skip
+__all__ = ["Rows", "compared", "csv_text", "details", "failed", "latex_text", "markdown_text"]
 
 Rows = list[list[str]]
 

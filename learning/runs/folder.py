@@ -33,7 +33,7 @@ Fields = Mapping[str, type | tuple[type, ...]]
 """Names that a JSON object has to have, and the Python types that their values may be of."""
 
 __all__ = ["TENSORBOARD", "Fields", "RunFolder", "check_fields", "read_json", "read_record",
-           "read_snapshot", "write_json"]  # fmt: skip
+           "read_snapshot", "write_json"]
 
 TENSORBOARD = "tensorboard"
 """Folder of TensorBoard's files in that of a run."""

@@ -19,7 +19,7 @@ from warp_deform.support.extras import install_extra
 from .folder import TENSORBOARD, RunFolder, check_fields
 
 __all__ = ["LINE_STEPS", "TrainingLog", "cpu_seconds", "load_tensorboard",
-           "read_log"]  # fmt: skip
+           "read_log"]
 
 LINE_STEPS = 50
 """Steps that a line of the log stands for."""

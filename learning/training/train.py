@@ -97,9 +97,12 @@ def train(config: TrainConfig) -> TrainReport:
             torch.backends.cudnn.allow_tf32 = False  # on by default, with 10 bits of mantissa
         # What is trained, and on what
         data = Demonstrations(
-            config.data, task=config.task, count=config.demos, seed=config.seed,
+            config.data,
+            task=config.task,
+            count=config.demos,
+            seed=config.seed,
             spare=config.hold_out,
-        )  # fmt: skip
+        )
         check_lifts(data)
         plan = config.plan(len(data))
         description = _describe(config, data)
@@ -121,9 +124,12 @@ def train(config: TrainConfig) -> TrainReport:
         kept, store = set(plan.snapshot_steps()), state_steps(plan)
 
         bar = progress_bar(
-            f"train {config.task}", plan.steps, done=first, unit="steps",
+            f"train {config.task}",
+            plan.steps,
+            done=first,
+            unit="steps",
             shown=config.progress and rank == 0,
-        )  # fmt: skip
+        )
         log = TrainingLog(run, first, tensorboard=config.tensorboard, enabled=rank == 0)
         with log, bar as advance:
             for step in range(first + 1, plan.steps + 1):

@@ -57,37 +57,46 @@ _GOES_ON = "the same command goes on"
 VERBS: dict[str, Verb] = {
     "list": Verb("warp_deform.command.verbs:list_tasks", "the tasks and their Gymnasium ids"),
     "demo": Verb(
-        "warp_deform.command.verbs:demo", "collect demonstrations of a task",
+        "warp_deform.command.verbs:demo",
+        "collect demonstrations of a task",
         kept=f"episodes already written are complete, {_GOES_ON}",
     ),
     "goals": Verb(
-        "warp_deform.command.verbs:goals", "make a task's set of goals",
+        "warp_deform.command.verbs:goals",
+        "make a task's set of goals",
         kept=f"goals already written are complete, {_GOES_ON}",
     ),
     "replay": Verb(
-        "warp_deform.command.verbs:replay", "simulate recorded episodes again and compare",
+        "warp_deform.command.verbs:replay",
+        "simulate recorded episodes again and compare",
     ),
     "inspect": Verb(
-        "warp_deform.command.verbs:inspect", "statistics and contact sheets of a dataset",
+        "warp_deform.command.verbs:inspect",
+        "statistics and contact sheets of a dataset",
     ),
     "convert": Verb("learning.command.convert:convert", "datasets to and from other formats"),
     "train": Verb(
-        "learning.command.verbs:train", "train an agent on demonstrations",
+        "learning.command.verbs:train",
+        "train an agent on demonstrations",
         kept=f"all but the last steps is kept, {_GOES_ON} and ends with the same bits",
     ),
     "eval": Verb(
-        "learning.command.verbs:evaluate", "choose a run's best snapshot and test it",
+        "learning.command.verbs:evaluate",
+        "choose a run's best snapshot and test it",
         kept=f"what was played is kept, {_GOES_ON}",
     ),
     "report": Verb(
-        "learning.command.verbs:report", "tables and learning curves beside the paper's",
+        "learning.command.verbs:report",
+        "tables and learning curves beside the paper's",
     ),
     "sweep": Verb(
-        "learning.command.verbs:sweep", "train and evaluate a grid, as long as it takes",
+        "learning.command.verbs:sweep",
+        "train and evaluate a grid, as long as it takes",
         kept=f"what is done is kept, {_GOES_ON}",
     ),
     "refine": Verb(
-        "learning.command.refine:refine", "improve demonstrations by search",
+        "learning.command.refine:refine",
+        "improve demonstrations by search",
         kept=f"episodes already written are complete, {_GOES_ON}",
     ),
     "bench": Verb("warp_deform.command.verbs:bench", "time the simulator, alone or beside a peer"),
@@ -95,13 +104,15 @@ VERBS: dict[str, Verb] = {
         "warp_deform.command.verbs:gradcheck", "compare derivatives with finite differences"
     ),
     "franka": Verb(
-        "hardware.command.franka:franka", "the cable task on a Franka arm or its twin",
+        "hardware.command.franka:franka",
+        "the cable task on a Franka arm or its twin",
         kept="episodes already written are complete",
     ),
     "doctor": Verb(
-        "warp_deform.command.verbs:doctor", "versions, devices, caches and what is missing",
+        "warp_deform.command.verbs:doctor",
+        "versions, devices, caches and what is missing",
     ),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,8 +56,12 @@ CHUNK = 14
 WORLDS = 1 + 2 * CHUNK
 """Worlds that `compare` uses."""
 _GROWING = (
-    "velocities", "inverse_masses", "body_velocities", "body_inverse_masses", *WORLD_PARAMETERS
-)  # fmt: skip
+    "velocities",
+    "inverse_masses",
+    "body_velocities",
+    "body_inverse_masses",
+    *WORLD_PARAMETERS,
+)
 """Their effect grows with the length of the rollout, so steps shrink with it."""
 _OF_PATH = ("way_points", "knot_times", "knot_rotations")
 
@@ -275,19 +279,25 @@ def _roll(
     if path is not None:
         for w in range(count):
             paths[w] = replace(
-                path, positions=moved["way_points"][w], times=moved["knot_times"][w],
+                path,
+                positions=moved["way_points"][w],
+                times=moved["knot_times"][w],
                 rotations=moved["knot_rotations"][w] if "knot_rotations" in moved else None,
-            )  # fmt: skip
+            )
     for w in range(count):
         _set_body_masses(worlds, w, moved["body_inverse_masses"][w])
         touching_of(worlds, w)[:] = draw.touching
     stacked = {name: np.stack(values) for name, values in moved.items() if name not in _OF_PATH}
     ends = run.forward(
-        range(count), [substeps * dt], paths=paths,
-        positions=stacked["positions"], velocities=stacked["velocities"],
-        body_poses=stacked["body_poses"], body_velocities=stacked["body_velocities"],
+        range(count),
+        [substeps * dt],
+        paths=paths,
+        positions=stacked["positions"],
+        velocities=stacked["velocities"],
+        body_poses=stacked["body_poses"],
+        body_velocities=stacked["body_velocities"],
         parameters={n: stacked[n] for n in (*WORLD_PARAMETERS, "inverse_masses")},
-    )  # fmt: skip
+    )
     return {
         "positions": ends[:, 0],
         "velocities": np.stack([data.lane("particles.v", w) for w in range(count)]),

@@ -89,9 +89,12 @@ def draw_states(
         for slot in range(each):
             worlds.restore(slot, start.taken)
         rollout(
-            worlds.solver, range(each), paths=dict.fromkeys(range(each), start.path),
-            least=1e3, most=dict(enumerate(times)),
-        )  # fmt: skip
+            worlds.solver,
+            range(each),
+            paths=dict.fromkeys(range(each), start.path),
+            least=1e3,
+            most=dict(enumerate(times)),
+        )
         states = [worlds.state(slot) for slot in range(each)]
         met = [touching_of(worlds, slot).copy() for slot in range(each)]
         for state, time, touching in zip(states, times, met, strict=True):

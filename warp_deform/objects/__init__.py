@@ -9,8 +9,32 @@ from .push import Push
 from .scene_object import SceneObject
 from .zone import Zone, ring_zone, segment_zone, square_zone
 
-__all__ = ["Bag", "BagConfig", "Box", "BoxConfig", "BoxPart", "Cable", "CableConfig", "Cloth",
-           "ClothConfig", "Push", "RingConfig", "SceneObject", "Zone", "add_bag", "add_bag_mesh",
-           "add_box", "add_cable", "add_cloth", "add_cloth_mesh", "bag_shell", "cable_line",
-           "cable_ring", "cloth_sheet", "l_block", "ring_zone", "segment_zone",
-           "square_zone"]  # fmt: skip
+__all__ = [
+    "Bag",
+    "BagConfig",
+    "Box",
+    "BoxConfig",
+    "BoxPart",
+    "Cable",
+    "CableConfig",
+    "Cloth",
+    "ClothConfig",
+    "Push",
+    "RingConfig",
+    "SceneObject",
+    "Zone",
+    "add_bag",
+    "add_bag_mesh",
+    "add_box",
+    "add_cable",
+    "add_cloth",
+    "add_cloth_mesh",
+    "bag_shell",
+    "cable_line",
+    "cable_ring",
+    "cloth_sheet",
+    "l_block",
+    "ring_zone",
+    "segment_zone",
+    "square_zone",
+]

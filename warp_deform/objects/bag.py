@@ -254,12 +254,17 @@ def _add(builder: newton.ModelBuilder, config: BagConfig, shell: BagShell, pose:
         faces,
         (
             Spring(
-                edges[~diagonal], config.structural_stiffness, shortest=config.shortest,
+                edges[~diagonal],
+                config.structural_stiffness,
+                shortest=config.shortest,
                 longest=config.longest,
             ),
             Spring(
-                edges[diagonal], config.shear_stiffness, SpringMode.AT_MOST,
-                shortest=config.shortest_diagonal, longest=config.longest_diagonal,
+                edges[diagonal],
+                config.shear_stiffness,
+                SpringMode.AT_MOST,
+                shortest=config.shortest_diagonal,
+                longest=config.longest_diagonal,
             ),
             Spring(across, config.bend_stiffness),
             Spring(np.column_stack([ring, np.roll(ring, -2)]), config.ring_stiffness),
@@ -272,7 +277,7 @@ def _add(builder: newton.ModelBuilder, config: BagConfig, shell: BagShell, pose:
         exclusion=config.exclusion,
         friction=config.friction,
         color=config.color,
-    )  # fmt: skip
+    )
     first = ranges[0].start
     return Bag(config, *ranges, faces + first, tuple(int(v) + first for v in ring))
 

@@ -44,8 +44,10 @@ def add_cloth_mesh(
         faces,
         (
             Spring(
-                edges, config.structural_stiffness,
-                shortest=config.shortest, longest=config.longest,
+                edges,
+                config.structural_stiffness,
+                shortest=config.shortest,
+                longest=config.longest,
             ),
             Spring(across, config.bend_stiffness),
         ),
@@ -57,5 +59,5 @@ def add_cloth_mesh(
         exclusion=config.exclusion * spacing,
         friction=config.friction,
         color=config.color,
-    )  # fmt: skip
+    )
     return Cloth(config, *ranges, faces + ranges[0].start, ())

@@ -2,8 +2,22 @@
 
 from __future__ import annotations
 
-__all__ = ["BLUE", "BROWN", "CYAN", "GRAY", "GREEN", "ORANGE", "PINK", "PURPLE", "RED", "TABLE",
-           "TARGET", "WHITE", "YELLOW", "Color"]  # fmt: skip
+__all__ = [
+    "BLUE",
+    "BROWN",
+    "CYAN",
+    "GRAY",
+    "GREEN",
+    "ORANGE",
+    "PINK",
+    "PURPLE",
+    "RED",
+    "TABLE",
+    "TARGET",
+    "WHITE",
+    "YELLOW",
+    "Color",
+]
 
 Color = tuple[int, int, int]
 

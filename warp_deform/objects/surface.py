@@ -11,8 +11,15 @@ import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["Surface", "area_share", "boundary_loops", "check_even", "checked_surface",
-           "edges_and_pairs", "rigid_pose"]  # fmt: skip
+__all__ = [
+    "Surface",
+    "area_share",
+    "boundary_loops",
+    "check_even",
+    "checked_surface",
+    "edges_and_pairs",
+    "rigid_pose",
+]
 
 _MOST_VERTICES = 10_000
 _MOST_UNEVEN = 20.0  # longest edge over the median one

@@ -17,8 +17,18 @@ from .geometry import Geometry
 from .pinhole import View, inverse_depth, to_camera, view_of
 from .zbuffer import ZBuffer
 
-__all__ = ["NOWHERE", "OccluderBuffer", "Occluders", "above_limit", "above_sample", "lamp_limit",
-           "lamp_sample", "lit_share", "open_share", "tap_reach"]  # fmt: skip
+__all__ = [
+    "NOWHERE",
+    "OccluderBuffer",
+    "Occluders",
+    "above_limit",
+    "above_sample",
+    "lamp_limit",
+    "lamp_sample",
+    "lit_share",
+    "open_share",
+    "tap_reach",
+]
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -17,9 +17,20 @@ import warp as wp
 from .camera import Camera
 from .geometry import Scene
 
-__all__ = ["View", "inverse_depth", "link_window", "primitive_of", "raster_links", "raster_spheres",
-           "raster_triangles", "ray", "sphere_window", "to_camera", "triangle_window",
-           "view_of"]  # fmt: skip
+__all__ = [
+    "View",
+    "inverse_depth",
+    "link_window",
+    "primitive_of",
+    "raster_links",
+    "raster_spheres",
+    "raster_triangles",
+    "ray",
+    "sphere_window",
+    "to_camera",
+    "triangle_window",
+    "view_of",
+]
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -12,8 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["BOUNDS", "PIXEL_SIZE", "SHAPE", "TABLE_GRID", "PixelGrid", "pixel_to_world",
-           "world_to_pixel"]  # fmt: skip
+__all__ = [
+    "BOUNDS",
+    "PIXEL_SIZE",
+    "SHAPE",
+    "TABLE_GRID",
+    "PixelGrid",
+    "pixel_to_world",
+    "world_to_pixel",
+]
 
 BOUNDS = ((0.25, 0.75), (-0.5, 0.5), (0.0, 0.28))
 """Workspace [m]: (min, max) along x, y, z, in the frame of the robot's base."""

@@ -26,8 +26,16 @@ from ..rollout.launch import GripPath
 from ..support.quaternion import quat_from_yaw, quat_inverse, quat_multiply, quat_rotate
 from .arm import Robot
 
-__all__ = ["Grasp", "Motion", "Outcome", "PrimitiveConfig", "approach", "carry",
-           "find_grasp", "solve_joints"]  # fmt: skip
+__all__ = [
+    "Grasp",
+    "Motion",
+    "Outcome",
+    "PrimitiveConfig",
+    "approach",
+    "carry",
+    "find_grasp",
+    "solve_joints",
+]
 
 
 _GENTLE_PIECES = 13

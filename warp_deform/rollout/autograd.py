@@ -135,10 +135,16 @@ def rollout_tensors(
                 field: dict[str, Any] = {_KNOTS[name]: value}
                 changed[w] = replace(changed[w], **field)
         return run.forward(
-            names, times, paths=changed, pushes=pushes, until_rest=until_rest, calm=calm,
-            calm_after=calm_after, parameters={n: values[n] for n in _PARAMETERS if n in values},
+            names,
+            times,
+            paths=changed,
+            pushes=pushes,
+            until_rest=until_rest,
+            calm=calm,
+            calm_after=calm_after,
+            parameters={n: values[n] for n in _PARAMETERS if n in values},
             **{n: values[n] for n in _STATE if n in values},
-        )  # fmt: skip
+        )
 
     states: tuple[torch.Tensor, ...] = _Rollout.apply(run, forward, keys, *tensors_in)
     return TensorRollout(**dict(zip(_STATE, states, strict=True)), watch=run.watch)

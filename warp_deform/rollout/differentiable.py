@@ -139,16 +139,24 @@ class DifferentiableRollout:
             for k, w in enumerate(self._worlds):
                 poses, twists = data.body_poses(w)
                 data.set_bodies(
-                    w, poses if body_poses is None else np.asarray(body_poses)[k],
+                    w,
+                    poses if body_poses is None else np.asarray(body_poses)[k],
                     twists if body_velocities is None else np.asarray(body_velocities)[k],
-                )  # fmt: skip
+                )
         turns = data.arrays["bodies.q"].view
         self._turns = [turns[data.body_rows(w)].copy() for w in self._worlds]
         end = marks[-1] * dt if marks else 0.0
         prepare(
-            self.solver, self._worlds, paths=paths, pushes=pushes, most=2 * end,
-            least=0.0 if until_rest else 2 * end, calm=calm, calm_after=calm_after, dt=dt,
-        )  # fmt: skip
+            self.solver,
+            self._worlds,
+            paths=paths,
+            pushes=pushes,
+            most=2 * end,
+            least=0.0 if until_rest else 2 * end,
+            calm=calm,
+            calm_after=calm_after,
+            dt=dt,
+        )
         knot, end_knot = (data.arrays[f"grips.{n}"].view for n in ("knot", "knot_end"))
         self._knots = {
             w: slice(int(knot[s]), int(end_knot[s]))

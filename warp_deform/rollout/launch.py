@@ -110,9 +110,15 @@ def rollout(
     """
     dt = solver.config.dt
     longest = prepare(
-        solver, worlds, paths=paths, pushes=pushes, least=least, most=most, calm=calm,
+        solver,
+        worlds,
+        paths=paths,
+        pushes=pushes,
+        least=least,
+        most=most,
+        calm=calm,
         calm_after=calm_after,
-    )  # fmt: skip
+    )
     every = max(1, _substeps(record, -1, "record", dt)) if record else 0
     watch = solver.run(longest, record_every=every)
     return {

@@ -178,9 +178,11 @@ class TapedStep:
             body_velocities=slopes.get("body_qd"),
         )
         before = {
-            "particle_q": by.positions.copy(), "particle_qd": by.velocities,
-            "body_q": by.body_poses, "body_qd": by.body_velocities,
-        }  # fmt: skip
+            "particle_q": by.positions.copy(),
+            "particle_qd": by.velocities,
+            "body_q": by.body_poses,
+            "body_qd": by.body_velocities,
+        }
         targets = np.zeros((data.world_count, 3))
         for w, path in held.items():
             start, end = by.way_points[w]

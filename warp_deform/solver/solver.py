@@ -65,9 +65,13 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
         bundles: folder that gets a reproducing file whenever a guard fires.
         """
         super().__init__(
-            model, config, lanes=lanes, precision=precision,
-            pairs_per_particle=pairs_per_particle, bundles=bundles,
-        )  # fmt: skip
+            model,
+            config,
+            lanes=lanes,
+            precision=precision,
+            pairs_per_particle=pairs_per_particle,
+            bundles=bundles,
+        )
         self._clamped: list[float] = []
         """By world: substeps that the clamp acted in, steps in a row."""
 
@@ -141,9 +145,14 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
         self.check(self._clamped_in_a_row(values, substep / self.config.dt))
 
     def _stepped(
-        self, state_in: newton.State, state_out: newton.State, control: Any, steps: int,
-        substep: float, taped: TapedStep | None,
-    ) -> list[WatchValues]:  # fmt: skip
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: Any,
+        steps: int,
+        substep: float,
+        taped: TapedStep | None,
+    ) -> list[WatchValues]:
         self.read_state(state_in)
         self.data.clear_grips()
         if control is not None and hasattr(control, "grip_particle"):

@@ -13,8 +13,16 @@ import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["YAW_SCALE", "Row", "Rows", "pose_rows", "row_count", "row_kinds",
-           "rows_of", "yaw_columns"]  # fmt: skip
+__all__ = [
+    "YAW_SCALE",
+    "Row",
+    "Rows",
+    "pose_rows",
+    "row_count",
+    "row_kinds",
+    "rows_of",
+    "yaw_columns",
+]
 
 YAW_SCALE = 15.0
 

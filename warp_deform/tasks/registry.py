@@ -23,8 +23,17 @@ from .fabric_cover import FabricCover
 from .fabric_flat import FabricFlat, FabricFlatNotarget
 from .task import Task
 
-__all__ = ["FURTHER_TASKS", "TASKS", "add_task", "all_tasks", "is_known", "registered", "task",
-           "task_name", "task_of"]  # fmt: skip
+__all__ = [
+    "FURTHER_TASKS",
+    "TASKS",
+    "add_task",
+    "all_tasks",
+    "is_known",
+    "registered",
+    "task",
+    "task_name",
+    "task_of",
+]
 
 TASKS: dict[str, type[Task]] = {
     cls.name: cls

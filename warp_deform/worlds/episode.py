@@ -18,8 +18,18 @@ from ..tasks.past import Aloft, PastAction
 from ..tasks.task import Layout, Snapshot, Task
 from ..xpbd.guards import Problem
 
-__all__ = ["ALOFT_EVERY", "DEMONSTRATOR_STREAM", "LAYOUT_STREAM", "Carry", "Plan", "RunningEpisode",
-           "StepReport", "aloft", "episode_rng", "objects_in"]  # fmt: skip
+__all__ = [
+    "ALOFT_EVERY",
+    "DEMONSTRATOR_STREAM",
+    "LAYOUT_STREAM",
+    "Carry",
+    "Plan",
+    "RunningEpisode",
+    "StepReport",
+    "aloft",
+    "episode_rng",
+    "objects_in",
+]
 
 LAYOUT_STREAM, DEMONSTRATOR_STREAM = 0, 1
 """Random streams of an episode: where things start, and what the demonstrator draws."""

@@ -374,9 +374,16 @@ class Worlds:
             return self.task.draw(topdown, layout, drawables, particle_q, body_q)
 
         episode.snapshot = Snapshot(
-            particle_q, particle_qd, body_q, body_qd, drawables.segments, render,
-            episode.objects, episode.history, episode.over,
-        )  # fmt: skip
+            particle_q,
+            particle_qd,
+            body_q,
+            body_qd,
+            drawables.segments,
+            render,
+            episode.objects,
+            episode.history,
+            episode.over,
+        )
 
     def state(self, slot: int) -> WorldState:
         """All that the slot's episode goes on from; the slot must have been reset."""

@@ -86,9 +86,12 @@ class FusedXPBD:
         self.activate()
         for w in range(self.data.world_count):
             self.set_world(
-                w, damping=self.config.damping, table_friction=self.config.table_friction,
-                contact_friction=self.config.contact_friction, stiffness=self.config.stiffness,
-            )  # fmt: skip
+                w,
+                damping=self.config.damping,
+                table_friction=self.config.table_friction,
+                contact_friction=self.config.contact_friction,
+                stiffness=self.config.stiffness,
+            )
         self.set_duration(FOREVER, FOREVER)
 
     # -- parameters

@@ -89,8 +89,13 @@ class SolverData(PackedWorlds):
         self.add_constant("topology.radius", joined("particle_radius"), t.S, number)
         for name in ("springs.ij", "pairs.ij"):
             self.add_constant(name, joined(_field(name)), wp.vec2i, np.int32)
-        for name in ("springs.length", "springs.compliance", "springs.limit", "springs.floor",
-                     "pairs.distance"):  # fmt: skip
+        for name in (
+            "springs.length",
+            "springs.compliance",
+            "springs.limit",
+            "springs.floor",
+            "pairs.distance",
+        ):
             self.add_constant(name, joined(_field(name)), t.S, number)
         groups, L = self.group_count, self.lanes
         # every world has its own boxes: their sizes may differ

@@ -47,11 +47,15 @@ def add_sheets(data: PackedWorlds, pairs_per_particle: int) -> None:
     links = [len(tops[k].sheet_edge) * L for k in data.group_topology]
     link_start = np.cumsum([0, *links])
     for name, values in (
-        ("sheets.first", first), ("sheets.grid", grid), ("sheets.owner", of_particles("owner")),
-        ("cells.head_start", head_start[:-1]), ("cells.list_start", list_start[:-1]),
-        ("cells.capacity", room), ("sheets.edge_first", edge_first),
+        ("sheets.first", first),
+        ("sheets.grid", grid),
+        ("sheets.owner", of_particles("owner")),
+        ("cells.head_start", head_start[:-1]),
+        ("cells.list_start", list_start[:-1]),
+        ("cells.capacity", room),
+        ("sheets.edge_first", edge_first),
         ("cells.link_start", link_start[:-1]),
-    ):  # fmt: skip
+    ):
         data.add_constant(name, np.asarray(values), wp.int32, np.int32)
     data.add_constant("sheets.triangle", of_triangles("triangle"), wp.vec3i, np.int32)
     data.add_constant("sheets.edge", of_triangles("edge"), wp.vec2i, np.int32)
@@ -72,19 +76,29 @@ def add_sheets(data: PackedWorlds, pairs_per_particle: int) -> None:
     slots = data.group_count * L
     edge_room = int(list_start[-1]) if data.has_edges else 0
     for name, count in (
-        ("head", int(head_start[-1])), ("key", particles * L), ("particle", int(list_start[-1])),
-        ("face", int(list_start[-1])), ("count", slots), ("met", slots),
+        ("head", int(head_start[-1])),
+        ("key", particles * L),
+        ("particle", int(list_start[-1])),
+        ("face", int(list_start[-1])),
+        ("count", slots),
+        ("met", slots),
         ("edge_key", int(link_start[-1])),
-        ("edge_moved", int(link_start[-1])), ("edge_count", slots), ("edge_a", edge_room),
-        ("edge_b", edge_room), ("moved", particles * L), ("stamp", particles * L),
-    ):  # fmt: skip
+        ("edge_moved", int(link_start[-1])),
+        ("edge_count", slots),
+        ("edge_a", edge_room),
+        ("edge_b", edge_room),
+        ("moved", particles * L),
+        ("stamp", particles * L),
+    ):
         data.add_array(f"cells.{name}", count, wp.int32, (), np.int32)
     data.add_array("cells.gap", int(list_start[-1]), t.S, (), number)
     data.add_array("cells.edge_gap", edge_room, t.S, (), number)
     for name, count in (
-        ("edge_ball", int(link_start[-1])), ("edge_sorted", int(link_start[-1])),
-        ("place", particles * L), ("sorted", particles * L),
-    ):  # fmt: skip
+        ("edge_ball", int(link_start[-1])),
+        ("edge_sorted", int(link_start[-1])),
+        ("place", particles * L),
+        ("sorted", particles * L),
+    ):
         data.add_array(f"cells.{name}", count, t.V4, (4,), number)
     data.add_array("cells.xr", particles, t.V3, (3, L), number)
     data.add_array("cells.slack", particles, t.V, (L,), number)

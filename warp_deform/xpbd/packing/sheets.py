@@ -44,11 +44,16 @@ class Sheets:
         if not mine.any():
             none = np.zeros(0)
             return {
-                "sheet_triangle": np.zeros((0, 3), int), "sheet_friction": none,
-                "sheet_skin": none, "sheet_rest": np.zeros((0, 3)),
-                "sheet_owner": np.zeros(0, int), "sheet_exclusion": none, "sheet_cell": 0.0,
-                "sheet_edge": np.zeros((0, 2), int), "sheet_edge_gap": none,
-            }  # fmt: skip
+                "sheet_triangle": np.zeros((0, 3), int),
+                "sheet_friction": none,
+                "sheet_skin": none,
+                "sheet_rest": np.zeros((0, 3)),
+                "sheet_owner": np.zeros(0, int),
+                "sheet_exclusion": none,
+                "sheet_cell": 0.0,
+                "sheet_edge": np.zeros((0, 2), int),
+                "sheet_edge_gap": none,
+            }
         if len(ids) > _MOST_PARTICLES:
             raise InputError(
                 f"a world with triangles holds at most {_MOST_PARTICLES} particles, got {len(ids)}"

@@ -214,11 +214,15 @@ class _Springs:
         if not self.count:
             empty = np.zeros(0)
             return {
-                "spring_ij": np.zeros((0, 2), int), "spring_length": empty,
-                "spring_compliance": empty, "spring_limit": empty, "spring_floor": empty,
-                "spring_mode": empty.astype(int), "spring_watched": empty.astype(int),
+                "spring_ij": np.zeros((0, 2), int),
+                "spring_length": empty,
+                "spring_compliance": empty,
+                "spring_limit": empty,
+                "spring_floor": empty,
+                "spring_mode": empty.astype(int),
+                "spring_watched": empty.astype(int),
                 "spring_middle": empty.astype(int),
-            }  # fmt: skip
+            }
         mine = np.isin(self.ij[:, 0], ids)
         bent = mine & (self.mode == int(SpringMode.BEND))
         if not np.isin(self.middle[bent], ids).all():
@@ -241,10 +245,12 @@ class _Shapes:
         rows = np.flatnonzero(np.isin(self.body, bodies))
         if not len(rows):
             return {
-                "shape_body": np.zeros(0, int), "shape_center": np.zeros((0, 3)),
-                "shape_rotation": np.zeros((0, 4)), "shape_half": np.zeros((0, 3)),
+                "shape_body": np.zeros(0, int),
+                "shape_center": np.zeros((0, 3)),
+                "shape_rotation": np.zeros((0, 4)),
+                "shape_half": np.zeros((0, 3)),
                 "shape_friction": np.zeros(0),
-            }  # fmt: skip
+            }
         local = {b: i for i, b in enumerate(bodies)}
         body = np.array([local[b] for b in self.body[rows]])
         transform = self.model.shape_transform.numpy()[rows]

@@ -29,8 +29,10 @@ _INPUTS = (
 )  # fmt: skip
 """What whoever sets a rollout up may change, and no launch does."""
 _SHEET_STATE = ("cells.count", "cells.met", "cells.xr", "cells.slack", "cells.place")
-_LISTS = {"cells.count": ("cells.particle", "cells.face", "cells.gap"),
-          "cells.edge_count": ("cells.edge_a", "cells.edge_b", "cells.edge_gap")}  # fmt: skip
+_LISTS = {
+    "cells.count": ("cells.particle", "cells.face", "cells.gap"),
+    "cells.edge_count": ("cells.edge_a", "cells.edge_b", "cells.edge_gap"),
+}
 
 
 class Checkpoints:

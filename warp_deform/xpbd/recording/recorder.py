@@ -74,9 +74,7 @@ class Recorder:
         self.solver, self.storage, self.memory, self.sleep = solver, storage, memory, sleep
         self.dt = dt or solver.config.dt
         data = solver.data
-        variant = (
-            data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets, data.has_edges
-        )  # fmt: skip
+        variant = (data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets, data.has_edges)
         self._kernels = forward_kernel(*variant, taped=True), adjoint_kernel(*variant)
         self._settings = self._new_settings()
         self._segments: list[_Segment] = []
@@ -125,9 +123,13 @@ class Recorder:
     def _recorded(self, kernel: Any, inputs: list[Any]) -> Any:
         """A launch that is cheap to repeat."""
         return wp.launch(
-            kernel, dim=self.solver.data.group_count, inputs=inputs,
-            device=self.solver.model.device, record_cmd=True, record_tape=False,
-        )  # fmt: skip
+            kernel,
+            dim=self.solver.data.group_count,
+            inputs=inputs,
+            device=self.solver.model.device,
+            record_cmd=True,
+            record_tape=False,
+        )
 
     def _mirrored(self, count: int, dtype: Any, shape: tuple[int, ...]) -> Mirrored:
         data = self.solver.data
@@ -311,8 +313,11 @@ class Recorder:
             tape = self._replay(number) if self.storage == "replay" else segment.tape
             struct.leave = int(segment.begin > 0 and segment.begin not in self._marks)
             self._settings.max_steps = segment.end
-            for at, value in ((0, self._settings), (1 + len(_SWEPT), tape.struct),
-                              (2 + len(_SWEPT), struct)):  # fmt: skip
+            for at, value in (
+                (0, self._settings),
+                (1 + len(_SWEPT), tape.struct),
+                (2 + len(_SWEPT), struct),
+            ):
                 sweep.set_param_at_index(at, value)
             sweep.launch()
 

@@ -63,9 +63,11 @@ def new_stacks(data: SolverData, control: dict[str, Mirrored], room: np.ndarray)
     for name, mirrored in control.items():
         arrays[name] = mirrored.array
     flat = wp.array(
-        ptr=arrays["x"].ptr, dtype=data.scalar,
-        shape=(arrays["x"].capacity // np.dtype(data.number).itemsize,), device=device,
-    )  # fmt: skip
+        ptr=arrays["x"].ptr,
+        dtype=data.scalar,
+        shape=(arrays["x"].capacity // np.dtype(data.number).itemsize,),
+        device=device,
+    )
     for name, array in (*arrays.items(), ("x_flat", flat)):
         setattr(struct, name, array)
     return Stacks(struct, room, arrays, int((room @ _sizes(data)).sum()))
