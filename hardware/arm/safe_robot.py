@@ -17,13 +17,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from types import TracebackType
 from typing import TypeVar
 
 import numpy as np
 
 from warp_deform.errors import InputError
 
+from ..support.closing import Closing
 from .arrival import check_arrival, pressed_contact
 from .limits import SafetyLimits
 from .motion_checks import LEVEL, MotionChecks, Planner, as_lines, sunk_after
@@ -60,7 +60,7 @@ _MIN_WIDTH = 1e-5  # [m]: less is a slip
 _FIXED = frozenset({"_arm", "_checks", "_home", "_latch", "_limits", "_lock", "_robot"})
 
 
-class SafeRobot:
+class SafeRobot(Closing):
     """A `Robot` within `SafetyLimits`.
 
     Taking hold of a backend clears a reflex that is left from before, and moves nothing. Leaving
@@ -349,20 +349,8 @@ class SafeRobot:
         """End the connection; see `Robot.close`."""
         self._robot.close()
 
-    def __enter__(self) -> SafeRobot:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        try:
-            if kind is not None:
-                self.stop()
-        finally:
-            self._robot.close()
+    def _end_by(self, error: BaseException) -> None:
+        self.stop()
 
     def _ready(self) -> RobotState:
         """Return the state of a robot that stands still and within the limits, not stopped."""

@@ -15,7 +15,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import cv2
@@ -29,6 +28,7 @@ from ..arm.pick_place import PickPlaceAction, PickPlaceResult
 from ..arm.robot import Robot, RobotError, RobotState
 from ..arm.safe_robot import SafeRobot
 from ..cameras.camera import DEPTH_UNIT, Frame
+from ..support.closing import Closing
 from ..support.json_file import write_json, write_whole
 from .recording import SCHEMA
 
@@ -55,7 +55,7 @@ class RecorderConfig:
     """Revision of the software, where it runs from a checkout."""
 
 
-class EpisodeRecorder:
+class EpisodeRecorder(Closing):
     """Writes one episode's folder.
 
     Args:
@@ -286,20 +286,9 @@ class EpisodeRecorder:
         if failed is not None:
             raise failed
 
-    def __enter__(self) -> EpisodeRecorder:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        try:
-            if value is not None and self._meta["outcome"] is None:
-                self.finish(f"error: {type(value).__name__}: {' '.join(str(value).split())}")
-        finally:
-            self.close()
+    def _end_by(self, error: BaseException) -> None:
+        if self._meta["outcome"] is None:
+            self.finish(f"error: {type(error).__name__}: {' '.join(str(error).split())}")
 
     def _append(self, file: BinaryIO, row: dict[str, Any], *, sync: bool = True) -> None:
         row = {**row, "t": time.monotonic() - self._start}

@@ -1,4 +1,4 @@
-"""What is closed at the end of a `with` block: robots, cameras, the emulator's process."""
+"""What is closed at the end of a `with` block: robots, cameras, recordings, the emulator."""
 
 from __future__ import annotations
 
@@ -15,6 +15,10 @@ class Closing(Protocol):
         """Give back what is held; may be called twice."""
         ...
 
+    def _end_by(self, error: BaseException) -> None:
+        """What comes before closing where an error ends the block; nothing unless overridden."""
+        return None
+
     def __enter__(self) -> Self:
         return self
 
@@ -24,4 +28,8 @@ class Closing(Protocol):
         value: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self.close()
+        try:
+            if value is not None:
+                self._end_by(value)
+        finally:
+            self.close()

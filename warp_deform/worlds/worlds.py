@@ -373,17 +373,9 @@ class Worlds:
                 raise WarpDeformError("a state that is not finite cannot be drawn")
             return self.task.draw(topdown, layout, drawables, particle_q, body_q)
 
-        episode.snapshot = Snapshot(
-            particle_q,
-            particle_qd,
-            body_q,
-            body_qd,
-            drawables.segments,
-            render,
-            episode.objects,
-            episode.history,
-            episode.over,
-        )
+        state = particle_q, particle_qd, body_q, body_qd
+        past = episode.objects, episode.history, episode.over
+        episode.snapshot = Snapshot(*state, drawables.segments, render, *past)
 
     def state(self, slot: int) -> WorldState:
         """All that the slot's episode goes on from; the slot must have been reset."""
