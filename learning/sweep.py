@@ -58,9 +58,11 @@ _DONE = "sweep.json"
 class Collecting:
     """Where demonstrations come from. The section `demonstrations` of the file.
 
-    folder: holds a folder of demonstrations a task; None: OUT/demos
-    count: to collect where a task has fewer; None: as many as the largest run needs
-    seed: first one of the collection; demonstrator: who acts
+    Attributes:
+        folder: holds a folder of demonstrations a task; None: OUT/demos
+        count: to collect where a task has fewer; None: as many as the largest run needs
+        seed: first one of the collection
+        demonstrator: who acts
     """
 
     folder: Path | None = None

@@ -40,10 +40,11 @@ _MOST_DRAWS = 10_000
 class RigidTransform:
     """A mirror image or not, a turn about the middle of the picture, then a shift.
 
-    turn: [rad], from x to y, which is from columns to rows in a picture too
-    shift: along x (columns) and y (rows) [pixels]
-    grid: where on the table the pixels are
-    mirror: swap left and right, which are rows, first
+    Attributes:
+        turn: [rad], from x to y, which is from columns to rows in a picture too
+        shift: along x (columns) and y (rows) [pixels]
+        grid: where on the table the pixels are
+        mirror: swap left and right, which are rows, first
     """
 
     turn: float
@@ -80,8 +81,10 @@ def draw_transform(
 ) -> RigidTransform:
     """A random transform that keeps pick and place of `action` (7,) within the picture.
 
-    copies: turn by one of so many even parts of a circle; None: by any angle, small ones more often
-    mirror: every second one is a mirror image
+    Args:
+        copies: turn by one of so many even parts of a circle; None: by any angle, small ones more
+            often
+        mirror: every second one is a mirror image
 
     Raises:
         InputError: pick and place lie too far apart for one picture.
@@ -131,7 +134,8 @@ def move_states(
 ) -> np.ndarray:
     """Ground-truth states (B, D) float32 of a task, each moved.
 
-    layout: what their numbers are, `Task.ground_truth_rows`
+    Args:
+        layout: what their numbers are, `Task.ground_truth_rows`
 
     Raises:
         InputError: the ground truth has another size, or the task does not say what it is.

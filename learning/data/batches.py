@@ -29,9 +29,10 @@ StateBatch = tuple[Tensor, Tensor, Tensor]
 def task_lifts(task: Task) -> tuple[float, ...]:
     """Lifts of the task's stages [m], each once, from low to high.
 
-    >>> from warp_deform.tasks.registry import task
-    >>> task_lifts(task("bag-items-1"))
-    (0.05, 0.3, 0.4)
+    Examples:
+        >>> from warp_deform.tasks.registry import task
+        >>> task_lifts(task("bag-items-1"))
+        (0.05, 0.3, 0.4)
     """
     return tuple(sorted({stage.lift for stage in task.stages}))
 
@@ -71,8 +72,9 @@ def image_batch(
 ) -> Batch:
     """Moments, moved by `rng`, as an agent over pictures sees them.
 
-    moments: demonstrations and moments, `Demonstrations.drawn` say
-    mirror: show every second one mirrored, where mirror images are scenes of the task
+    Args:
+        moments: demonstrations and moments, `Demonstrations.drawn` say
+        mirror: show every second one mirrored, where mirror images are scenes of the task
 
     Raises:
         InputError: a pick or place is out of view, or a lift is no stage's.

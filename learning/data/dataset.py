@@ -37,8 +37,10 @@ _IMPORTED_SOLVED = "bag-items-1", "bag-items-2"
 class Moment(NamedTuple):
     """One demonstrated action: what was seen, what was done, and what came of the episode.
 
-    color (H, W, 3) uint8 and height (H, W) float32 [m], of the moment and of the episode's end
-    action: (7,) float64 pick x, y, yaw, place x, y, yaw, lift [m, rad]
+    Attributes:
+        color: (H, W, 3) uint8, of the moment and of the episode's end
+        height: (H, W) float32 [m], likewise
+        action: (7,) float64 pick x, y, yaw, place x, y, yaw, lift [m, rad]
     """
 
     color: np.ndarray
@@ -53,8 +55,9 @@ def choose(seeds: tuple[int, ...], count: int, *, seed: int) -> tuple[int, ...]:
 
     Source: Seita et al., ICRA 2021, section on training (1, 10, 100 of 1000, drawn by run).
 
-    >>> choose((3, 5, 8, 13), 2, seed=0)
-    (8, 13)
+    Examples:
+        >>> choose((3, 5, 8, 13), 2, seed=0)
+        (8, 13)
 
     Raises:
         InputError: there are not so many.

@@ -69,10 +69,11 @@ def evaluate_snapshot(
 ) -> Evaluation:
     """Play a protocol with a snapshot of a run, or read what was played before.
 
-    heard: called with every episode, those that were played before first
-
     An episode depends on snapshot, seed and protocol alone, so neither the number of workers nor an
     interruption changes a result.
+
+    Args:
+        heard: called with every episode, those that were played before first
 
     Raises:
         InputError: there is no such snapshot, it cannot play this, or a file is damaged.

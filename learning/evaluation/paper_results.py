@@ -54,7 +54,8 @@ def read_paper() -> PaperResults:
 def partial_credit(task: str) -> bool:
     """Whether a task's result is the mean score; that of tasks outside of the table is successes.
 
-    >>> partial_credit("fabric-flat"), partial_credit("cable-ring")
-    (True, False)
+    Examples:
+        >>> partial_credit("fabric-flat"), partial_credit("cable-ring")
+        (True, False)
     """
     return read_paper().measures.get(task) == PARTIAL_SCORE

@@ -26,10 +26,11 @@ __all__ = ["Measured", "Played", "goal_distance", "play_policy"]
 class Played:
     """One episode. score: at its end, 0 if its physics cannot be trusted; reason: why it ended.
 
-    failure: which of `failures.FAILURES` it is; None if solved
-    goal_l2: for goal-conditioned tasks, `goal_distance` at the start and after every action
-    enclosed: `Worlds.enclosed` at the end, whether the bag keeps its items; None also if the
-    physics cannot be trusted
+    Attributes:
+        failure: which of `failures.FAILURES` it is; None if solved
+        goal_l2: for goal-conditioned tasks, `goal_distance` at the start and after every action
+        enclosed: `Worlds.enclosed` at the end, whether the bag keeps its items; None also if the
+            physics cannot be trusted
     """
 
     seed: int
@@ -61,8 +62,9 @@ def play_policy(
 ) -> Iterator[tuple[int, Played, Run[Measured]]]:
     """Play episodes of a protocol in `worlds`; each is yielded, after its slot, when it is over.
 
-    goals: by seed, see `protocol.goals_of`; None: every seed constructs its own
-    watch: called with a slot, what is seen there, and the action chosen
+    Args:
+        goals: by seed, see `protocol.goals_of`; None: every seed constructs its own
+        watch: called with a slot, what is seen there, and the action chosen
     """
     stages: dict[int, Stage | None] = {}
     players: dict[int, Policy] = {}

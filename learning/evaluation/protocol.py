@@ -34,19 +34,20 @@ FIRST_SEED = {"validation": 50_000, "test": 10_000}
 class Protocol:
     """What a snapshot plays.
 
-    split: "validation" or "test", whose seeds are played
-    episodes: their number, from the split's first seed on; first_seed: of test episodes, in place
-        of the split's
-    goals: "constructed": for validation from the episode's own seed, for test from goal seeds;
-        "demonstrated": ends of demonstrations on goal seeds, the paper's
-    n_goals: goals that the test episodes share in turn
-    goal_folder: a folder of goals that the test episodes share in turn instead
-    stage_rule: who chooses the lift, "action" (the policy) or "privileged" (the paper's hidden
-        rule, which reads the simulator)
-    retry: whether agents over pictures remember what they missed and what they just put down, and
-        pick elsewhere, see `policy.RetryingPolicy`; the paper's do not
-    motions_must_succeed: whether an action that the arm cannot carry out ends the episode,
-        unsolved, as in the original; else it costs an action
+    Attributes:
+        split: "validation" or "test", whose seeds are played
+        episodes: their number, from the split's first seed on
+        first_seed: of test episodes, in place of the split's
+        goals: "constructed": for validation from the episode's own seed, for test from goal seeds;
+            "demonstrated": ends of demonstrations on goal seeds, the paper's
+        n_goals: goals that the test episodes share in turn
+        goal_folder: a folder of goals that the test episodes share in turn instead
+        stage_rule: who chooses the lift, "action" (the policy) or "privileged" (the paper's hidden
+            rule, which reads the simulator)
+        retry: whether agents over pictures remember what they missed and what they just put down,
+            and pick elsewhere, see `policy.RetryingPolicy`; the paper's do not
+        motions_must_succeed: whether an action that the arm cannot carry out ends the episode,
+            unsolved, as in the original; else it costs an action
     """
 
     split: Literal["validation", "test"]
@@ -149,7 +150,8 @@ def check_goals(folder: Path, task: str) -> Path:
 def check_splits(trained: Iterable[int], protocols: Sequence[Protocol], *, task: str) -> None:
     """Refuse protocols that would play what was trained on, or share seeds among their splits.
 
-    trained: seeds of the demonstrations
+    Args:
+        trained: seeds of the demonstrations
 
     Raises:
         InputError: a seed of training is one of the episodes or goals, or one of an episode is

@@ -50,11 +50,6 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Choose the best snapshot on validation seeds, and play the test seeds with it.
 
-    goals: folder of goals for the test episodes; None: constructed from goal seeds
-    first_seed: of other test episodes; their results are kept apart
-    video: folder for videos of the first `videos` test episodes; video_arm: also with the arm
-    progress: tell of it on stderr, see `warp_deform.support.progress`
-
     Writes `eval_info.json` into the run's folder and returns what it says: task, agent, preset,
     steps (planned), trained_steps (fewer where training stopped early), demos, seed, stage_rule,
     retry, robot, goals, seconds [s]; `snapshots`: by step, results on validation seeds;
@@ -72,6 +67,13 @@ def evaluate_run(
 
     By the paper's protocol its hidden rule chooses the lift where a task has several, which
     `stage_rule` of `paper` says, and an action that the arm cannot carry out ends an episode.
+
+    Args:
+        goals: folder of goals for the test episodes; None: constructed from goal seeds
+        first_seed: of other test episodes; their results are kept apart
+        video: folder for videos of the first `videos` test episodes
+        video_arm: also with the arm
+        progress: tell of it on stderr, see `warp_deform.support.progress`
 
     Raises:
         InputError: this is no finished run, a seed of it is to be played, a file is damaged, or

@@ -23,7 +23,10 @@ _MARK = "conversion.json"
 class ConversionReport:
     """What a conversion made.
 
-    steps: actions of all episodes; bytes: size on the disk; seconds: what this run took [s]
+    Attributes:
+        steps: actions of all episodes
+        bytes: size on the disk
+        seconds: what this run took [s]
     """
 
     format: str
@@ -41,8 +44,10 @@ def new_folder(
 ) -> Iterator[Path]:
     """A hidden folder beside `target` to write into; it gets its name when the block ends well.
 
-    description: what is converted, JSON types. With `resume`, what an interrupted run of the same
-        description left is kept, in the folder that is given; else it is removed.
+    Args:
+        description: what is converted, JSON types
+        resume: keep what an interrupted run of the same description left, in the folder that is
+            given; else it is removed
 
     Raises:
         InputError: there is something at `target` already, it cannot be written, or another

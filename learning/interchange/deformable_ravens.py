@@ -90,11 +90,12 @@ def import_deformable_ravens(
 ) -> ConversionReport:
     """Convert one task's folder of the original into a folder of episodes.
 
-    task: our name of the task; None reads it from the folder's name, with which the original's
-        begins ("insertion-goal" is block-notarget). An episode's seed is its number there.
-    workers: processes; None takes one per core, but not for a handful of episodes
+    An episode's seed is its number there. An interrupted import goes on when it is called again.
 
-    An interrupted import goes on when it is called again.
+    Args:
+        task: our name of the task; None reads it from the folder's name, with which the original's
+            begins ("insertion-goal" is block-notarget)
+        workers: processes; None takes one per core, but not for a handful of episodes
 
     Raises:
         InputError: the folder is incomplete, a file is damaged or holds more than data, or

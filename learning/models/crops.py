@@ -60,8 +60,9 @@ def rotated_crops(
 def crop_reach(size: int, n_rotations: int) -> int:
     """Greatest distance [pixels] along an axis from a crop's centre to a pixel that it samples.
 
-    >>> crop_reach(64, 1), crop_reach(64, 24)
-    (32, 46)
+    Examples:
+        >>> crop_reach(64, 1), crop_reach(64, 24)
+        (32, 46)
     """
     half = size // 2
     return half if n_rotations == 1 else int(np.ceil(np.hypot(half, half)))

@@ -279,8 +279,9 @@ def receptive_span(start: int, stop: int, *, equivariant: bool = False) -> tuple
     An `equivariant` one takes means of two rows where others take the first of two. The result may
     reach outside of the image, where the network sees its own zero padding.
 
-    >>> receptive_span(160, 161)
-    (89, 224)
+    Examples:
+        >>> receptive_span(160, 161)
+        (89, 224)
     """
     first, last = start, stop - 1
     for _ in range(3):  # the three stages after an interpolation: two 3x3 convolutions, then twice

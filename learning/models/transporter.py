@@ -174,10 +174,13 @@ PRESETS = {
 class Batch(NamedTuple):
     """Labelled images, in network pixels.
 
-    image: (B, 4 k, H, W) float32, raw (see `image_tensor`): the current picture, then the goal's
-    pick, place: (B, 2) int64, row and column
-    theta: (B,) float, pick yaw minus place yaw [rad]
-    lift: (B,) int64, index into the configuration's lifts
+    Attributes:
+        image: (B, 4 k, H, W) float32, raw (see `image_tensor`): the current picture, then the
+            goal's
+        pick: (B, 2) int64, row and column
+        place: (B, 2) int64, row and column
+        theta: (B,) float, pick yaw minus place yaw [rad]
+        lift: (B,) int64, index into the configuration's lifts
     """
 
     image: Tensor
@@ -205,9 +208,11 @@ class Losses(NamedTuple):
 class PixelActions(NamedTuple):
     """What to do in each of B pictures.
 
-    pick, place: (B, 2) float64 row and column [camera pixels]
-    place_yaw: (B,) float64 [rad], within -pi to pi; the pick yaw is 0
-    lift: (B,) float64 [m]
+    Attributes:
+        pick: (B, 2) float64 row and column [camera pixels]
+        place: as `pick`
+        place_yaw: (B,) float64 [rad], within -pi to pi; the pick yaw is 0
+        lift: (B,) float64 [m]
     """
 
     pick: np.ndarray
@@ -219,10 +224,11 @@ class PixelActions(NamedTuple):
 class Transporter(nn.Module):
     """Pick by attention, place by transport, lift by a head on the pick's crop.
 
-    >>> agent = Transporter(PRESETS["fast"], seed=0)
-    >>> color, height = np.zeros((320, 160, 3), np.uint8), np.zeros((320, 160), np.float32)
-    >>> agent.act(agent.image((color, height))[None]).place.shape
-    (1, 2)
+    Examples:
+        >>> agent = Transporter(PRESETS["fast"], seed=0)
+        >>> color, height = np.zeros((320, 160, 3), np.uint8), np.zeros((320, 160), np.float32)
+        >>> agent.act(agent.image((color, height))[None]).place.shape
+        (1, 2)
 
     Args:
         config: sizes and choices
@@ -316,7 +322,8 @@ class Transporter(nn.Module):
     def act(self, image: Tensor, *, avoid: Tensor | None = None) -> PixelActions:
         """Pick and place that are likely together, then the lift, for images (B, 4 k, H, W).
 
-        avoid: (B, H, W) bool, network pixels that are not to be picked; not all of a picture
+        Args:
+            avoid: (B, H, W) bool, network pixels that are not to be picked; not all of a picture
 
         Raises:
             InputError: an image of another shape.

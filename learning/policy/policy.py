@@ -58,8 +58,9 @@ AGENTS: dict[str, type[Transporter] | type[GtState] | type[GtState2Step]] = {
 class AgentDescription:
     """All that it takes to build an agent but its weights.
 
-    config: fields of its `TransporterConfig` or `GtStateConfig`
-    state_size: length of the ground truth, for agents that see it
+    Attributes:
+        config: fields of its `TransporterConfig` or `GtStateConfig`
+        state_size: length of the ground truth, for agents that see it
     """
 
     task: str
@@ -117,8 +118,9 @@ class Policy(Protocol):
     ) -> np.ndarray:
         """Action (7,) float64: pick x, y, yaw, place x, y, yaw, lift [m, rad].
 
-        goal: `color` and `height` of the goal, where they are not part of the observation
-        rng: for policies that draw their actions
+        Args:
+            goal: `color` and `height` of the goal, where they are not part of the observation
+            rng: for policies that draw their actions
         """
 
 
@@ -139,7 +141,8 @@ class ImagePolicy:
     ) -> np.ndarray:
         """See `Policy.act`.
 
-        avoid: points x, y and distances [m] from them within which nothing is to be picked
+        Args:
+            avoid: points x, y and distances [m] from them within which nothing is to be picked
 
         Raises:
             InputError: a picture is missing, or is not a top-down picture of the table.

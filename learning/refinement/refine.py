@@ -88,12 +88,16 @@ class RefineConfig(RefineSettings):
 class RefineReport:
     """What came of it.
 
-    improved: episodes that took the place of the original
-    score_before, score_after: means; actions_before, actions_after: sums over all episodes
-    origins: how many actions of the episodes that took the place of the original come from where,
-        see `planning.Outlook.origin`
-    seconds: what this run took [s]
-    state_hash: of the new folder's episodes in the order of their seeds
+    Attributes:
+        improved: episodes that took the place of the original
+        score_before: mean over all episodes before
+        score_after: mean over all episodes afterwards
+        actions_before: sum over all episodes before
+        actions_after: sum over all episodes afterwards
+        origins: how many actions of the episodes that took the place of the original come from
+            where, see `planning.Outlook.origin`
+        seconds: what this run took [s]
+        state_hash: of the new folder's episodes in the order of their seeds
     """
 
     episodes: int

@@ -61,10 +61,16 @@ class BendConfig(FolderSettings):
 class BendReport:
     """What came of it.
 
-    actions: those whose straight path ran; bent: for how many a better one was found
-    loss_before, loss_after, score_before, score_after: means over `actions` of the task's loss and
-    score after the action; None where there are none
-    seconds: what this run took [s]
+    Attributes:
+        actions: those whose straight path ran
+        bent: for how many a better one was found
+        loss_before: mean over `actions` of the task's loss after the straight path; None where
+            there are none
+        loss_after: the same after the best path
+        score_before: mean over `actions` of the score after the straight path; None where there
+            are none
+        score_after: the same after the best path
+        seconds: what this run took [s]
     """
 
     demonstrator: str

@@ -63,16 +63,25 @@ class RunResult:
 class Cell:
     """Runs that differ in their seed alone, taken together.
 
-    n_episodes, n_success, pc_success [%], pc_success_ci95 [%]: of the test episodes of all runs
-    n_success_enclosed: successes whose items the bag enclosed; None without items, or where a run
-    does not say
-    mean_score: in [0, 1], with its standard_error; mean_actions: of all test episodes
-    value, value_error [%]: what the paper's table shows for the task (`measure`), on our test seeds
-    paper_protocol [%]: the same by the paper's protocol, which is optimistic; None if not played
-    paper_protocol_stage_rule: who chose the lift there, "action" or "privileged"
-    paper [%]: the paper's number; None where it has none
-    failures: how often each of `failures.FAILURES` happened
-    validation, test: learning curves; `test` where the paper's protocol was played
+    Attributes:
+        n_episodes: test episodes of all runs
+        n_success: those that were solved
+        pc_success: their share [%]
+        pc_success_ci95: 95 % interval of the share, low and high [%]
+        n_success_enclosed: successes whose items the bag enclosed; None without items, or where a
+            run does not say
+        mean_score: from 0 to 1
+        standard_error: of the mean score
+        mean_actions: of all test episodes
+        value: what the paper's table shows for the task (`measure`), on our test seeds [%]
+        value_error: its standard error [%]
+        paper_protocol: the same by the paper's protocol, which is optimistic [%]; None if not
+            played
+        paper_protocol_stage_rule: who chose the lift there, "action" or "privileged"
+        paper: the paper's number [%]; None where it has none
+        failures: how often each of `failures.FAILURES` happened
+        validation: learning curve on validation episodes
+        test: learning curve on test episodes, where the paper's protocol was played
     """
 
     task: str

@@ -180,7 +180,8 @@ class RunFolder:
     def write_state(self, tensors: Mapping[str, Tensor], step: int, *, key: str) -> None:
         """Store what training goes on from, in place of what was stored before.
 
-        key: digest of the settings that it belongs to
+        Args:
+            key: digest of the settings that it belongs to
         """
         _write_tensors(self.state, tensors, {"format": str(_FORMAT), "step": str(step), "key": key})
 

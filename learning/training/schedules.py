@@ -58,10 +58,11 @@ class Schedule:
     def snapshot_steps(self) -> tuple[int, ...]:
         """Steps after which a snapshot is kept.
 
-        >>> Schedule(steps=10, batch=1, lr=1.0, snapshots=4).snapshot_steps()
-        (2, 5, 8, 10)
-        >>> Schedule(steps=4000, batch=1, lr=1.0, snapshots=5, doubling=True).snapshot_steps()
-        (250, 500, 1000, 2000, 4000)
+        Examples:
+            >>> Schedule(steps=10, batch=1, lr=1.0, snapshots=4).snapshot_steps()
+            (2, 5, 8, 10)
+            >>> Schedule(steps=4000, batch=1, lr=1.0, snapshots=5, doubling=True).snapshot_steps()
+            (250, 500, 1000, 2000, 4000)
         """
         n = self.snapshots
         if self.doubling:

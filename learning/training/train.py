@@ -52,14 +52,17 @@ _STREAM = 7
 class TrainReport:
     """What was trained.
 
-    left_out: recordings of the folder that are no demonstrations, see `dataset.Demonstrations`
-    steps: taken in all, of planned_steps; snapshots: the steps of which there are snapshots
-    validation: of snapshots on validation episodes, `n_success`, `n_episodes`, `mean_score` by step
-    loss: mean over the last logged steps [nat]
-    held_out: that of snapshots on held-out demonstrations by step [nat]
-    seconds: of this call [s]
-    cpu_seconds: that the steps of all calls took the process, without validation [s]
-    weights_hash: of the last snapshot's weights
+    Attributes:
+        left_out: recordings of the folder that are no demonstrations, see `dataset.Demonstrations`
+        steps: taken in all, of planned_steps
+        snapshots: the steps of which there are snapshots
+        validation: of snapshots on validation episodes, `n_success`, `n_episodes`, `mean_score` by
+            step
+        loss: mean over the last logged steps [nat]
+        held_out: that of snapshots on held-out demonstrations by step [nat]
+        seconds: of this call [s]
+        cpu_seconds: that the steps of all calls took the process, without validation [s]
+        weights_hash: of the last snapshot's weights
     """
 
     task: str

@@ -56,11 +56,13 @@ class CollectConfig(CollectSettings):
 class CollectReport:
     """What was collected.
 
-    attempts: seeds up to the one of the last kept success; mean_actions, mean_score, sim_seconds
-    [s] and physics_ok are of the kept episodes; seconds: what this run took [s]
-    state_hash: of the kept episodes' hashes in the order of their seeds
-    enclosed: kept episodes whose bag enclosed its items, see `Task.enclosed`; None where there are
-    none
+    Attributes:
+        attempts: seeds up to the one of the last kept success; mean_actions, mean_score,
+            sim_seconds [s] and physics_ok are of the kept episodes
+        seconds: what this run took [s]
+        state_hash: of the kept episodes' hashes in the order of their seeds
+        enclosed: kept episodes whose bag enclosed its items, see `Task.enclosed`; None where there
+            are none
     """
 
     task: str

@@ -43,17 +43,18 @@ def make_goals(
 ) -> dict[str, Any]:
     """Make `count` goals of a goal-conditioned task in a folder; goes on with what is there.
 
-    kind: "demonstrated" keeps a demonstrator's successes on the seeds, whose last states are the
-        goals (the paper's protocol); "constructed" places the objects at sampled targets and lets
-        them settle, which takes no demonstrator but the default
-
     Returns task, kind, goals, attempts, seconds [s], physics_ok and state_hash.
+
+    Source: Seita et al., ICRA 2021, section on goal-conditioned tasks.
+
+    Args:
+        kind: "demonstrated" keeps a demonstrator's successes on the seeds, whose last states are
+            the goals (the paper's protocol); "constructed" places the objects at sampled targets
+            and lets them settle, which takes no demonstrator but the default
 
     Raises:
         InputError: the task has no goal, the kind or the demonstrator is unknown, or the folder
             holds something else.
-
-    Source: Seita et al., ICRA 2021, section on goal-conditioned tasks.
     """
     if not find_task(task).goal_conditioned:
         raise InputError(f"{task} has no goal image; goals are for goal-conditioned tasks")

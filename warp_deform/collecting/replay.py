@@ -30,12 +30,13 @@ def verify(
 ) -> dict[str, Any]:
     """Simulate every episode of a folder again and compare every row.
 
-    tolerance: None compares states bit by bit, scores and successes exactly; else positions of
-        particles and bodies may differ by so much [m], and only they are compared: for another
-        processor or version.
-
     Returns episodes, steps (rows), mismatches (rows that differ or were not reached), max_error
     [m], and whether the recording's processor and versions are the "same" or "other".
+
+    Args:
+        tolerance: None compares states bit by bit, scores and successes exactly; else positions of
+            particles and bodies may differ by so much [m], and only they are compared: for another
+            processor or version.
 
     Raises:
         InputError: the folder has no episodes, one is damaged, was not simulated, or is of a task

@@ -43,8 +43,10 @@ class _Shot:
 class Take:
     """An episode as it was played: enough to simulate it again, and what its frames tell.
 
-    goal: the one it was given, None where the start makes it; actions: (7,) each
-    rows: at the start and after every action, what was seen and came of it
+    Attributes:
+        goal: the one it was given, None where the start makes it
+        actions: (7,) each
+        rows: at the start and after every action, what was seen and came of it
     """
 
     task: str

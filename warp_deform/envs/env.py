@@ -32,9 +32,6 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         observation, info = env.reset(seed=0)
         observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 
-    task: a name, see `warp-deform list`, or a `Task` of your own; robot: "ur5" or "panda"
-    render_mode: None, or "rgb_array" for `render` to draw table, objects and arm (360, 640, 3)
-
     Reward is the change of the score. An episode terminates when the task is solved or over without
     success by its rules (`Task.ended`), and is truncated after `max_actions`, or as soon as a guard
     of the solver says that the state cannot be trusted. `spaces.observation` and
@@ -42,6 +39,11 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
 
     A seed names an episode: the same bits in any environment, alone or in a vector. A reset without
     one draws the episode's seed from `np_random` (1,000,000 and up) and tells it in `info`.
+
+    Args:
+        task: a name, see `warp-deform list`, or a `Task` of your own
+        robot: "ur5" or "panda"
+        render_mode: None, or "rgb_array" for `render` to draw table, objects and arm (360, 640, 3)
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 2}
@@ -66,9 +68,10 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start the episode that `seed` names.
 
-        options: {"goal": ...} for a goal-conditioned task, a `Goal`, the path of an episode file
-            (its last state is the goal) or of a folder of them (chosen by the seed); by default
-            the objects are placed at the target that the seed drew
+        Args:
+            options: {"goal": ...} for a goal-conditioned task, a `Goal`, the path of an episode
+                file (its last state is the goal) or of a folder of them (chosen by the seed); by
+                default the objects are placed at the target that the seed drew
 
         Raises:
             InputError: an option is unknown, or the goal is not this task's.

@@ -39,10 +39,16 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
     An episode has the same bits as in `PickPlaceEnv` with the same seed, whatever the number of
     environments and its place among them; so have the episodes that follow it by autoreset.
 
-    autoreset_mode: "NextStep" (Gymnasium's default: the step after an episode's end ignores the
-        action and resets), "SameStep" (the last observation is in infos["final_obs"], its info in
-        infos["final_info"]) or "Disabled" (reset ended ones with options={"reset_mask": mask})
-    task, robot, render_mode: see `PickPlaceEnv`; infos are dictionaries of arrays, as Gymnasium's.
+    Infos are dictionaries of arrays, as Gymnasium's.
+
+    Args:
+        autoreset_mode: "NextStep" (Gymnasium's default: the step after an episode's end ignores the
+            action and resets), "SameStep" (the last observation is in infos["final_obs"], its info
+            in infos["final_info"]) or "Disabled" (reset ended ones with options={"reset_mask":
+            mask})
+        task: see `PickPlaceEnv`
+        robot: see `PickPlaceEnv`
+        render_mode: see `PickPlaceEnv`
     """
 
     metadata: dict[str, Any] = {
@@ -88,10 +94,12 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
     ) -> tuple[Batch, dict[str, Any]]:
         """Start an episode in every environment.
 
-        seed: one seed an environment, or a number s for s, s + 1, ...; None goes on with every
-            environment's own sequence
-        options: "goal" as for `PickPlaceEnv`, or a list of one an environment (None: constructed);
-            "reset_mask" (num_envs,) bool: which environments to reset, all others go on
+        Args:
+            seed: one seed an environment, or a number s for s, s + 1, ...; None goes on with every
+                environment's own sequence
+            options: "goal" as for `PickPlaceEnv`, or a list of one an environment (None:
+                constructed); "reset_mask" (num_envs,) bool: which environments to reset, all others
+                go on
 
         Raises:
             InputError: a wrong number of seeds or goals, an unknown option, a goal of another task.
@@ -118,7 +126,8 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
     ) -> tuple[Batch, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Pick and place once in every environment, all at the same time.
 
-        actions: (num_envs, 7), see `PickPlaceEnv`
+        Args:
+            actions: (num_envs, 7), see `PickPlaceEnv`
 
         Raises:
             InputError: an action is not in the action space; nothing has been moved then.

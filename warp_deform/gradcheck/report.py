@@ -39,18 +39,19 @@ _MEMORY = 3 * 2**29  # bytes
 class Row:
     """One line of the report; None where a level does not say.
 
-    constraint: kind whose states are counted, see `Kind`, or "all"
-    parameter: what is differentiated by, or "all"; of actions "place", by the rollout that counts,
-    and "place, as differentiated", by the one that slopes are taken of
-    relative_error: 99th percentile over states, see `Sample.error`
-    cosine: between all directional derivatives and their differences; of actions the mean
-    share: of comparisons that cross no branch; of actions those that a search would use
-    growth: median of the gradient's length at the start over that at the end
-    n: comparisons, or actions
-    states: from so many states
-    within: share of the comparisons that count whose error is below the level's bound
-    doubtful: share of comparisons that do not count, as the differences themselves are not known to
-    the level's bound
+    Attributes:
+        constraint: kind whose states are counted, see `Kind`, or "all"
+        parameter: what is differentiated by, or "all"; of actions "place", by the rollout that
+            counts, and "place, as differentiated", by the one that slopes are taken of
+        relative_error: 99th percentile over states, see `Sample.error`
+        cosine: between all directional derivatives and their differences; of actions the mean
+        share: of comparisons that cross no branch; of actions those that a search would use
+        growth: median of the gradient's length at the start over that at the end
+        n: comparisons, or actions
+        states: from so many states
+        within: share of the comparisons that count whose error is below the level's bound
+        doubtful: share of comparisons that do not count, as the differences themselves are not
+            known to the level's bound
     """
 
     task: str

@@ -14,11 +14,15 @@ __all__: list[str] = []  # `warp_deform.gradcheck` is the import path of what is
 class Summary:
     """One line; None where a level does not say.
 
-    worst: largest 99th percentile of any constraint and parameter, and which these are
-    within, share, doubtful: over all comparisons, see `Row`
-    growth, cosine: by positions; of actions by place, in the rollout that counts
-    states: states, or actions
-    seldom: kinds of constraints that acted in fewer than `ENOUGH` states
+    Attributes:
+        worst: largest 99th percentile of any constraint and parameter, and which these are
+        within: over all comparisons, see `Row`
+        share: over all comparisons, see `Row`
+        doubtful: over all comparisons, see `Row`
+        growth: by positions; of actions by place, in the rollout that counts
+        cosine: as `growth`
+        states: states, or actions
+        seldom: kinds of constraints that acted in fewer than `ENOUGH` states
     """
 
     task: str

@@ -135,7 +135,9 @@ class BagShell:
 class Bag:
     """Where a bag stands in the model; particle numbers are relative to its world.
 
-    faces (T, 3): particles at the corners of its triangles; ring: its beads, around the opening
+    Attributes:
+        faces: (T, 3), particles at the corners of its triangles
+        ring: its beads, around the opening
     """
 
     config: BagConfig

@@ -110,8 +110,9 @@ class ClothConfig:
 class Cloth:
     """Where a fabric stands in the model; particle numbers are relative to its world.
 
-    faces (T, 3): particles at the corners of its triangles
-    corners: particles one cell inwards of the corners of a sheet; empty for a mesh
+    Attributes:
+        faces: (T, 3), particles at the corners of its triangles
+        corners: particles one cell inwards of the corners of a sheet; empty for a mesh
     """
 
     config: ClothConfig

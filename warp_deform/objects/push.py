@@ -17,7 +17,8 @@ MOST_PUSHES = 2
 class Push:
     """One particle is accelerated for a while.
 
-    acceleration (3,) [m/s^2] comes on top of gravity.
+    Attributes:
+        acceleration: (3,) [m/s^2], on top of gravity
     """
 
     particle: int

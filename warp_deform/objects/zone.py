@@ -19,7 +19,8 @@ _LIFT = 0.001  # [m] above the table, as the original's 1 mm high markers
 class Zone:
     """A set of flat quadrilaterals of one colour.
 
-    corners: (quads, 4, 3) in order around each quadrilateral [m].
+    Attributes:
+        corners: (quads, 4, 3) in order around each quadrilateral [m].
     """
 
     corners: np.ndarray

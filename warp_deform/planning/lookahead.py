@@ -25,9 +25,10 @@ LOOKAHEAD_REST = 1.0
 class Outlook:
     """What an action leads to.
 
-    grade: 4 solved, 3 solved but an item is not enclosed (`Task.enclosed`), 2 placed, 1 nothing
-    moved, 0 not to be trusted or the episode over without success
-    promise: of the task for the state that the action leaves; greater is better
+    Attributes:
+        grade: 4 solved, 3 solved but an item is not enclosed (`Task.enclosed`), 2 placed, 1 nothing
+            moved, 0 not to be trusted or the episode over without success
+        promise: of the task for the state that the action leaves; greater is better
     """
 
     action: Action
@@ -88,9 +89,11 @@ class Lookahead:
     ) -> list[Outlook]:
         """The outlook of every action from its state, in the order given.
 
-        keep: whether outlooks hold the state afterwards
         An outlook depends on its state and action alone. An action that the environments do not
         allow moves nothing.
+
+        Args:
+            keep: whether outlooks hold the state afterwards
         """
         outlooks: dict[int, Outlook] = {}
         space = action_space()

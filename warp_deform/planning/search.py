@@ -84,9 +84,12 @@ def search(
 ) -> list[Outlook]:
     """Outlooks tried from `state`, the best first; empty when the task has no candidate.
 
-    also: actions to try before the task's candidates, within the budget; of equals they come first
     With `depth` 2 and no first action that solves the task, the actions whose second action leads
     farthest come first, in the order of what that one leads to.
+
+    Args:
+        also: actions to try before the task's candidates, within the budget; of equals they come
+            first
     """
     deep = config.depth > 1
     spent = lookahead.rollouts

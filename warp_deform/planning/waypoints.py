@@ -64,10 +64,11 @@ class Ran:
 class Bent:
     """An action's straight path and the best one found.
 
-    path: the best; None where the straight one stayed the best, or there is none
-    before: None where the tip takes nothing, the arm does not reach, or the place is the pick
-    steps: how many had a slope that could be used, the others were drawn
-    growth: largest of the slopes that were used
+    Attributes:
+        path: the best; None where the straight one stayed the best, or there is none
+        before: None where the tip takes nothing, the arm does not reach, or the place is the pick
+        steps: how many had a slope that could be used, the others were drawn
+        growth: largest of the slopes that were used
     """
 
     path: GripPath | None

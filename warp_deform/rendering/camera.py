@@ -16,9 +16,10 @@ __all__ = ["Camera", "look_at", "paper_cameras"]
 class Camera:
     """A pinhole camera without distortion: x right, y down, z forward.
 
-    intrinsics (3, 3) [pixels]: the centre of pixel (row, column) is at v = row, u = column
-    world_T_camera (4, 4): pose of the camera in the world [m]
-    size: rows and columns of its pictures
+    Attributes:
+        intrinsics: (3, 3) [pixels], the centre of pixel (row, column) is at v = row, u = column
+        world_T_camera: (4, 4), pose of the camera in the world [m]
+        size: rows and columns of its pictures
 
     Raises:
         InputError: a matrix has another shape, is not finite, or is no pinhole without skew.
@@ -50,7 +51,8 @@ def look_at(
 ) -> Camera:
     """Camera at `eye` [m] that sees `target` [m] in the middle, the world's z axis up.
 
-    vertical_fov: opening angle from the top to the bottom of the picture [rad]
+    Args:
+        vertical_fov: opening angle from the top to the bottom of the picture [rad]
     """
     if not 0 < vertical_fov < np.pi:
         raise InputError(f"vertical_fov must be between 0 and pi, got {vertical_fov}")

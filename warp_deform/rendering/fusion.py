@@ -26,8 +26,10 @@ def fuse(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fuse the views of `cameras` into top-down pictures.
 
-    colors: per camera (H, W, 3) uint8; depths: per camera (H, W) float32 [m] along the viewing axis
-    segmentations: per camera (H, W) uint8, or None
+    Args:
+        colors: per camera (H, W, 3) uint8
+        depths: per camera (H, W) float32 [m] along the viewing axis
+        segmentations: per camera (H, W) uint8, or None
 
     Returns:
         color (320, 160, 3) uint8, height (320, 160) float32 [m] and segmentation (320, 160) uint8;

@@ -13,7 +13,10 @@ __all__ = ["Images"]
 class Images:
     """Top-down views of one state: rows are y, columns are x, 3.125 mm a pixel.
 
-    color (320, 160, 3) uint8; height (320, 160) float32 [m]; segmentation (320, 160) uint8
+    Attributes:
+        color: (320, 160, 3) uint8
+        height: (320, 160) float32 [m]
+        segmentation: (320, 160) uint8
     """
 
     color: np.ndarray

@@ -36,8 +36,10 @@ ABOVE_REACH = 0.7  # [m]
 class RGBD:
     """What one camera sees.
 
-    color (H, W, 3) uint8; depth (H, W) float32 [m] along the viewing axis, at most 10;
-    segmentation (H, W) uint8: 0 floor or nothing, 1 table, 2 robot, objects and zones from 4
+    Attributes:
+        color: (H, W, 3) uint8
+        depth: (H, W) float32, along the viewing axis, at most 10 [m]
+        segmentation: (H, W) uint8: 0 floor or nothing, 1 table, 2 robot, objects and zones from 4
     """
 
     color: np.ndarray
@@ -48,14 +50,16 @@ class RGBD:
 class Perspective:
     """Draws pinhole pictures; keeps its buffers and meshes, so make one and use it again.
 
-    look: surroundings and light; supersample: samples a pixel along both axes (colour only: depth
-    and segmentation need 1); links: whether rods are drawn between beads.
-
     An instance is for one thread at a time. Meshes are recognised by the identity of their arrays:
     hand in the same arrays for every picture, and they are uploaded once. Where a picture has the
     drawables, meshes and camera (the same objects) of the one before, only the patches that look
     different are shaded again; the bits are those of a picture drawn whole. Shadows fall within
     about a metre of the table's centre.
+
+    Args:
+        look: surroundings and light
+        supersample: samples a pixel along both axes (colour only: depth and segmentation need 1)
+        links: whether rods are drawn between beads.
     """
 
     def __init__(
@@ -99,7 +103,9 @@ class Perspective:
     ) -> list[RGBD]:
         """One picture per camera.
 
-        particle_q (P, 3) [m]; body_q (B, 7) position [m] and quat_xyzw
+        Args:
+            particle_q: positions of the particles (P, 3) [m]
+            body_q: poses of the bodies (B, 7), position [m] and quat_xyzw
 
         Raises:
             InputError: the state is not finite or has fewer particles or bodies than are drawn.

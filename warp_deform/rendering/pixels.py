@@ -34,7 +34,9 @@ SHAPE = (320, 160)
 class PixelGrid:
     """Which point of the table every pixel of a picture of `SHAPE` is centred on.
 
-    origin: x, y [m] of pixel (0, 0); pixel_size: side of a pixel [m]
+    Attributes:
+        origin: x, y [m] of pixel (0, 0)
+        pixel_size: side of a pixel [m]
     """
 
     origin: tuple[float, float]
@@ -69,8 +71,9 @@ TABLE_GRID = PixelGrid((BOUNDS[0][0], BOUNDS[1][0]), PIXEL_SIZE)
 def pixel_to_world(pixel: np.ndarray) -> np.ndarray:
     """`TABLE_GRID.to_world`.
 
-    >>> pixel_to_world(np.array([160, 80])).tolist()
-    [0.5, 0.0]
+    Examples:
+        >>> pixel_to_world(np.array([160, 80])).tolist()
+        [0.5, 0.0]
     """
     return TABLE_GRID.to_world(pixel)
 
@@ -78,7 +81,8 @@ def pixel_to_world(pixel: np.ndarray) -> np.ndarray:
 def world_to_pixel(xy: np.ndarray) -> np.ndarray:
     """`TABLE_GRID.to_pixel`.
 
-    >>> world_to_pixel(np.array([0.5, 0.0])).tolist()
-    [160, 80]
+    Examples:
+        >>> world_to_pixel(np.array([0.5, 0.0])).tolist()
+        [160, 80]
     """
     return TABLE_GRID.to_pixel(xy)

@@ -42,8 +42,9 @@ def scene_camera(size: tuple[int, int] = (720, 1280)) -> Camera:
 class ArmMeshes:
     """An arm's meshes, ready for `SceneView`: one colour a link, dark and light in turn.
 
-    meshes: (link, link_T_mesh (4, 4), trimesh.Trimesh) of everything that is drawn, as from the
-    `meshes` method of an arm; the link named "tip" is blue.
+    Args:
+        meshes: (link, link_T_mesh (4, 4), trimesh.Trimesh) of everything that is drawn, as from the
+            `meshes` method of an arm; the link named "tip" is blue.
     """
 
     def __init__(self, meshes: Sequence[tuple[str, np.ndarray, Any]]) -> None:
@@ -70,8 +71,11 @@ class ArmMeshes:
 class SceneView:
     """Draws frames for people; keeps its buffers and meshes, so make one and use it again.
 
-    size: rows and columns of a frame; camera: another view than `scene_camera` (its size wins)
-    look: surroundings and light; supersample: samples a pixel along both axes
+    Args:
+        size: rows and columns of a frame
+        camera: another view than `scene_camera` (its size wins)
+        look: surroundings and light
+        supersample: samples a pixel along both axes
     """
 
     def __init__(
@@ -106,8 +110,11 @@ class SceneView:
     ) -> np.ndarray:
         """One frame, (H, W, 3) uint8.
 
-        particle_q (P, 3) [m]; body_q (B, 7) position [m] and quat_xyzw; robot_links: vertices
-        (V, 3) [m], faces (F, 3), world_T_link (4, 4) and 8-bit colour of every link's mesh
+        Args:
+            particle_q: positions of the particles (P, 3) [m]
+            body_q: poses of the bodies (B, 7), position [m] and quat_xyzw
+            robot_links: of every link's mesh the vertices (V, 3) [m], faces (F, 3), world_T_link
+                (4, 4) and 8-bit colour
 
         Raises:
             InputError: the state is not finite or has fewer particles or bodies than are drawn.

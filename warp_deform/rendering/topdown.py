@@ -207,7 +207,9 @@ class TopDown:
     def render(self, drawables: Drawables, particle_q: np.ndarray, body_q: np.ndarray) -> Images:
         """Pictures of one world.
 
-        particle_q (P, 3) [m]; body_q (B, 7) position [m] and quat_xyzw
+        Args:
+            particle_q: positions of the particles (P, 3) [m]
+            body_q: poses of the bodies (B, 7), position [m] and quat_xyzw
 
         Raises:
             InputError: the state is not finite or has fewer particles or bodies than are drawn.

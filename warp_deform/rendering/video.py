@@ -62,8 +62,12 @@ def write_png(path: str | os.PathLike[str], color: np.ndarray) -> None:
 class VideoWriter:
     """Writes an H.264 video (yuv420p, so every player shows it), one frame in memory at a time.
 
-    path: ends with .mp4; fps: frames a second. Use it as a context manager: the file appears when
-    the block ends well, and nothing is left of it otherwise.
+    Use it as a context manager: the file appears when the block ends well, and nothing is left of
+    it otherwise.
+
+    Args:
+        path: ends with .mp4
+        fps: frames a second
 
     Raises:
         InputError: the path does not end with .mp4 or cannot be written, fps is not positive, or

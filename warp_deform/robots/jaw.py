@@ -69,8 +69,9 @@ class JawConfig:
 class JawContact:
     """What a jaw feels.
 
-    force: upwards on the hand [N]
-    width: of what lies between the fingers if they squeezed it [m]; 0 where nothing does
+    Attributes:
+        force: upwards on the hand [N]
+        width: of what lies between the fingers if they squeezed it [m]; 0 where nothing does
     """
 
     force: float
@@ -80,8 +81,9 @@ class JawContact:
 def between(local: np.ndarray, opening: float, *, radius: float, config: JawConfig) -> np.ndarray:
     """Numbers of the beads that fingers `opening` [m] apart would take, of those at `local` (n, 3).
 
-    local: centres in the hand's frame [m]; a bead counts whose centre is between the pads and
-    above their lower edge
+    Args:
+        local: centres in the hand's frame [m]; a bead counts whose centre is between the pads and
+            above their lower edge
     """
     inside = (
         (np.abs(local[:, 0]) < config.pad_length / 2)
@@ -97,8 +99,9 @@ def squeezed_width(local: np.ndarray, numbers: np.ndarray, *, radius: float) -> 
 
     A strand is as wide as a bead; strands side by side add up, strands on top of each other do not.
 
-    >>> squeezed_width(np.zeros((3, 3)), np.array([0, 1]), radius=0.5)
-    1.0
+    Examples:
+        >>> squeezed_width(np.zeros((3, 3)), np.array([0, 1]), radius=0.5)
+        1.0
     """
     if not len(numbers):
         return 0.0
@@ -115,8 +118,11 @@ def squeezed_width(local: np.ndarray, numbers: np.ndarray, *, radius: float) -> 
 class Jaw:
     """The jaw of one world: `move` tells the chain what the fingers do before the solver runs.
 
-    solver, world, chain: whose beads
-    rng: for grips that slip
+    Args:
+        solver: whose beads
+        world: whose beads
+        chain: whose beads
+        rng: for grips that slip
 
     Attributes:
         held: numbers of the beads in the grip
@@ -168,7 +174,9 @@ class Jaw:
     ) -> JawContact:
         """Bring the hand to `world_T_tcp` (4, 4) [m] within the next `steps` substeps.
 
-        opening: of the fingers at the end [m]; closing: whether they press
+        Args:
+            opening: of the fingers at the end [m]
+            closing: whether they press
         """
         pinned, self._pinned = self._pinned, np.zeros(0, int)
         self._w[self._led] = self._free[self._led]

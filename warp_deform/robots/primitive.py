@@ -88,9 +88,11 @@ LIFT = (0.04, 0.40)
 class Stage:
     """How high the tip carries what it holds [m], and how fast [m/s].
 
-    lower_speed: of the descent over the place point [m/s]; None: as fast as it carries
-    pause: rest after lifting and before lowering [s], in which what hangs from the tip calms
-    gentle: whether lift, carry and descent begin and end slowly; their mean speed is then `speed`
+    Attributes:
+        lower_speed: of the descent over the place point [m/s]; None: as fast as it carries
+        pause: rest after lifting and before lowering [s], in which what hangs from the tip calms
+        gentle: whether lift, carry and descent begin and end slowly; their mean speed is then
+            `speed`
     """
 
     lift: float
@@ -104,7 +106,10 @@ class Stage:
 class Grasp:
     """What a descending tip met first: a particle or a body, with its pose in the tip's frame.
 
-    height: of the tip at contact [m]; offset (3,) [m] and turn (4,) quat_xyzw as in `GripPath`
+    Attributes:
+        height: of the tip at contact [m]
+        offset: (3,) [m], as in `GripPath`
+        turn: (4,) quat_xyzw, as in `GripPath`
     """
 
     height: float
@@ -201,11 +206,14 @@ def carry(
 ) -> tuple[Motion, GripPath]:
     """Lift, carry and lower what `grasp` holds, then wait; the path for the solver, and the tip's.
 
-    stage: speeds and pauses
-    floor: lowest height of the tip over the place point [m], where what is held rests on the table
     A bead or a body is lowered until it meets something, a vertex of a fabric or a bag only where
     `sheet_meets` says so, else to a fixed height. The retreat to `hover` follows the release and is
     in the motion only.
+
+    Args:
+        stage: speeds and pauses
+        floor: lowest height of the tip over the place point [m], where what is held rests on the
+            table
     """
     pick, place, lift = action[:3], action[3:6], float(action[6])
     yaw = pick[2] + _half_turn(place[2] - pick[2])
@@ -246,7 +254,8 @@ def solve_joints(
 ) -> list[np.ndarray | None]:
     """Joint way-points (K, dof) of every motion, solved in one batch; None: out of reach.
 
-    postures: joint positions (dof,) [rad] from which each motion sets out
+    Args:
+        postures: joint positions (dof,) [rad] from which each motion sets out
     """
     if not motions:
         return []

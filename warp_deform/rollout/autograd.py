@@ -29,10 +29,12 @@ _KNOTS = {"way_points": "positions", "knot_times": "times", "knot_rotations": "r
 class TensorRollout:
     """Worlds (W) at times (T), as tensors of the solver's precision.
 
-    positions (W, T, P, 3) [m], velocities (W, T, P, 3) [m/s] of the particles
-    body_poses (W, T, B, 7): position [m] and quat_xyzw of the bodies' frames
-    body_velocities (W, T, B, 6): twists, linear at the centre of mass [m/s], angular [rad/s]
-    watch: the guards' values by world of the solver
+    Attributes:
+        positions: of the particles (W, T, P, 3) [m]
+        velocities: of the particles (W, T, P, 3) [m/s]
+        body_poses: of the bodies' frames (W, T, B, 7), position [m] and quat_xyzw
+        body_velocities: twists (W, T, B, 6), linear at the centre of mass [m/s], angular [rad/s]
+        watch: the guards' values by world of the solver
     """
 
     positions: torch.Tensor
@@ -82,16 +84,34 @@ def rollout_tensors(
     Derivatives are those of `DifferentiableRollout`, by every tensor that is given; their branches
     and their growth are explained there. A second derivative is refused.
 
-    positions, velocities (W, P, 3), body_poses (W, B, 7), body_velocities (W, B, 6): the start;
-    None: as the worlds are. Quaternions are of unit length, and derivatives lie along their sphere.
-    damping, table_friction, contact_friction, stiffness (W,), inverse_masses (W, P): stay set
-    paths: by world; way_points (K, 3), knot_times (K,), knot_rotations (K, 4) take the place of a
-    path's positions, times and rotations
-    storage, memory, sleep: see `Recorder`. The tape lives as long as the graph that needs it, so a
-    chain of n calls holds n of them, each of `memory` bytes at most.
-    pushes, until_rest, calm, calm_after: see `DifferentiableRollout.forward`
-
     The solver may be used for anything between this call and `backward`, which leaves it as it is.
+
+    The start is that of `positions`, `velocities`, `body_poses` and `body_velocities`; of those
+    that are None it is as the worlds are. Quaternions are of unit length, and derivatives lie along
+    their sphere. The tape lives as long as the graph that needs it, so a chain of n calls holds n
+    of them, each of `memory` bytes at most.
+
+    Args:
+        positions: of the particles at the start (W, P, 3) [m]
+        velocities: of the particles at the start (W, P, 3) [m/s]
+        body_poses: of the bodies' frames at the start (W, B, 7), position [m] and quat_xyzw
+        body_velocities: twists at the start (W, B, 6), linear [m/s], angular [rad/s]
+        damping: (W,) [1/s]; this and the next four stay set
+        table_friction: (W,)
+        contact_friction: (W,)
+        stiffness: (W,)
+        inverse_masses: (W, P) [1/kg]
+        paths: by world
+        way_points: by world (K, 3) [m], in place of the positions of its path
+        knot_times: by world (K,) [s], in place of its times
+        knot_rotations: by world (K, 4) quat_xyzw, in place of its rotations
+        storage: see `Recorder`
+        memory: see `Recorder`
+        sleep: see `Recorder`
+        pushes: see `DifferentiableRollout.forward`
+        until_rest: see `DifferentiableRollout.forward`
+        calm: see `DifferentiableRollout.forward`
+        calm_after: see `DifferentiableRollout.forward`
 
     Raises:
         InputError: tensors of other shapes than the worlds', knots of a world without a path, and

@@ -27,16 +27,23 @@ WORLD_PARAMETERS = ("damping", "table_friction", "contact_friction", "stiffness"
 class Gradients:
     """Derivatives of a loss, world by world (W) in the order in which the worlds were given.
 
-    positions, velocities (W, P, 3): by the particles at the start
-    inverse_masses (W, P): by those of free particles; what is pinned, or while it is held, has none
-    damping, table_friction, contact_friction, stiffness (W,): by the parameters of the worlds
-    body_poses (W, B, 7): by the poses of the bodies' frames at the start, position and quat_xyzw;
-    the last four along the sphere of unit quaternions
-    body_velocities (W, B, 6): by the twists there
-    body_inverse_masses (W, B): by those of free bodies at the same inertia
-    way_points, knot_times, knot_rotations: by world number, by the knots of its path (K, 3), (K,),
-    (K, 4)
-    fired (W, kinds): how often constraints of each `Kind` acted, and contacts in which branch
+    Attributes:
+        positions: (W, P, 3), by the particles at the start
+        velocities: (W, P, 3), by the particles at the start
+        inverse_masses: (W, P), by those of free particles; what is pinned, or while it is held, has
+            none
+        damping: (W,), by the parameters of the worlds
+        table_friction: (W,), by the parameters of the worlds
+        contact_friction: (W,), by the parameters of the worlds
+        stiffness: (W,), by the parameters of the worlds
+        body_poses: (W, B, 7), by the poses of the bodies' frames at the start, position and
+            quat_xyzw; the last four along the sphere of unit quaternions
+        body_velocities: (W, B, 6), by the twists there
+        body_inverse_masses: (W, B), by those of free bodies at the same inertia
+        way_points: by world number, by the positions of the knots of its path (K, 3)
+        knot_times: by world number, by their times (K,)
+        knot_rotations: by world number, by their rotations (K, 4)
+        fired: (W, kinds), how often constraints of each `Kind` acted, and contacts in which branch
     """
 
     positions: np.ndarray
@@ -67,7 +74,11 @@ class DifferentiableRollout:
     release and the like are those of the rollout, so a derivative is that of the smooth piece that
     it ran on; a derivative over many contacts may be as large as the rollout is chaotic.
 
-    storage, memory, sleep, dt: see `Recorder`. `sleep` False lets fabrics creep, not sleep.
+    Args:
+        storage: see `Recorder`
+        memory: see `Recorder`
+        sleep: see `Recorder`; False lets fabrics creep, not sleep
+        dt: length of a substep [s]; None: the solver's
     """
 
     def __init__(
@@ -111,12 +122,16 @@ class DifferentiableRollout:
         (W, T, B, 7) the poses of the bodies' frames, position and quat_xyzw, and `body_velocities`
         (W, T, B, 6) their twists.
 
-        positions (W, P, 3) [m], velocities (W, P, 3) [m/s]: the start; None: as the worlds are
-        body_poses (W, B, 7), body_velocities (W, B, 6: linear at the centre of mass, angular):
-        likewise
-        parameters: by name "damping", "table_friction", "contact_friction", "stiffness" (W,) or
-        "inverse_masses" (W, P) [1/kg]; they stay set
-        until_rest: worlds freeze once they rest, as in `rollout`; otherwise they run on
+        Args:
+            positions: of the particles at the start (W, P, 3) [m]; None: as the worlds are
+            velocities: of the particles at the start (W, P, 3) [m/s]; None: as the worlds are
+            body_poses: of the bodies' frames at the start (W, B, 7), position [m] and quat_xyzw;
+                None: as the worlds are
+            body_velocities: twists at the start (W, B, 6), linear at the centre of mass [m/s],
+                angular [rad/s]; None: as the worlds are
+            parameters: by name "damping", "table_friction", "contact_friction", "stiffness" (W,) or
+                "inverse_masses" (W, P) [1/kg]; they stay set
+            until_rest: worlds freeze once they rest, as in `rollout`; otherwise they run on
 
         Raises:
             InputError: worlds of several topologies, times that do not ascend, too little memory.
@@ -204,8 +219,10 @@ class DifferentiableRollout:
         """Derivatives of a loss from those by the positions (W, T, P, 3) and the velocities at the
         times of `forward`. May be called again with others.
 
-        bodies (W, T, B, 7), body_velocities (W, T, B, 6): the same by `body_poses` and by twists;
-        what is across the sphere of unit quaternions does not count
+        Args:
+            bodies: derivatives by `body_poses` (W, T, B, 7); what is across the sphere of unit
+                quaternions does not count
+            body_velocities: derivatives by the twists (W, T, B, 6)
         """
         given = {"particles.x": positions, "particles.v": velocities}
         cotangents: dict[int, dict[str, np.ndarray]] = {}
@@ -333,10 +350,12 @@ def substep_vjp(
 ) -> Gradients:
     """One substep of `worlds` as they are, and derivatives back through it.
 
-    positions, velocities (W, P, 3): derivatives of a loss by those after the substep
-    options: as in `DifferentiableRollout.forward`, for example paths
-
     The worlds are left after the substep.
+
+    Args:
+        positions: (W, P, 3), derivatives of a loss by those after the substep
+        velocities: (W, P, 3), as `positions`
+        **options: as in `DifferentiableRollout.forward`, for example paths
     """
     run = DifferentiableRollout(solver, storage="full", sleep=sleep)
     run.forward(worlds, [solver.config.dt], **options)

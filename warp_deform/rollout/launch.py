@@ -26,10 +26,16 @@ _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 class GripPath:
     """A tip that holds one particle or body and lets it go at the end of its path.
 
-    times (K,) [s] ascending from 0; positions (K, 3) [m] and rotations (K, 4) quat_xyzw of the tip
-    particle or body: local number of what is held
-    offset (3,) [m], turn (4,): pose of what is held (a body: its centre of mass) in the tip's frame
-    lower: between these two times contact ends the descent, and the rest of the path stays there
+    Attributes:
+        times: of the knots (K,) [s], ascending from 0
+        positions: of the tip (K, 3) [m]
+        particle: local number of the particle that is held
+        body: local number of the body that is held
+        rotations: of the tip (K, 4) quat_xyzw
+        offset: of what is held (a body: its centre of mass) in the tip's frame (3,) [m]
+        turn: of what is held in the tip's frame (4,) quat_xyzw
+        lower: between these two times [s] contact ends the descent, and the rest of the path stays
+            there
     """
 
     times: np.ndarray
@@ -98,15 +104,17 @@ def rollout(
 ) -> dict[int, Rollout]:
     """Run `worlds` until each has followed its path and come to rest; others keep their state.
 
-    least: a world runs at least so long after its path [s]; most: and at most so long in all [s]
-    calm: speeds are clamped to `calm_speed` for so long from the start, `calm_after`: after a
-    release
-    record: interval of recorded frames [s]; 0 records nothing
-
     Durations are rounded to whole substeps; `Rollout.seconds` and `Frames.times` are what was
     simulated.
 
     A world's result does not depend on which other worlds run with it.
+
+    Args:
+        least: a world runs at least so long after its path [s]
+        most: and at most so long in all [s]
+        calm: speeds are clamped to `calm_speed` for so long from the start, `calm_after`: after a
+            release
+        record: interval of recorded frames [s]; 0 records nothing
     """
     dt = solver.config.dt
     longest = prepare(
@@ -146,7 +154,8 @@ def prepare(
 ) -> int:
     """Set a rollout up without running it, see `rollout`; returns its substeps at most.
 
-    dt: length of a substep [s]; None: the solver's
+    Args:
+        dt: length of a substep [s]; None: the solver's
     """
     data, dt = solver.data, dt or solver.config.dt
     for w in worlds:

@@ -37,7 +37,8 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
     ignored, contacts are found in the kernel. The state in `newton.State` is float32 whatever the
     solver's precision.
 
-    Example:
+    For example:
+
         builder = newton.ModelBuilder()
         config = CableConfig()
         add_cable(builder, config, cable_line(config, (0.5, -0.2), (0.5, 0.2)))

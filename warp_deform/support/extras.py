@@ -8,7 +8,8 @@ __all__ = ["install_extra"]
 def install_extra(extra: str) -> str:
     """The command that installs an extra of pyproject.toml, to be run in a clone's folder.
 
-    >>> install_extra("ray")
-    "pip install -c constraints.txt -e '.[ray]'"
+    Examples:
+        >>> install_extra("ray")
+        "pip install -c constraints.txt -e '.[ray]'"
     """
     return f"pip install -c constraints.txt -e '.[{extra}]'"

@@ -161,8 +161,9 @@ def _shown(what: str, total: int, done: int, unit: str) -> Iterator[Advance]:
 def duration(seconds: float) -> str:
     """Seconds in a form to read.
 
-    >>> [duration(s) for s in (0.4, 42, 119.6, 3599, 4 * 3600 + 130)]
-    ['0 s', '42 s', '2 min', '1 h 0 min', '4 h 2 min']
+    Examples:
+        >>> [duration(s) for s in (0.4, 42, 119.6, 3599, 4 * 3600 + 130)]
+        ['0 s', '42 s', '2 min', '1 h 0 min', '4 h 2 min']
     """
     if seconds < 99.5:
         return f"{seconds:.0f} s"

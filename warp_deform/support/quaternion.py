@@ -26,8 +26,9 @@ __all__ = [
 def quat_from_yaw(yaw: np.ndarray | float) -> np.ndarray:
     """Turns (..., 4) about the vertical axis by `yaw` (...) [rad].
 
-    >>> quat_from_yaw(np.pi).round(3).tolist()
-    [0.0, 0.0, 1.0, 0.0]
+    Examples:
+        >>> quat_from_yaw(np.pi).round(3).tolist()
+        [0.0, 0.0, 1.0, 0.0]
     """
     sine, cosine = np.sin(np.asarray(yaw) / 2), np.cos(np.asarray(yaw) / 2)
     return np.stack([np.zeros_like(sine), np.zeros_like(sine), sine, cosine], axis=-1)
@@ -36,8 +37,9 @@ def quat_from_yaw(yaw: np.ndarray | float) -> np.ndarray:
 def quat_yaw(quat_xyzw: np.ndarray) -> np.ndarray:
     """Yaws (...) [rad, -pi to pi] of rotations (..., 4): the last of x-y-z Euler angles.
 
-    >>> float(quat_yaw(quat_from_yaw(0.4)).round(6))
-    0.4
+    Examples:
+        >>> float(quat_yaw(quat_from_yaw(0.4)).round(6))
+        0.4
     """
     x, y, z, w = np.moveaxis(np.asarray(quat_xyzw, dtype=float), -1, 0)
     yaw: np.ndarray = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

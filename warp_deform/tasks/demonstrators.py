@@ -70,7 +70,10 @@ def best_map(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The map of least mean distance (n,), and the distance to each target under it (n,) [m].
 
-    beads, targets (n, 3) [m]; maps (m, n) as from `ring_maps`.
+    Args:
+        beads: (n, 3) [m]
+        targets: (n, 3) [m]
+        maps: (m, n), as from `ring_maps`
     """
     distances = np.linalg.norm(beads[:, None] - targets, axis=-1)  # bead, target
     mapped = distances[maps, np.arange(len(targets))]
@@ -81,7 +84,10 @@ def best_map(
 def farthest_bead(beads: np.ndarray, targets: np.ndarray, maps: np.ndarray) -> tuple[int, int]:
     """Bead and target farthest apart under the map of least mean distance; of equals the first.
 
-    beads, targets (n, 3) [m]; maps (m, n) as from `ring_maps`.
+    Args:
+        beads: (n, 3) [m]
+        targets: (n, 3) [m]
+        maps: (m, n), as from `ring_maps`
     """
     bead_of, distances = best_map(beads, targets, maps)
     target = int(np.argmax(distances))

@@ -19,8 +19,9 @@ _PIXELS = pixel_to_world(np.moveaxis(np.indices(SHAPE), 0, -1))
 def square_corners(pose: np.ndarray, side: float) -> np.ndarray:
     """Corners (4, 2) [m] of a square, in the order of `ClothConfig.inner_corners`.
 
-    >>> square_corners(np.array([0.5, 0.0, 0.0]), 0.2).round(3).tolist()
-    [[0.4, -0.1], [0.4, 0.1], [0.6, 0.1], [0.6, -0.1]]
+    Examples:
+        >>> square_corners(np.array([0.5, 0.0, 0.0]), 0.2).round(3).tolist()
+        [[0.4, -0.1], [0.4, 0.1], [0.6, 0.1], [0.6, -0.1]]
     """
     return to_world(_UNIT_SQUARE * side / 2, pose)
 

@@ -73,8 +73,9 @@ def _is_run(run: object) -> bool:
 def row_kinds(rows: Rows) -> np.ndarray:
     """Kind of every row (n,), as objects.
 
-    >>> row_kinds(((Row.POSE, 1), (Row.POINT, 2))).tolist()
-    [<Row.POSE: 'pose'>, <Row.POINT: 'point'>, <Row.POINT: 'point'>]
+    Examples:
+        >>> row_kinds(((Row.POSE, 1), (Row.POINT, 2))).tolist()
+        [<Row.POSE: 'pose'>, <Row.POINT: 'point'>, <Row.POINT: 'point'>]
     """
     kinds = np.empty(row_count(rows), dtype=object)
     kinds[:] = [kind for kind, count in rows for _ in range(count)]
@@ -89,8 +90,9 @@ def rows_of(kinds: np.ndarray, wanted: Sequence[Row]) -> np.ndarray:
 def yaw_columns(rows: Rows) -> tuple[int, ...]:
     """Where in a ground truth -yaw / 15 of rigid bodies and zones stand.
 
-    >>> yaw_columns(((Row.POINT, 1), (Row.POSE, 2)))
-    (5, 8)
+    Examples:
+        >>> yaw_columns(((Row.POINT, 1), (Row.POSE, 2)))
+        (5, 8)
     """
     return tuple(int(3 * row + 2) for row in np.flatnonzero(rows_of(row_kinds(rows), [Row.POSE])))
 

@@ -18,7 +18,8 @@ __all__ = ["cover_distance", "grid_maps", "mean_distance", "ring_area"]
 def mean_distance(points: Tensor, targets: np.ndarray, maps: np.ndarray) -> Tensor:
     """Mean distance () [m] of `points` (n, d) from `targets` (n, d) under the best of the maps.
 
-    maps (m, n): entry j of a map is the point for target j
+    Args:
+        maps: (m, n), entry j of a map is the point for target j
     """
     import torch
 
@@ -41,7 +42,8 @@ def ring_area(beads: Tensor) -> Tensor:
 def cover_distance(vertices: Tensor, points: Tensor, softness: float) -> Tensor:
     """Mean over `points` (n, 2) [m] of the soft distance to the nearest of `vertices` (v, 3).
 
-    softness: distances that differ by less [m] count alike
+    Args:
+        softness: distances that differ by less [m] count alike
     """
     import torch
 

@@ -26,10 +26,11 @@ def hull_area(points: np.ndarray) -> float:
     Fewer than three different points, or points on a line, span 0; a point that is not finite makes
     the area nan, which is above no threshold. Source: Andrew's monotone chain.
 
-    >>> hull_area(np.array([[0, 0], [2, 0], [2, 1], [0, 1], [1, 0.5]]))
-    2.0
-    >>> hull_area(np.array([[0, 0], [1, 1], [2, 2]]))
-    0.0
+    Examples:
+        >>> hull_area(np.array([[0, 0], [2, 0], [2, 1], [0, 1], [1, 0.5]]))
+        2.0
+        >>> hull_area(np.array([[0, 0], [1, 1], [2, 2]]))
+        0.0
     """
     points = np.asarray(points, dtype=float).reshape(-1, 2)
     if not np.isfinite(points).all():
@@ -60,8 +61,9 @@ def share_in_zone(points: np.ndarray, targets: np.ndarray, tolerance: float) -> 
 
     A point that is not finite is not in the zone.
 
-    >>> share_in_zone(np.array([[0.0, 0.0], [0.0, 1.0]]), np.array([[0.01, 0.0]]), 0.02)
-    0.5
+    Examples:
+        >>> share_in_zone(np.array([[0.0, 0.0], [0.0, 1.0]]), np.array([[0.01, 0.0]]), 0.02)
+        0.5
     """
     offsets = np.asarray(points, dtype=float)[:, None, :2] - np.asarray(targets, dtype=float)[None]
     nearest = np.linalg.norm(offsets, axis=-1).min(axis=1)
@@ -71,8 +73,9 @@ def share_in_zone(points: np.ndarray, targets: np.ndarray, tolerance: float) -> 
 def mask_iou(a: np.ndarray, b: np.ndarray) -> float:
     """Intersection over union of two masks of one shape; 0 when both are empty.
 
-    >>> mask_iou(np.array([1, 1, 0]), np.array([0, 1, 1]))
-    0.3333333333333333
+    Examples:
+        >>> mask_iou(np.array([1, 1, 0]), np.array([0, 1, 1]))
+        0.3333333333333333
     """
     a, b = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
     union = np.count_nonzero(a | b)
@@ -82,8 +85,9 @@ def mask_iou(a: np.ndarray, b: np.ndarray) -> float:
 def coverage(mask: np.ndarray, target: np.ndarray) -> float:
     """Share of `target` that `mask` covers (masks of one shape); 0 when the target is empty.
 
-    >>> coverage(np.array([1, 1, 0]), np.array([0, 1, 1]))
-    0.5
+    Examples:
+        >>> coverage(np.array([1, 1, 0]), np.array([0, 1, 1]))
+        0.5
     """
     mask, target = np.asarray(mask, dtype=bool), np.asarray(target, dtype=bool)
     size = np.count_nonzero(target)
@@ -93,9 +97,10 @@ def coverage(mask: np.ndarray, target: np.ndarray) -> float:
 def pose_error(pose: np.ndarray, target: np.ndarray) -> tuple[float, float]:
     """Distance [m] and least turn [rad, 0 to pi] between two planar poses (3,) x, y [m], yaw [rad].
 
-    >>> distance, turn = pose_error(np.array([0.3, 0.0, 0.1]), np.array([0.3, 0.4, 2 * np.pi]))
-    >>> round(distance, 6), round(turn, 6)
-    (0.4, 0.1)
+    Examples:
+        >>> distance, turn = pose_error(np.array([0.3, 0.0, 0.1]), np.array([0.3, 0.4, 2 * np.pi]))
+        >>> round(distance, 6), round(turn, 6)
+        (0.4, 0.1)
     """
     x, y, yaw = np.subtract(pose, target)
     return float(np.hypot(x, y)), abs(wrap_angle(yaw))

@@ -114,8 +114,9 @@ def all_tasks() -> tuple[dict[str, type[Task]], list[str]]:
 def task(name: str, *, recorded: str | None = None) -> Task:
     """The task called `name`.
 
-    recorded: class of the task, `task_name`, where a recording says so; it is only told, since
-        code is never imported because a file says so
+    Args:
+        recorded: class of the task, `task_name`, where a recording says so; it is only told, since
+            code is never imported because a file says so
 
     Raises:
         InputError: there is none; the message says which name is nearest, and where it was from.

@@ -87,8 +87,9 @@ def sample_shape(rng: np.random.Generator, sides: tuple[int, ...], beads: int) -
 def to_world(points: np.ndarray, frame: np.ndarray) -> np.ndarray:
     """Points (n, 2) [m] of the planar `frame` (3,) x, y [m], yaw [rad], in the world.
 
-    >>> to_world(np.array([[1.0, 0.0]]), np.array([0.5, 0.0, np.pi / 2])).round(6).tolist()
-    [[0.5, 1.0]]
+    Examples:
+        >>> to_world(np.array([[1.0, 0.0]]), np.array([0.5, 0.0, np.pi / 2])).round(6).tolist()
+        [[0.5, 1.0]]
     """
     x, y, yaw = frame
     c, s = np.cos(yaw), np.sin(yaw)
@@ -98,8 +99,10 @@ def to_world(points: np.ndarray, frame: np.ndarray) -> np.ndarray:
 def chain_yaw(points: np.ndarray, *, closed: bool) -> np.ndarray:
     """Angle (n,) [rad] of a chain's tangent at each of its `points` (n, 2 or 3) [m].
 
-    >>> chain_yaw(np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]]), closed=False).round(3).tolist()
-    [1.571, 1.571, 1.571]
+    Examples:
+        >>> points = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]])
+        >>> chain_yaw(points, closed=False).round(3).tolist()
+        [1.571, 1.571, 1.571]
     """
     xy = np.asarray(points, dtype=float)[:, :2]
     if closed:

@@ -74,8 +74,9 @@ class Grasp:
 def wrap_half_turn(angle: float) -> float:
     """The same line within (-pi/2, pi/2] [rad]: a parallel jaw looks the same turned by pi.
 
-    >>> round(wrap_half_turn(0.6 * math.pi) / math.pi, 6)
-    -0.4
+    Examples:
+        >>> round(wrap_half_turn(0.6 * math.pi) / math.pi, 6)
+        -0.4
     """
     wrapped = math.remainder(angle, math.pi)
     return math.pi / 2 if wrapped <= -math.pi / 2 else wrapped

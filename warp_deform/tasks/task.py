@@ -49,17 +49,21 @@ Action = np.ndarray
 class Layout:
     """One sampled start of an episode.
 
-    particle_q (P, 3) [m] and body_q (B, 7) position [m] and quat_xyzw, before settling
-    targets: what the task aims at; shape and meaning are the task's ((n, 2) points or a pose)
-    configs: by their number, objects whose config differs from the task's in this episode: the
-        colour of a bag, colour, size and mass of a body that is one box
-    frame: pose (3,) x, y [m], yaw [rad] in which the targets were laid out, where a task needs it
-    zones: marks that are drawn
-    pushes: perturbations that follow the start, at most `MOST_PUSHES`
-    calm: start by damping (speeds clamped for a moment) instead of falling freely; for layouts
-        that are constructed at rest, such as goals
-    physics: those of `PHYSICS` that differ from the task's in this episode
-    look: how pictures of this episode depart from the truth, where the task draws masks
+    Attributes:
+        particle_q: positions of the particles before settling (P, 3) [m]
+        body_q: poses of the bodies before settling (B, 7), position [m] and quat_xyzw
+        targets: what the task aims at; shape and meaning are the task's ((n, 2) points or a pose)
+        zones: marks that are drawn
+        pushes: perturbations that follow the start, at most `MOST_PUSHES`
+        settle_seconds: how long the objects settle at least [s]
+        calm: start by damping (speeds clamped for a moment) instead of falling freely; for layouts
+            that are constructed at rest, such as goals
+        frame: pose (3,) x, y [m], yaw [rad] in which the targets were laid out, where a task needs
+            it
+        configs: by their number, objects whose config differs from the task's in this episode: the
+            colour of a bag, colour, size and mass of a body that is one box
+        physics: those of `PHYSICS` that differ from the task's in this episode
+        look: how pictures of this episode depart from the truth, where the task draws masks
     """
 
     particle_q: np.ndarray
@@ -83,8 +87,13 @@ class Layout:
 class Snapshot:
     """State of one world at rest between two actions.
 
-    particle_q, particle_qd (P, 3) [m], [m/s]; body_q (B, 7) position and quat_xyzw of the body's
-    frame; body_qd (B, 6) linear, angular velocity. `images` renders on first use.
+    `images` renders on first use.
+
+    Attributes:
+        particle_q: positions of the particles (P, 3) [m]
+        particle_qd: velocities of the particles (P, 3) [m/s]
+        body_q: poses of the bodies' frames (B, 7), position [m] and quat_xyzw
+        body_qd: velocities of the bodies (B, 6), linear [m/s], angular [rad/s]
     """
 
     particle_q: np.ndarray
@@ -163,8 +172,11 @@ class Task(abc.ABC):
     def privileged_stage(self, segment: int, snapshot: Snapshot, previous: Stage | None) -> Stage:
         """Stage of a pick on what has the segmentation id `segment`, by the paper's hidden rule.
 
-        snapshot: the state before the action; previous: the episode's stage before, None at first.
         A task with one stage needs no rule; one with several states its own here.
+
+        Args:
+            snapshot: the state before the action
+            previous: the episode's stage before, None at first
         """
         if len(self.stages) > 1:
             raise TypeError(f"{self.name} has {len(self.stages)} stages and no rule between them")
@@ -256,8 +268,11 @@ class Task(abc.ABC):
     ) -> Tensor:
         """A smooth measure () of what is left to do after an action from `snapshot`.
 
-        particle_q (P, 3) [m], body_q (B, 7): the state the action leaves; only for tasks that say
-        so are there gradients to plan by.
+        Only for tasks that define it are there gradients to plan by.
+
+        Args:
+            particle_q: positions of the particles that the action leaves (P, 3) [m]
+            body_q: poses of the bodies that it leaves (B, 7)
         """
         raise TypeError(f"{self.name} has no loss to differentiate")
 

@@ -95,8 +95,10 @@ class RunningEpisode:
 class StepReport:
     """What one action did.
 
-    motions and joints: the tip's way-points and the arm's, of the approach and of the carry
-    frames: recorded states, when asked for, at times from the beginning of the action
+    Attributes:
+        motions: the tip's way-points, of the approach and of the carry
+        joints: the arm's way-points, of both
+        frames: recorded states, when asked for, at times from the beginning of the action
     """
 
     outcome: Outcome
@@ -146,7 +148,8 @@ class Plan:
 class Carry:
     """How a tip carries what it has taken: called with an action, it tells the motion and the path.
 
-    radii (P,): of the world's particles [m]
+    Attributes:
+        radii: (P,), of the world's particles [m]
     """
 
     grasp: Grasp

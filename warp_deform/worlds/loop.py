@@ -33,8 +33,11 @@ SOLVED = "solved"
 class Run(Generic[Row]):
     """One episode as it goes.
 
-    rows: what `look` returned at the start and after every action
-    actions (7,) each, and what became of them; ended: why the episode is over, None while it runs
+    Attributes:
+        rows: what `look` returned at the start and after every action
+        actions: (7,) each
+        outcomes: what became of them
+        ended: why the episode is over, None while it runs
     """
 
     seed: int
@@ -78,10 +81,12 @@ def play(
     yielded episode until the iteration goes on. Neither the order of seeds nor the number of slots
     changes an episode.
 
-    look: called with a slot at the start and after every action of an episode whose physics holds
-    goals: the goal of a seed, None to construct it
-    until_solved: end episodes that are solved, over by their task's rules (`Task.ended`), or have
-        used up their actions; else `act` alone ends them
+    Args:
+        look: called with a slot at the start and after every action of an episode whose physics
+            holds
+        goals: the goal of a seed, None to construct it
+        until_solved: end episodes that are solved, over by their task's rules (`Task.ended`), or
+            have used up their actions; else `act` alone ends them
     """
     waiting = iter(seeds)
     free = list(range(worlds.count))

@@ -20,10 +20,14 @@ class WorldState:
     Arrays have the solver's precision. Nothing else lasts between two launches: contacts are found
     anew and nothing is held.
 
-    particle_q, particle_qd (P, 3) [m], [m/s]
-    body_x (B, 3) centres of mass [m]; body_quat (B, 4) quat_xyzw; body_v (B, 3) [m/s];
-    body_omega (B, 3) [rad/s]
-    episode: seed, layout, goal, actions, tip, posture and the like
+    Attributes:
+        particle_q: positions of the particles (P, 3) [m]
+        particle_qd: their velocities (P, 3) [m/s]
+        body_x: centres of mass (B, 3) [m]
+        body_quat: turns of the bodies (B, 4) quat_xyzw
+        body_v: their velocities (B, 3) [m/s]
+        body_omega: their angular velocities (B, 3) [rad/s]
+        episode: seed, layout, goal, actions, tip, posture and the like
     """
 
     particle_q: np.ndarray

@@ -62,9 +62,15 @@ class Worlds:
         reports = worlds.step({slot: action, ...})
         worlds.episodes[slot].snapshot.images.color
 
-    robot: "ur5" or "panda"; lanes, precision, bundles: see `SolverFusedXPBD`; rest_limit: a world
-    that does not rest is looked at so long after its path or settling time [s]. Starts that already
-    solve the task, or leave the table, are drawn again and counted.
+    Starts that already solve the task, or leave the table, are drawn again and counted.
+
+    Args:
+        robot: "ur5" or "panda"
+        lanes: see `SolverFusedXPBD`
+        precision: see `SolverFusedXPBD`
+        bundles: see `SolverFusedXPBD`
+        rest_limit: a world that does not rest is looked at so long after its path or settling time
+            [s]
     """
 
     def __init__(
@@ -250,8 +256,9 @@ class Worlds:
     ) -> dict[int, StepReport]:
         """Run one pick-and-place in every named slot and let the worlds come to rest.
 
-        actions: (7,) each, pick x, y [m], yaw [rad], place x, y, yaw, lift [m]; finite.
-        record: interval of recorded frames [s]; 0 records nothing.
+        Args:
+            actions: (7,) each, pick x, y [m], yaw [rad], place x, y, yaw, lift [m]; finite
+            record: interval of recorded frames [s]; 0 records nothing.
         """
         plans = {slot: self._checked(slot, action) for slot, action in actions.items()}
         if self.task.jaw is None:
