@@ -69,8 +69,7 @@ class Worlds:
         lanes: see `SolverFusedXPBD`
         precision: see `SolverFusedXPBD`
         bundles: see `SolverFusedXPBD`
-        rest_limit: a world that does not rest is looked at so long after its path or settling time
-            [s]
+        rest_limit: longest wait for rest after a path or a settling time [s]
     """
 
     def __init__(
@@ -113,8 +112,6 @@ class Worlds:
     def _waiting_tip(self) -> np.ndarray:
         """Above the middle of the table (4,) x, y, z [m], yaw [rad]."""
         return np.array([0.5, 0.0, self.robot.hover_height(0.5, 0.0, self.task.primitive.hover), 0])
-
-    # -- starting
 
     def reset(self, seeds: Mapping[int, int], *, goals: Mapping[int, Goal] | None = None) -> None:
         """Start an episode with the given seed in every named slot.
@@ -249,8 +246,6 @@ class Worlds:
         inside = (points >= (x0, y0)).all() and (points <= (x1, y1)).all()
         return bool(inside) and self.task.acceptable(episode.layout, snapshot)
 
-    # -- acting
-
     def step(
         self, actions: Mapping[int, np.ndarray], *, record: float = 0.0
     ) -> dict[int, StepReport]:
@@ -362,8 +357,6 @@ class Worlds:
             else:
                 self.episodes[slot].posture = q[-1]
         return [slot for slot, q in zip(motions, joints, strict=True) if q is not None]
-
-    # -- looking
 
     def _look(self, slot: int) -> None:
         """Take a snapshot of a slot's state."""
