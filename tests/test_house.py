@@ -45,7 +45,7 @@ def test_text_holds_no_machine_path_and_nothing_undone(path: Path) -> None:
 
 def test_readme_is_short() -> None:
     for readme in ROOT.glob("README.md"):
-        assert len(readme.read_text().splitlines()) <= 150
+        assert len(readme.read_text().splitlines()) <= 120
 
 
 def test_constraints_pin_versions_and_name_no_host() -> None:
