@@ -41,6 +41,7 @@ __all__ = [
     "UnreachablePose",
     "UserStopped",
     "check_joints",
+    "check_line",
     "check_number",
     "check_pose",
     "check_range",
@@ -391,6 +392,21 @@ def check_pose(base_T_tcp: np.ndarray) -> np.ndarray:
     if not (rigid and np.linalg.det(R) > 0.0 and np.array_equal(T[3], [0, 0, 0, 1])):
         raise InputError("base_T_tcp: not a rigid transform; its rotation must be orthonormal")
     return T
+
+
+def check_line(
+    base_T_tcp: np.ndarray,
+    *,
+    speed: float,
+    stop_force_N: float | None = None,
+    most_force_N: float = np.inf,
+) -> np.ndarray:
+    """Return the target of a straight line as `check_pose` does; InputError, too, of the others."""
+    target = check_pose(base_T_tcp)
+    check_range("speed", speed, low=0.0, high=1.7, unit="m/s")
+    if stop_force_N is not None:
+        check_range("stop_force_N", stop_force_N, low=0.0, high=most_force_N, unit="N")
+    return target
 
 
 def check_range(name: str, value: float, *, low: float, high: float, unit: str) -> float:

@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 
 from ..arm.panda import GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
-from ..arm.robot import MoveResult, RobotMode, RobotState, check_joints, check_pose, check_range
+from ..arm.robot import (
+    MoveResult,
+    RobotMode,
+    RobotState,
+    check_joints,
+    check_line,
+    check_range,
+)
 from ..arm.stop_latch import StopLatch
 from ..arm.straight_line import straight_line
 from ..support.closing import Closing
@@ -98,8 +105,7 @@ class DryRunRobot(Closing):
         self, base_T_tcp: np.ndarray, *, speed: float, stop_force_N: float | None = None
     ) -> MoveResult:
         """Plan a straight line as the arm would, and record it; see `Robot.move_linear`."""
-        target = check_pose(base_T_tcp)
-        check_range("speed", speed, low=0.0, high=1.7, unit="m/s")
+        target = check_line(base_T_tcp, speed=speed)
         self._latch.check()
         plan = straight_line(self._kinematics, self._q, target, speed=speed)
         self._record("move_linear", base_T_tcp=target, speed=speed, stop_force_N=stop_force_N)

@@ -37,7 +37,7 @@ from ..arm.robot import (
     RobotState,
     UnreachablePose,
     check_joints,
-    check_pose,
+    check_line,
     check_range,
 )
 from ..arm.stop_latch import StopLatch
@@ -218,12 +218,10 @@ class FrankapyRobot(Closing):
         self, base_T_tcp: np.ndarray, *, speed: float, stop_force_N: float | None = None
     ) -> MoveResult:
         """Move the TCP in a straight line; see `Robot.move_linear`."""
-        target = check_pose(base_T_tcp)
-        check_range("speed", speed, low=0.0, high=1.7, unit="m/s")
+        high = self.config.collision_force_N
+        target = check_line(base_T_tcp, speed=speed, stop_force_N=stop_force_N, most_force_N=high)
         limits = None
         if stop_force_N is not None:
-            high = self.config.collision_force_N
-            check_range("stop_force_N", stop_force_N, low=0.0, high=high, unit="N")
             # torques are not what a descent should feel
             limits = [stop_force_N] * 3 + [high] * 3
         far, turned = distance(self.state().base_T_tcp, target)

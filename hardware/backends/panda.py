@@ -24,7 +24,7 @@ from ..arm.robot import (
     RobotState,
     UserStopped,
     check_joints,
-    check_pose,
+    check_line,
     check_range,
 )
 from ..arm.straight_line import distance, straight_line
@@ -111,15 +111,13 @@ class PandaRobot(Closing):
         `stop_force_N` becomes the robot's own collision threshold, which it watches at 1 kHz; the
         reflex that ends the motion is recovered from at once.
         """
-        target = check_pose(base_T_tcp)
-        check_range("speed", speed, low=0.0, high=1.7, unit="m/s")
+        high = self.config.collision_force_N
+        target = check_line(base_T_tcp, speed=speed, stop_force_N=stop_force_N, most_force_N=high)
         plan = straight_line(self, np.array(self._ready().q), target, speed=speed)
         contact = False
         if stop_force_N is None:
             self._move(plan.q, plan.speed_factor, target)
         else:
-            limit = self.config.collision_force_N
-            check_range("stop_force_N", stop_force_N, low=0.0, high=limit, unit="N")
             contact = self._move_until(stop_force_N, plan.q, plan.speed_factor, target)
         return MoveResult(np.array(self._link.read().O_T_EE).reshape(4, 4).T, contact)
 

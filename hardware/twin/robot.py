@@ -22,7 +22,7 @@ from ..arm.robot import (
     RobotMode,
     RobotState,
     check_joints,
-    check_pose,
+    check_line,
     check_range,
 )
 from ..arm.stop_latch import StopLatch
@@ -98,11 +98,8 @@ class SimRobot(Closing):
         self, base_T_tcp: np.ndarray, *, speed: float, stop_force_N: float | None = None
     ) -> MoveResult:
         """Move the TCP in a straight line; see `Robot.move_linear`."""
-        target = check_pose(base_T_tcp)
-        check_range("speed", speed, low=0.0, high=1.7, unit="m/s")
-        if stop_force_N is not None:
-            high = self.config.collision_force_N
-            check_range("stop_force_N", stop_force_N, low=0.0, high=high, unit="N")
+        high = self.config.collision_force_N
+        target = check_line(base_T_tcp, speed=speed, stop_force_N=stop_force_N, most_force_N=high)
         self._check_ready()
         plan = straight_line(self._arm, self._q, target, speed=speed)
         contact = self._move(plan.q, plan.speed_factor, stop_force_N)

@@ -17,7 +17,7 @@ from ..objects.scene_object import SceneObject
 from ..support.quaternion import quat_from_yaw, quat_yaw
 from .bag_opening import BAG_ROWS, BagTask
 from .bag_physics import INSERT, OPEN
-from .free_space import FreeSpace, NoFreeSpace
+from .free_space import FreeSpace, first_that_fits
 from .ground_truth import Row, pose_rows
 from .task import Action, Layout, Snapshot, Stage
 
@@ -33,7 +33,6 @@ _PATIENCE = 6
 """Actions for which the scripted demonstrator waits for that room; two are left to insert."""
 _PATIENCE_VISIBLE = 3
 """The same of the visible demonstrator."""
-_TRIES = 50
 _GOAL_SETTLE_SECONDS = 1.0
 
 
@@ -74,7 +73,7 @@ class BagColorGoal(BagTask):
     def sample(self, rng: np.random.Generator, space: FreeSpace) -> Layout:
         """Two bags of different colours about to fall, and a block of any of the colours."""
         target, other = rng.choice(len(COLORS), 2, replace=False)
-        return self._sample(rng, space, None, int(target), int(other))
+        return first_that_fits(lambda: self._draw(rng, space, None, int(target), int(other)))
 
     def sample_for_goal(
         self, rng: np.random.Generator, space: FreeSpace, targets: np.ndarray
@@ -83,23 +82,9 @@ class BagColorGoal(BagTask):
         x, y, color = targets[0]
         others = [n for n in range(len(COLORS)) if n != int(color)]
         other = others[rng.integers(len(others))]
-        layout = self._sample(rng, space, (float(x), float(y)), int(color), other)
+        place = float(x), float(y)
+        layout = first_that_fits(lambda: self._draw(rng, space, place, int(color), other))
         return layout.with_targets(targets)
-
-    def _sample(
-        self,
-        rng: np.random.Generator,
-        space: FreeSpace,
-        place: tuple[float, float] | None,
-        color: int,
-        other: int,
-    ) -> Layout:
-        for _ in range(_TRIES - 1):
-            try:
-                return self._draw(rng, space, place, color, other)
-            except NoFreeSpace:
-                continue
-        return self._draw(rng, space, place, color, other)
 
     def _draw(
         self,

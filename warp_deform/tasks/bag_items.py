@@ -20,7 +20,7 @@ from ..support.quaternion import quat_from_yaw, quat_yaw
 from .bag_opening import BAG_ROWS, BagTask
 from .bag_physics import CARRY, INSERT, OPEN
 from .demonstrators import pick_place
-from .free_space import FreeSpace, NoFreeSpace
+from .free_space import FreeSpace, first_that_fits
 from .ground_truth import Row, pose_rows
 from .past import PastAction
 from .shapes import to_world
@@ -37,7 +37,6 @@ _INNER = 0.13  # [m] what is nearer to the zone's centre along both of its axes 
 _ZONE_HEIGHT = (-0.01, 0.28)
 _ROOM = 0.025  # [m] that an item needs beyond its size
 _ROOM_SECOND = 0.015  # [m] the same where another item is in the bag
-_TRIES = 50  # draws of a whole layout; a zone in the way leaves no room in some of them
 
 
 class BagItems1(BagTask):
@@ -73,14 +72,10 @@ class BagItems1(BagTask):
 
     def sample(self, rng: np.random.Generator, space: FreeSpace) -> Layout:
         """A zone, a bag about to fall, and items that stand apart."""
-        for _ in range(_TRIES - 1):
-            try:
-                return self._sample(rng, space)
-            except NoFreeSpace:
-                continue
-        return self._sample(rng, space)
+        return first_that_fits(lambda: self._sample(rng, space))
 
     def _sample(self, rng: np.random.Generator, space: FreeSpace) -> Layout:
+        # a zone in the way leaves no room in some of the draws
         zone_pose = np.array(space.sample(rng, _ZONE, _ZONE, extent=0.02))
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * _ZONE / 2
         space = space.occupy_polygon(to_world(corners, zone_pose))

@@ -8,7 +8,9 @@ typed error instead of a crash.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -16,7 +18,9 @@ import numpy as np
 from ..errors import InputError, WarpDeformError
 from ..rendering.pixels import BOUNDS, PIXEL_SIZE, SHAPE, pixel_to_world
 
-__all__ = ["FreeSpace", "NoFreeSpace"]
+__all__ = ["FreeSpace", "NoFreeSpace", "first_that_fits"]
+
+T = TypeVar("T")
 
 _LOW, _HIGH = np.array(BOUNDS[:2]).T
 _SUBPIXEL_BITS = 4  # polygon corners are rounded to 1/16 pixel
@@ -24,6 +28,20 @@ _SUBPIXEL_BITS = 4  # polygon corners are rounded to 1/16 pixel
 
 class NoFreeSpace(WarpDeformError):
     """Nothing of the wanted size fits on what is left of the table."""
+
+
+def first_that_fits(draw: Callable[[], T], *, tries: int = 50) -> T:
+    """What `draw` returns, which places things one after the other, in the first try with room.
+
+    Raises:
+        NoFreeSpace: that of the last try.
+    """
+    for _ in range(tries - 1):
+        try:
+            return draw()
+        except NoFreeSpace:
+            continue
+    return draw()
 
 
 @dataclass(frozen=True, eq=False)
