@@ -25,9 +25,10 @@ from hardware import (
     UnreachablePose,
     UserStopped,
 )
+from hardware.arm.arguments import check_joints, check_pose
 from hardware.arm.joint_path import path_pieces
 from hardware.arm.panda import DQ_MAX, HOME_Q, Q_MAX, Q_MIN, PandaKinematics
-from hardware.arm.robot import REFLEX_ADVICE, check_joints, check_pose
+from hardware.arm.robot import REFLEX_ADVICE
 from hardware.arm.straight_line import distance, straight_line
 from hardware.backends.dry_run import DryRunConfig, DryRunRobot, RecordedCommand
 from hardware.backends.libfranka_errors import reflex_names, typed_error

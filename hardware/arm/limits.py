@@ -15,8 +15,8 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
+from .arguments import check_number, shown
 from .panda import Q_MAX, Q_MIN
-from .robot import check_number, shown
 from .table_plane import TablePlane
 
 __all__ = [

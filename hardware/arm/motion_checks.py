@@ -17,11 +17,12 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
+from .arguments import check_number, check_pose
 from .joint_path import corner_cuts, path_pieces
 from .limits import LIMIT_NAMES, PATH_TOLERANCE, SafetyLimits, dense_path
 from .panda import PandaKinematics
 from .path_speed import fitting_share
-from .robot import SafetyViolation, check_number, check_pose
+from .robot import SafetyViolation
 from .straight_line import StraightLine, distance, straight_line
 
 __all__ = [

@@ -21,7 +21,8 @@ import numpy as np
 from warp_deform.errors import InputError
 from warp_deform.tasks.strand_grasp import wrap_half_turn
 
-from .robot import MotionError, check_number
+from .arguments import check_number
+from .robot import MotionError
 from .safe_robot import SafeRobot
 from .table_plane import TablePlane
 

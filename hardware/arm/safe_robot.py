@@ -24,6 +24,7 @@ import numpy as np
 from warp_deform.errors import InputError
 
 from ..support.closing import Closing
+from .arguments import check_joints, check_pose, check_range, shown
 from .arrival import check_arrival, pressed_contact
 from .limits import SafetyLimits
 from .motion_checks import LEVEL, MotionChecks, Planner, as_lines, sunk_after
@@ -40,10 +41,6 @@ from .robot import (
     RobotState,
     SafetyViolation,
     UserStopped,
-    check_joints,
-    check_pose,
-    check_range,
-    shown,
 )
 from .stop_latch import StopLatch
 from .straight_line import distance, straight_line

@@ -9,7 +9,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from .robot import check_number
+from .arguments import check_number
 
 __all__ = ["MAX_SLOPE", "TablePlane", "fit_table_plane"]
 

@@ -11,15 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from ..arm.arguments import check_joints, check_line, check_range
 from ..arm.panda import GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
-from ..arm.robot import (
-    MoveResult,
-    RobotMode,
-    RobotState,
-    check_joints,
-    check_line,
-    check_range,
-)
+from ..arm.robot import MoveResult, RobotMode, RobotState
 from ..arm.stop_latch import StopLatch
 from ..arm.straight_line import straight_line
 from ..support.closing import Closing

@@ -24,6 +24,7 @@ import numpy as np
 from warp_deform.errors import InputError
 from warp_deform.support.extras import install_extra
 
+from ..arm.arguments import check_joints, check_line, check_range
 from ..arm.panda import DQ_MAX, GRIPPER_MAX_WIDTH
 from ..arm.robot import (
     BackendMissing,
@@ -38,9 +39,6 @@ from ..arm.robot import (
     RobotMode,
     RobotState,
     UserStopped,
-    check_joints,
-    check_line,
-    check_range,
 )
 from ..arm.stop_latch import StopLatch
 from ..arm.straight_line import distance

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ..arm.arguments import check_joints, check_line, check_range
 from ..arm.panda import DQ_MAX, GRIPPER_MAX_WIDTH
 from ..arm.robot import (
     BackendMissing,
@@ -36,9 +37,6 @@ from ..arm.robot import (
     RobotMode,
     RobotState,
     UnreachablePose,
-    check_joints,
-    check_line,
-    check_range,
 )
 from ..arm.stop_latch import StopLatch
 from ..arm.straight_line import distance

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arm.arguments import check_joints, check_line, check_range
 from ..arm.joint_path import path_pieces
 from ..arm.panda import GRIPPER_MAX_WIDTH
 from ..arm.robot import (
@@ -23,9 +24,6 @@ from ..arm.robot import (
     RobotMode,
     RobotState,
     UserStopped,
-    check_joints,
-    check_line,
-    check_range,
 )
 from ..arm.straight_line import distance, straight_line
 from ..support.closing import Closing

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..arm.arguments import check_joints, check_line, check_range
 from ..arm.joint_path import path_pieces
 from ..arm.panda import DDQ_MAX, DQ_MAX, GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
 from ..arm.robot import (
@@ -21,9 +22,6 @@ from ..arm.robot import (
     ReflexError,
     RobotMode,
     RobotState,
-    check_joints,
-    check_line,
-    check_range,
 )
 from ..arm.stop_latch import StopLatch
 from ..arm.straight_line import straight_line
