@@ -87,7 +87,9 @@ def film(
     """Write an MP4 of episodes of a folder, by default the first; the arm is the recorded one.
 
     The states are simulated again, not stored, and have to be the recorded ones bit by bit.
-    size: rows and columns of a frame.
+
+    Args:
+        size: rows and columns of a frame
 
     Raises:
         InputError: the path does not end with .mp4 or cannot be written, or there is no episode.

@@ -70,13 +70,15 @@ _OF_PATH = ("way_points", "knot_times", "knot_rotations")
 class Sample:
     """One direction in one state.
 
-    ours, theirs: directional derivatives, of the adjoint and of the differences
-    scale: the larger of the gradient's length and of the least one that is told from 0: so long
-    that half the bound is what rounding leaves of the differences with the middle step
-    doubt: how well the differences know the derivative, as a share of `scale`; None: no step is so
-    small that it crosses no branch, or the state lies on the edge of one
-    fired: how often constraints of each `Kind` acted in the state
-    growth: the gradient by positions over that which the loss has at the end
+    Attributes:
+        ours: directional derivative of the adjoint
+        theirs: that of the differences
+        scale: the larger of the gradient's length and of the least one that is told from 0: so long
+            that half the bound is what rounding leaves of the differences with the middle step
+        doubt: how well the differences know the derivative, as a share of `scale`; None: no step is
+            so small that it crosses no branch, or the state lies on the edge of one
+        fired: how often constraints of each `Kind` acted in the state
+        growth: the gradient by positions over that which the loss has at the end
     """
 
     parameter: str
@@ -141,8 +143,9 @@ def compare(
     """Roll on from `draw` for so many substeps and compare derivatives of a random loss along so
     many random directions of every array, and along every number.
 
-    bound: error that is asked about; what cannot be told from 0 so well counts as that large, and
-    the ladders start the lower the larger it is
+    Args:
+        bound: error that is asked about; what cannot be told from 0 so well counts as that large,
+            and the ladders start the lower the larger it is
     """
     for world in range(WORLDS):
         worlds.restore(world, draw.state)

@@ -42,7 +42,8 @@ class Start:
 class Draw:
     """A state in the middle of an action, and the path from there; None: let go already.
 
-    touching (B,): how many things each body met in the substep before, which may end a descent
+    Attributes:
+        touching: (B,), how many things each body met in the substep before, which may end a descent
     """
 
     state: WorldState

@@ -18,8 +18,9 @@ RATIO = 4.0
 def central(changes: np.ndarray, steps: np.ndarray, rounding: float) -> tuple[float, float]:
     """The derivative, and a bound of its error that knows of no derivative computed otherwise.
 
-    changes: f(x + h) - f(x - h) at the steps h, from the largest to the smallest
-    rounding: what the arithmetic leaves of values of f
+    Args:
+        changes: f(x + h) - f(x - h) at the steps h, from the largest to the smallest
+        rounding: what the arithmetic leaves of values of f
     """
     return _limit(changes / (2 * steps), rounding / steps, power=2)
 
@@ -27,7 +28,8 @@ def central(changes: np.ndarray, steps: np.ndarray, rounding: float) -> tuple[fl
 def kink(second: np.ndarray, steps: np.ndarray, rounding: float) -> tuple[float, float]:
     """By how much the slopes on both sides of x differ, and a bound of its error.
 
-    second: f(x + h) - 2 f(x) + f(x - h) at the steps h
+    Args:
+        second: f(x + h) - 2 f(x) + f(x - h) at the steps h
     """
     return _limit(second / steps, 2 * rounding / steps, power=1)
 

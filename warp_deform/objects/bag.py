@@ -121,8 +121,11 @@ class BagConfig:
 class BagShell:
     """A bag's undeformed shape around the sphere's centre, its opening up.
 
-    vertices (P, 3) [m]; faces (T, 3), seen from outside; ring (32,): vertices around the opening
-    diagonals (D, 2): edges that halve quadrilaterals
+    Attributes:
+        vertices: (P, 3) [m]
+        faces: vertices of the triangles (T, 3), seen from outside
+        ring: vertices around the opening (32,)
+        diagonals: edges that halve quadrilaterals (D, 2)
     """
 
     vertices: np.ndarray

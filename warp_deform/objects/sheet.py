@@ -19,7 +19,9 @@ __all__ = ["Spring", "add_sheet"]
 class Spring:
     """Springs of one kind: which ends (S, 2), how stiff [N/m] and when they act.
 
-    shortest, longest: hard limits as shares of the rest length, 0: none.
+    Attributes:
+        shortest: hard limit as a share of the rest length, 0: none
+        longest: hard limit as a share of the rest length, 0: none
     """
 
     ends: np.ndarray

@@ -15,8 +15,11 @@ _FIRST, _SECOND = 0.8, 0.9
 class Descent:
     """Steps (n, d) downhill for n points at once; a step k is as long as `scale` / sqrt(k).
 
-    scale (d,): lengths of the first step. Every slope is made of length 1 first: slopes of chaotic
-    rollouts have spikes, so that only directions are to be trusted.
+    Every slope is made of length 1 first: slopes of chaotic rollouts have spikes, so that only
+    directions are to be trusted.
+
+    Args:
+        scale: (d,), lengths of the first step
     """
 
     def __init__(self, shape: tuple[int, int], scale: np.ndarray) -> None:

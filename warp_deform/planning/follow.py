@@ -17,8 +17,9 @@ __all__ = ["Follow"]
 class Follow:
     """What an action picks, and where the tip meets it.
 
-    like: the action (7,), whose pick x, y stand for what is taken
-    offset (3,) [m]: of the tip from the particle, or in the frame of the body
+    Attributes:
+        like: the action (7,), whose pick x, y stand for what is taken
+        offset: (3,) [m], of the tip from the particle, or in the frame of the body
     """
 
     like: Action
@@ -61,8 +62,10 @@ class Follow:
     ) -> None:
         """Add to derivatives (P, 3), (B, 7) by the state it is read of.
 
-        by_pick (2,): derivatives by pick x, y; by_turn: by a turn about the vertical of what is
-        held in the tip, which is how a body lies there
+        Args:
+            by_pick: (2,), derivatives by pick x, y
+            by_turn: by a turn about the vertical of what is held in the tip, which is how a body
+                lies there
         """
         if self.particle is not None:
             particles[self.particle, :2] += by_pick

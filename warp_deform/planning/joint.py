@@ -34,8 +34,10 @@ def move_both(
 ) -> list[Pair]:
     """Pairs tried as they would run, after each of `steps` steps from each of `pairs`.
 
-    scale (4,): lengths of the first step by place x, y [m], yaw [rad], lift [m]
     A pair whose slope cannot be used stops there.
+
+    Args:
+        scale: (4,), lengths of the first step by place x, y [m], yaw [rad], lift [m]
     """
     moving: list[tuple[np.ndarray, Follow, Pair]] = []
     for pair in pairs:

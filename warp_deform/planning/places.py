@@ -24,8 +24,11 @@ _INSIDE = 1e-3
 class Places:
     """Draws and limits of place x, y [m], yaw [rad] and lift [m].
 
-    spread, turn_spread, lift_spread: standard deviations of draws [m], [rad], [m]
-    lifts: whether the lift moves; else it is the action's
+    Attributes:
+        spread: standard deviation of drawn places [m]
+        turn_spread: that of drawn yaws [rad]
+        lift_spread: that of drawn lifts [m]
+        lifts: whether the lift moves; else it is the action's
     """
 
     task: Task

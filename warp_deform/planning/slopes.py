@@ -37,9 +37,10 @@ class Slope:
     """Loss of the task after an action, and its derivatives by place x, y [1/m], yaw [1/rad] and by
     the lift [1/m], at which the tip goes on with the speeds of the same stage.
 
-    usable: whether the tip took something and every derivative is a number
-    growth: largest derivative by a position at the start over the largest by one at the end, of
-    particles and bodies; large where the rollout is chaotic
+    Attributes:
+        usable: whether the tip took something and every derivative is a number
+        growth: largest derivative by a position at the start over the largest by one at the end, of
+            particles and bodies; large where the rollout is chaotic
     """
 
     loss: float
@@ -238,7 +239,8 @@ def loss_and_slopes(
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """The task's loss of an end state, and its derivatives (P, 3) by particles, (B, 7) by bodies.
 
-    episode: before the action
+    Args:
+        episode: before the action
     """
     import torch
 

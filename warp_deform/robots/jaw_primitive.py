@@ -231,7 +231,8 @@ def run_scripts(
 ) -> dict[int, tuple[Outcome, Rollout]]:
     """Run one script in every named world until all have ended; ended worlds keep their state.
 
-    record: interval of recorded frames [s]; 0 records nothing
+    Args:
+        record: interval of recorded frames [s]; 0 records nothing
     """
     steps = max(1, round(config.tick / solver.config.dt))
     tick = steps * solver.config.dt
