@@ -48,12 +48,16 @@ def add_sheet(
 ) -> tuple[range, range, range]:
     """Add a sheet that is undeformed at `rest` (P, 3) and starts at `positions` (P, 3) [m].
 
-    faces (T, 3); masses (P,) [kg]; radius: height of a particle on the table [m]; skin: half the
-    distance at which layers touch [m]; both one number or (P,)
-    edge_gap: distance at which edges touch [m], 0: never; exclusion: no self-contact closer than
-    this in the rest shape [m]
+    Args:
+        faces: particles at the corners of the triangles (T, 3)
+        masses: of the particles (P,) [kg]
+        radius: height of a particle on the table [m], one number or (P,)
+        skin: half the distance at which layers touch [m], one number or (P,)
+        edge_gap: distance at which edges touch [m]; 0: never
+        exclusion: no self-contact closer than this in the rest shape [m]
 
-    Returns the ranges of its particles, springs and triangles.
+    Returns:
+        The ranges of its particles, springs and triangles.
     """
     import warp as wp
 
