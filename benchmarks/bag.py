@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from bag_scenes import (
+from fixtures.bag_scenes import (
     CENTRE,
     CUBE,
     SHELL,
@@ -31,8 +31,8 @@ from bag_scenes import (
     throw,
     timed,
 )
-from cloth_scenes import edge_ratios
-from solver_scenes import G, spring_energy
+from fixtures.cloth_scenes import edge_ratios
+from fixtures.solver_scenes import G, spring_energy
 
 from warp_deform.objects import Bag, BagConfig, BoxConfig
 from warp_deform.quiet import quiet_warp

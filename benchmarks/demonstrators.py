@@ -31,8 +31,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from bag_scenes import pierced
-from cloth_scenes import edges_of
+from fixtures.bag_scenes import pierced
+from fixtures.cloth_scenes import edges_of
 
 from learning.refinement.refine import RefineConfig, refine
 from warp_deform.collecting.collect import CollectConfig, collect

@@ -1,6 +1,6 @@
 """Thousands of random and adversarial commands through `SafeRobot`: are all written limits kept?
 
-`tests/safety_fuzzing.py` says what is commanded and judged; the tests give a few hundred.
+`tests/fixtures/safety_fuzzing.py` says what is commanded and judged; the tests give a few hundred.
 
     python benchmarks/safety_fuzz.py [--commands 5000] [--seed 0] [--json FILE]
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from safety_fuzzing import fuzz
+from fixtures.safety_fuzzing import fuzz
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
-from board_photographs import (
+from fixtures.board_photographs import (
     BOARD,
     INTRINSICS,
     TABLE,

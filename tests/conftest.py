@@ -22,7 +22,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 @pytest.fixture(scope="module")
 def emulator():
     """An emulated Panda before a table, in a process of its own."""
-    from emulator_worlds import RecordingWorld
+    from fixtures.emulator_worlds import RecordingWorld
 
     from hardware.emulator import EmulatorProcess
 
@@ -33,7 +33,7 @@ def emulator():
 @pytest.fixture(scope="module")
 def client(emulator):
     """The vendor's client, connected to it."""
-    from emulator_client import vendor_client
+    from fixtures.emulator_client import vendor_client
 
     with vendor_client(emulator.host) as client:
         yield client
@@ -42,7 +42,7 @@ def client(emulator):
 @pytest.fixture
 def panda(emulator, client):
     """The vendor's client of an arm at home."""
-    from emulator_client import reset
+    from fixtures.emulator_client import reset
 
     reset(client, emulator)
     return client
@@ -61,7 +61,7 @@ def connection(emulator):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """The folder of a run that took seconds, see `short_runs`."""
-    from short_runs import train_shortly
+    from fixtures.short_runs import train_shortly
 
     return train_shortly(tmp_path_factory.mktemp("trained"))
 

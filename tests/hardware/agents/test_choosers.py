@@ -1,0 +1,186 @@
+"""Who chooses: chance, the true state, a planner, a person; and the chain found in a mask."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures.franka_arm import Arm
+from fixtures.franka_episodes import (
+    CALIBRATION,
+    GOAL,
+    LIMITS,
+    SMALL,
+    TASK,
+    TWIN,
+    chain,
+    drawn_camera,
+    recorder,
+)
+
+from hardware.agents.choosers import RandomChooser, ScriptedChooser, still_chain, to_action
+from hardware.agents.finger_room import has_finger_room
+from hardware.agents.human import HumanChooser
+from hardware.agents.planner import PlannerChooser, PlannerConfig, SeenChain, chord_error
+from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig
+from hardware.arm.safe_robot import SafeRobot
+from hardware.episodes.episode import EpisodeConfig, Observation, refusal, run_episode
+from hardware.recordings.recording import Recording
+from hardware.recordings.replay import replay_recording
+from hardware.twin.camera import SimCamera
+from hardware.twin.robot import SimRobot
+from hardware.twin.twin import CableTwin
+from hardware.vision.chain_from_mask import estimate_chain
+from warp_deform.tasks.chain_shapes import curved_chain
+from warp_deform.tasks.task import Layout
+
+
+def test_a_persons_points_are_grasped_across_the_cable(tmp_path: Path) -> None:
+    shown: list[np.ndarray] = []
+
+    def points(picture: np.ndarray, view: object) -> object:
+        shown.append(picture)
+        return tuple(map(tuple, TWIN.view.base_to_pixel(np.array([[0.45, 0.1], [0.5, 0.2]]))))
+
+    chooser = HumanChooser(points)
+    with recorder(tmp_path / "a") as made, drawn_camera(lambda: 0.45) as camera:
+        result = run_episode(
+            SafeRobot(Arm(), LIMITS),
+            camera,
+            CALIBRATION,
+            chooser,
+            recorder=made,
+            goal=GOAL,
+            config=EpisodeConfig(max_actions=1),
+        )
+    assert result.outcomes == ("placed",) and shown[0].shape == (960, 480, 3)
+    x, y, yaw, *place = Recording.read(tmp_path / "a").actions[0]["action"]
+    np.testing.assert_allclose(
+        [x, y, abs(yaw), *place[:2]], [0.45, 0.1, np.pi / 2, 0.5, 0.2], atol=0.02
+    )
+
+
+def test_random_actions_pick_the_cable_and_stay_inside() -> None:
+    mask = TASK.mask(chain(0.45))
+    chooser = RandomChooser(np.random.default_rng(0))
+    seen = Observation(0, np.zeros((320, 160, 3), np.uint8), mask, None, None)
+    robot = SafeRobot(Arm(), LIMITS)
+    allowed = 0
+    for _ in range(20):
+        action = chooser.choose(seen)
+        assert action is not None and abs(action.pick_xy[0] - 0.45) < 0.005
+        allowed += refusal(robot, action, PickPlaceConfig()) is None
+    assert allowed > 10
+    empty = Observation(0, seen.view, np.zeros_like(mask), None, None)
+    assert chooser.choose(empty) is None
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_chain_is_found_in_its_mask(seed: int) -> None:
+    """Lone strands; which end comes first is open."""
+    rng = np.random.default_rng(seed)
+    beads = curved_chain(rng, TWIN.chain, TASK.x, TASK.y, bend=4.0)[:, :2]
+    found = estimate_chain(TASK.mask(beads), TWIN.view, len(beads))
+    assert found is not None
+    errors = [np.linalg.norm(found[::way] - beads, axis=1).max() for way in (1, -1)]
+    assert min(errors) < 5e-3
+
+
+def test_crossing_strands_go_straight_on_and_a_ring_is_opened() -> None:
+    t = np.linspace(0.0, 1.0, 90)[:, None]
+    # a loop whose ends cross at a right angle
+    angle = (0.25 + 1.5 * t) * np.pi + np.pi
+    loop = np.array([0.48, 0.0]) + 0.05 * np.hstack([np.cos(angle), np.sin(angle)])
+    away = np.linspace(0.002, 0.1, 30)[:, None]
+    ends = [
+        loop[0] - away[::-1] * _unit(loop[1] - loop[0]),
+        loop[-1] + away * _unit(loop[-1] - loop[-2]),
+    ]
+    line = np.concatenate([ends[0], loop, ends[1]])
+    found = estimate_chain(TASK.mask(line), TWIN.view, 90)
+    assert found is not None
+    gaps = np.linalg.norm(np.diff(found, axis=0), axis=1)
+    assert gaps.max() < 1.6 * np.median(gaps), "no jump from strand to strand"
+    tips = {tuple(np.round(found[i], 2)) for i in (0, -1)}
+    assert tips == {tuple(np.round(line[i], 2)) for i in (0, -1)}
+    ring = np.array([0.48, 0.0]) + 0.06 * np.hstack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)])
+    found = estimate_chain(TASK.mask(ring), TWIN.view, 90)
+    assert found is not None
+    np.testing.assert_allclose(np.linalg.norm(found - [0.48, 0.0], axis=1), 0.06, atol=3e-3)
+    assert estimate_chain(np.zeros((320, 160), bool), TWIN.view, 90) is None
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v)
+
+
+def test_the_scripted_and_the_planned_action_approach_the_goal(tmp_path: Path) -> None:
+    targets = chain(0.52)[:, :2]
+    goal = TASK.mask(targets)
+    twin = CableTwin()
+    planner = PlannerChooser(config=PlannerConfig(budget=8))
+    for chooser in (ScriptedChooser(twin.look, targets), planner):
+        twin.lay(chain(0.45))
+        robot = SafeRobot(SimRobot(twin), LIMITS)
+        folder = tmp_path / chooser.name
+        with recorder(folder, goal=goal) as made, SimCamera(twin.look, config=SMALL) as camera:
+            result = run_episode(
+                robot,
+                camera,
+                CALIBRATION,
+                chooser,
+                recorder=made,
+                goal=goal,
+                config=EpisodeConfig(max_actions=1),
+            )
+        assert result.outcomes == ("placed",)
+        after = twin.look().beads[:, :2]
+        ways = [np.linalg.norm(after - targets[::way], axis=1).mean() for way in (1, -1)]
+        assert min(ways) < 0.9 * 0.07
+        assert replay_recording(folder).mismatches == 0
+
+
+def test_an_environments_action_loses_its_lift() -> None:
+    action = to_action(np.array([0.4, 0.1, 0.2, 0.5, -0.1, 0.3, 0.05]))
+    assert action == PickPlaceAction((0.4, 0.1), 0.2, (0.5, -0.1), 0.3)
+
+
+def test_chords_tell_how_a_chain_is_bent_wherever_it_lies() -> None:
+    straight = np.column_stack([np.zeros(90), np.arange(90) * 5e-3])
+    error = functools.partial(chord_error, links=15, spacing=5e-3)
+    assert error(straight[:, ::-1] + 0.1, straight) == pytest.approx(0.0, abs=1e-12)
+    kinked = straight.copy()
+    kinked[45:] -= [0.0, 0.075]  # the second half lies back by as long as a chord
+    assert error(kinked, straight) == pytest.approx(15 / 75), "15 of 75 chords bridge the kink"
+    arc = np.linspace(0.0, np.pi, 90)
+    bow = np.column_stack([np.cos(arc), np.sin(arc)]) * 89 * 5e-3 / np.pi
+    assert error(bow, straight) > 0.01 and error(straight, bow) == error(bow, straight)
+
+
+def test_a_planner_prefers_a_straight_chain_beside_its_goal_to_a_kinked_one_on_it() -> None:
+    task = SeenChain(GOAL)
+    targets = chain(0.50)[:, :2]
+    layout = Layout(chain(0.50), np.zeros((0, 7)), targets)
+    beside, kinked = chain(0.52), chain(0.50)
+    kinked[45:60, 1] = kinked[45, 1] - np.arange(15) * 5e-3  # back
+    kinked[60:, 1] -= 30 * 5e-3  # and on from there
+    distances = [np.linalg.norm(q[:, :2] - targets, axis=1).mean() for q in (beside, kinked)]
+    beside += [np.diff(distances)[0], 0.0, 0.0]
+    promises = [task.promise(layout, still_chain(q)) for q in (beside, kinked)]
+    scores = [task.score(layout, still_chain(q)) for q in (beside, kinked)]
+    assert scores[0] < scores[1], "the kinked one lies half on the goal"
+    assert promises[0] - scores[0] > promises[1] - scores[1] + 0.1
+
+
+def test_fingers_need_room_beside_the_strand() -> None:
+    lone = TASK.mask(chain(0.45))
+
+    def room(mask: np.ndarray, yaw: float) -> bool:
+        action = PickPlaceAction((0.45, 0.0), yaw, (0.5, 0.0), yaw)
+        return has_finger_room(mask, action, view=TWIN.view)
+
+    assert room(lone, np.pi / 2) and not room(lone, 0.0), "along the strand both fingers meet it"
+    verdicts = {gap: room(lone | TASK.mask(chain(0.45 + gap)), np.pi / 2) for gap in (0.022, 0.032)}
+    assert verdicts == {0.022: False, 0.032: True}

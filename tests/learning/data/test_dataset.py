@@ -1,0 +1,181 @@
+"""Demonstrations for training: the right pictures, the right subset, little memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import resource
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures.episode_samples import with_info
+from fixtures.training_samples import block_episode, write_demonstrations
+
+from learning.data.dataset import Demonstrations, choose
+from learning.interchange.deformable_ravens import DEMONSTRATOR
+from learning.runs.folder import RunFolder
+from learning.training.config import TrainConfig
+from learning.training.schedules import Schedule
+from learning.training.train import train
+from warp_deform.episodes import HEIGHT_UNIT, Episode, EpisodeReader, EpisodeWriter
+from warp_deform.errors import InputError
+
+TASK = "cable-line-notarget"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_demonstrations(tmp_path_factory.mktemp("data") / "demos", 4)
+
+
+def test_a_moment_is_what_was_recorded_and_its_goal_the_end(folder: Path) -> None:
+    data = Demonstrations(folder, task=TASK)
+    for episode, seed in enumerate(data.seeds):
+        recorded = EpisodeReader(folder).read(seed)
+        for t in range(2):
+            moment = data.moment(episode, t)
+            assert (moment.color == recorded.steps[t].color).all()
+            assert (moment.height == recorded.steps[t].height).all()
+            assert (moment.goal_color == recorded.steps[-1].color).all()
+            assert (moment.goal_height == recorded.steps[-1].height).all()
+            assert np.abs(moment.height - block_episode(seed).steps[t].height).max() < HEIGHT_UNIT
+            assert (moment.action == recorded.steps[t].action).all()
+
+
+def test_the_goal_in_a_state_is_the_end_too(folder: Path) -> None:
+    data = Demonstrations(folder, task=TASK)
+    state, _ = data.state(0, 1)
+    recorded = EpisodeReader(folder).read(data.seeds[0]).steps
+    assert (state[:72] == recorded[1].ground_truth[:72]).all()
+    assert (state[72:] == recorded[-1].ground_truth[:72]).all()
+
+
+def test_a_task_without_goal_keeps_its_state(tmp_path: Path) -> None:
+    write_demonstrations(tmp_path, 1, task="cable-ring")
+    data = Demonstrations(tmp_path, task="cable-ring")
+    assert (data.state(0, 0)[0] == EpisodeReader(tmp_path).read(0).steps[0].ground_truth).all()
+
+
+def test_the_cache_follows_the_episodes(tmp_path: Path) -> None:
+    write_demonstrations(tmp_path, 2)
+    before = Demonstrations(tmp_path, task=TASK).moment(0, 0)
+    cached = sorted((tmp_path / "rows").iterdir())
+    cached[0].write_bytes(cached[0].read_bytes()[:100])  # cut short
+    assert (Demonstrations(tmp_path, task=TASK).moment(0, 0).color == before.color).all()
+    (tmp_path / "episode_000000000.parquet").unlink()
+    EpisodeWriter(tmp_path).write(with_info(block_episode(7), seed=0))
+    after = Demonstrations(tmp_path, task=TASK).moment(0, 0)
+    assert (after.color == block_episode(7).steps[0].color).all()
+
+
+def test_moments_are_drawn_uniformly_over_episodes_then_steps(tmp_path: Path) -> None:
+    writer = EpisodeWriter(tmp_path)
+    for seed, actions in ((0, 1), (1, 4)):
+        writer.write(block_episode(seed, actions=actions))
+    data, rng = Demonstrations(tmp_path, task=TASK), np.random.default_rng(0)
+    drawn = list(data.drawn(4000, rng))
+    shares = [drawn.count((0, 0)) / 4000, *(drawn.count((1, t)) / 4000 for t in range(4))]
+    assert np.abs(np.array(shares) - [0.5, 0.125, 0.125, 0.125, 0.125]).max() < 0.03
+
+
+def test_subsets_are_drawn_by_the_seed() -> None:
+    seeds = tuple(range(0, 2000, 2))
+    subsets = [choose(seeds, 100, seed=run) for run in (0, 0, 1)]
+    assert subsets[0] == subsets[1] != subsets[2]
+    assert all(len(set(s)) == 100 and set(s) <= set(seeds) for s in subsets)
+    assert choose(seeds, 1000, seed=5) == seeds
+
+
+@pytest.mark.parametrize("count", [0, -1, 5])
+def test_a_number_of_demonstrations_that_is_not_there(folder: Path, count: int) -> None:
+    with pytest.raises(InputError, match="the data holds 4 demonstrations"):
+        Demonstrations(folder, task=TASK, count=count)
+
+
+def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"episode of cable-line-notarget, not of cable-ring"):
+        Demonstrations(folder, task="cable-ring")
+    with pytest.raises(InputError, match="cannot be read as a folder"):
+        Demonstrations(tmp_path / "missing", task=TASK)
+    with pytest.raises(InputError, match="holds no episodes"):
+        Demonstrations(tmp_path, task=TASK)
+    EpisodeWriter(tmp_path).write(with_info(block_episode(0), success=False))
+    with pytest.raises(InputError, match="no successful demonstration"):
+        Demonstrations(tmp_path, task=TASK)
+
+
+def imported(seed: int, *, task: str = TASK, **changes: object) -> Episode:
+    """An episode as it is imported from the original code, failed."""
+    info = {"demonstrator": DEMONSTRATOR, "success": False, "task": task, **changes}
+    return with_info(block_episode(seed), **info)
+
+
+def test_the_originals_failures_are_demonstrations_as_there(tmp_path: Path) -> None:
+    """They are kept there, but for those that began solved and so have no action."""
+    writer = EpisodeWriter(tmp_path)
+    writer.write(imported(0))
+    writer.write(imported(1, success=True))
+    still = block_episode(2, actions=0)
+    writer.write(with_info(still, demonstrator=DEMONSTRATOR, success=True))
+    data = Demonstrations(tmp_path, task=TASK)
+    assert data.seeds == (0, 1) and data.left_out == 1
+    one = Demonstrations(tmp_path, task=TASK, count=2)
+    assert one.seeds == (0, 1)
+    with pytest.raises(InputError, match="the data holds 2 demonstrations"):
+        Demonstrations(tmp_path, task=TASK, count=3)
+    schedule = Schedule(steps=1, batch=1, lr=1e-3, snapshots=1)
+    out = tmp_path / "run"
+    report = train(
+        TrainConfig(task=TASK, agent="gt-mlp", data=tmp_path, out=out, schedule=schedule)
+    )
+    assert (report.demos, report.left_out) == (2, 1)
+    assert RunFolder(out).read_settings()["left_out"] == 1
+
+
+def test_of_the_originals_bags_by_color_only_good_ones_count(tmp_path: Path) -> None:
+    task, writer = "bag-color-goal", EpisodeWriter(tmp_path)
+    for seed, score in enumerate((0.5, 0.51, 1.0, 0.0)):
+        writer.write(imported(seed, task=task, score=score))
+    data = Demonstrations(tmp_path, task=task)
+    assert data.seeds == (1, 2) and data.left_out == 2
+    for seed in data.seeds:
+        (tmp_path / f"episode_{seed:09d}.parquet").unlink()
+    with pytest.raises(InputError, match="none of its 2 episodes is a demonstration"):
+        Demonstrations(tmp_path, task=task)
+
+
+@pytest.mark.parametrize("task", ["bag-items-1", "bag-items-2"])
+def test_of_the_originals_bags_with_items_only_the_solved_count(tmp_path: Path, task: str) -> None:
+    writer = EpisodeWriter(tmp_path)
+    for seed, (score, success) in enumerate(((0.75, False), (0.6, True), (0.5, False))):
+        writer.write(imported(seed, task=task, score=score, success=success))
+    data = Demonstrations(tmp_path, task=task)
+    assert data.seeds == (1,) and data.left_out == 2
+
+
+def test_what_holds_no_state_trains_no_agent_over_states(tmp_path: Path) -> None:
+    made = block_episode(0)
+    bare = [dataclasses.replace(step, ground_truth=np.zeros(0, np.float32)) for step in made.steps]
+    EpisodeWriter(tmp_path).write(dataclasses.replace(made, steps=tuple(bare)))
+    data = Demonstrations(tmp_path, task=TASK)
+    with pytest.raises(InputError, match="hold no ground truth"):
+        print(data.state_size)
+
+
+def test_pictures_stay_on_the_disk(tmp_path: Path) -> None:
+    """40 episodes of 5 rows hold 72 MB of pictures; looking at all of them adds far less."""
+    write_demonstrations(tmp_path, 40, actions=4)
+    data = Demonstrations(tmp_path, task=TASK)
+    before = _resident()
+    for episode in range(40):
+        for t in range(4):
+            data.moment(episode, t)
+    assert _resident() - before < 20e6
+
+
+def _resident() -> float:
+    """Memory in use by this process now [B], its mapped files included."""
+    if sys.platform == "linux":
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

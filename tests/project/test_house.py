@@ -1,0 +1,71 @@
+"""House rules that a machine can see: sizes, names, and what must not be in the repository."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from fixtures.places import ROOT
+
+import warp_deform
+from warp_deform.command.doctor import DEPENDENCIES
+
+FOLDERS = ("warp_deform", "learning", "hardware", "tests", "examples", "benchmarks")
+FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+TEXTS = sorted(
+    path
+    for path in [*FILES, *ROOT.glob("*.*"), *(ROOT / "docs").rglob("*.md"), ROOT / "Makefile"]
+    if path.suffix in {".py", ".md", ".toml", ".txt", ".cff", ""}
+    and path.is_file()
+    and path.name != ".git"  # of a worktree: a file that says where the repository is
+)
+BANNED_NAMES = {"utils", "util", "common", "helpers", "helper", "misc", "manager", "managers"}
+MACHINE_PATH = re.compile(r"(?<![\w.])/(?:wo[r]k|ro[o]t|ho[m]e|t[m]p)/[a-z]")
+LEFT_UNDONE = re.compile(r"\b(TO[D]O|FIX[M]E|XX[X]|NotImplemented[E]rror)\b")
+
+
+def relative(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("path", FILES, ids=relative)
+def test_python_file_is_short_and_well_named(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 420, "a place to ask whether it holds two ideas"
+    assert not BANNED_NAMES & {part.removesuffix(".py") for part in path.relative_to(ROOT).parts}
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=relative)
+def test_text_holds_no_machine_path_and_nothing_undone(path: Path) -> None:
+    text = path.read_text()
+    assert not MACHINE_PATH.search(text)
+    assert not LEFT_UNDONE.search(text)
+
+
+def test_readme_is_short() -> None:
+    for readme in ROOT.glob("README.md"):
+        assert len(readme.read_text().splitlines()) <= 120
+
+
+def test_constraints_pin_versions_and_name_no_host() -> None:
+    lines = [
+        line
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if not line.startswith("#")
+    ]
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in lines)
+
+
+def test_dependencies_are_pinned_and_examined_by_doctor() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = {re.split(r"[\[><=; ]", line)[0] for line in project["dependencies"]}
+    assert needed == set(DEPENDENCIES)
+    pinned = (ROOT / "constraints.txt").read_text().lower().replace("_", "-")
+    assert [name for name in sorted(needed) if f"{name}==" not in pinned] == []
+
+
+def test_version_is_the_same_everywhere() -> None:
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {warp_deform.__version__}\n" in citation
+    assert re.fullmatch(r"\d+\.\d+\.\d+", warp_deform.__version__)

@@ -1,0 +1,417 @@
+"""The adjoint against finite differences and closed forms; its bits against storage and lanes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fixtures.cloth_scenes import two_sheets_and_a_cable
+from fixtures.solver_scenes import LOOSE, G, add_particles, box_solver, finalize, ideal, new_builder
+
+from warp_deform.errors import InputError
+from warp_deform.objects import BoxConfig, CableConfig, add_box, add_cable, cable_line
+from warp_deform.objects.push import Push
+from warp_deform.rollout import DifferentiableRollout, Gradients, GripPath, rollout, substep_vjp
+from warp_deform.solver import SolverConfig, SolverFusedXPBD
+from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
+
+DT = 1 / 1200
+SHORT = CableConfig(beads=10)
+PARAMETERS = ("damping", "table_friction", "contact_friction", "stiffness")
+ROLLING = replace(FABRIC_SOLVER, limits=LOOSE, sleep_speed=0.0, max_speed=1e3)
+"""A sheet that never sleeps: sleep is a jump, which finite differences would straddle."""
+
+
+def cable_solver(
+    worlds: int = 1, lanes: int = 1, precision: str = "float64", bend: float = 0.0
+) -> SolverFusedXPBD:
+    cable = replace(SHORT, bend_stiffness=bend)
+    one, builder = new_builder(), new_builder()
+    add_cable(one, cable, cable_line(cable, (0.4, 0.0), (0.6, 0.0)))
+    builder.replicate(one, worlds)
+    return SolverFusedXPBD(
+        builder.finalize(device="cpu"), SolverConfig(limits=LOOSE), lanes=lanes, precision=precision
+    )
+
+
+def heap(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    z = 0.02 + 0.006 * np.arange(SHORT.beads)
+    return np.column_stack([rng.normal(0, 4e-3, (SHORT.beads, 2)), z])
+
+
+def set_state(solver: SolverFusedXPBD, x: np.ndarray, v: np.ndarray, world: int = 0) -> None:
+    solver.data.lane("particles.x", world)[:] = x
+    solver.data.lane("particles.v", world)[:] = v
+
+
+def state(solver: SolverFusedXPBD, world: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    return solver.particle_q(world), solver.particle_qd(world)
+
+
+class Check:
+    """A rollout of world 0 from its present state, and its loss along random cotangents."""
+
+    def __init__(
+        self, solver: SolverFusedXPBD, steps: int = 1, path: GripPath | None = None, seed: int = 0
+    ) -> None:
+        self.solver, self.steps, self.path = solver, steps, path
+        self.x, self.v = state(solver)
+        self.w = solver.data.lane("particles.w0", 0).copy()
+        self.rng = np.random.default_rng(seed)
+        self.gx = self.rng.normal(size=self.x.shape)
+        self.gv = self.rng.normal(size=self.x.shape) * 1e-3
+        self.values = {
+            name: solver.data.per_world(f"group.{name}", 0).copy() for name in PARAMETERS
+        }
+
+    def run(self, path: GripPath | None = None, **start: np.ndarray) -> Gradients:
+        at = {"positions": self.x, "velocities": self.v, "inverse_masses": self.w, **self.values}
+        at |= start
+        run = DifferentiableRollout(self.solver)
+        parameters = {
+            n: at[n].reshape(1, -1) if n == "inverse_masses" else at[n]
+            for n in at
+            if n not in ("positions", "velocities")
+        }
+        path = path or self.path
+        run.forward(
+            [0],
+            [self.steps * DT],
+            paths={} if path is None else {0: path},
+            parameters=parameters,
+            positions=at["positions"][None],
+            velocities=at["velocities"][None],
+        )
+        x, v = state(self.solver)
+        # the change only: less is lost to rounding
+        self.loss = float((self.gx * (x - self.x)).sum() + (self.gv * (v - self.v)).sum())
+        return run.backward(self.gx[None, None], self.gv[None, None])
+
+    def error(
+        self, name: str, size: float, along: np.ndarray, by: Callable[..., Gradients] | None = None
+    ) -> tuple[float, float]:
+        """Difference of the two directional derivatives, and their size."""
+        gradients = self.run()
+        value = {
+            "way_points": lambda: gradients.way_points[0],
+            "knot_times": lambda: gradients.knot_times[0],
+        }.get(name, lambda: getattr(gradients, name)[0])()
+        ours = float((value * along).sum())
+        moved = by or (lambda d: self.run(**{name: self._base(name) + d}))
+        moved(size * along)
+        above = self.loss
+        moved(-size * along)
+        return abs((above - self.loss) / (2 * size) - ours), abs(ours)
+
+    def _base(self, name: str) -> np.ndarray:
+        named = {"positions": self.x, "velocities": self.v, "inverse_masses": self.w}
+        return named[name] if name in named else self.values[name]
+
+    def assert_right(self, *, rounding: float = 1.0, draws: int = 3) -> dict[str, int]:
+        """All derivatives agree; returns how often constraints acted.
+
+        Steps are as small as float64 allows, for contacts are a micrometre deep: the error that
+        rounding leaves is allowed for, times `rounding`.
+        """
+        steps = {
+            "positions": 1e-9, "velocities": 1e-7, "inverse_masses": 1e-4 * self.w.max(),
+            "damping": 1e-3, "table_friction": 1e-5, "contact_friction": 1e-5, "stiffness": 1e-4,
+        }  # fmt: skip
+        floor = rounding * 2e-15
+        for name, size in steps.items():
+            base = self._base(name)
+            for _ in range(draws):
+                along = self.rng.normal(size=base.shape) * (base > 0 if "mass" in name else 1)
+                wrong, right = self.error(name, size, along)
+                assert wrong < 1e-6 * right + floor / size, (name, wrong, right)
+        if self.path is not None:
+            self._assert_path(floor)
+        return self.run().counts()
+
+    def _assert_path(self, floor: float) -> None:
+        path = self.path
+        assert path is not None
+        along = self.rng.normal(size=path.positions.shape)
+        wrong, right = self.error(
+            "way_points",
+            1e-8,
+            along,
+            lambda d: self.run(replace(path, positions=path.positions + d)),
+        )
+        assert wrong < 1e-6 * right + floor / 1e-8
+        along = np.arange(len(path.times)) > 0
+        wrong, right = self.error(
+            "knot_times",
+            1e-8,
+            along.astype(float),
+            lambda d: self.run(replace(path, times=path.times + d)),
+        )
+        assert wrong < 1e-6 * right + floor / 1e-8
+
+
+def lift(x: np.ndarray, particle: int = 0, far: float = 1.0) -> GripPath:
+    """A path of 5.2 ms from where the particle is."""
+    knots = x[particle] + far * np.array([[0, 0, 0], [1e-3, 5e-4, 2e-3], [2e-3, 0, 1e-3]])
+    return GripPath(np.array([0, 0.002, 0.0052]), knots, particle=particle)
+
+
+@pytest.fixture(scope="module")
+def settled() -> SolverFusedXPBD:
+    solver = cable_solver()
+    set_state(solver, heap(0), np.zeros((SHORT.beads, 3)))
+    rollout(solver, [0], least=0.4, most=0.4)
+    return solver
+
+
+def test_a_substep_of_a_settled_heap(settled: SolverFusedXPBD) -> None:
+    x, v = state(settled)
+    counts = Check(settled).assert_right()
+    assert min(counts[k] for k in ("stretch", "contact", "table", "fold_limit")) > 0
+    set_state(settled, x, v)
+
+
+@pytest.mark.parametrize("steps", [3, 9])
+def test_way_points_of_a_grip_and_its_release(settled: SolverFusedXPBD, steps: int) -> None:
+    x, v = state(settled)
+    counts = Check(settled, steps, lift(x, 3)).assert_right(rounding=30.0)
+    assert counts["grip"] == min(steps, 6)
+    assert counts.get("release", 0) == (steps == 9)
+    set_state(settled, x, v)
+
+
+def test_bending_and_the_speed_clamp() -> None:
+    solver = cable_solver(bend=0.02)
+    rng = np.random.default_rng(1)
+    line = cable_line(SHORT, (0.4, 0.0), (0.6, 0.0))
+    set_state(solver, line + rng.normal(0, 1e-3, line.shape), rng.normal(0, 1.8, line.shape))
+    counts = Check(solver).assert_right(rounding=30.0)
+    assert counts["bend"] == SHORT.beads - 2
+    assert counts["speed_clamp"] > 0
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_a_substep_of_two_crumpled_sheets_and_a_cable(seed: int) -> None:
+    solver = two_sheets_and_a_cable(ROLLING, edge=0.2, lanes=1, precision="float64")
+    rng = np.random.default_rng(seed)
+    x = solver.particle_q(0)
+    x += rng.normal(size=x.shape) * 0.002 * (1 + seed % 3)
+    if seed == 5:
+        x[:, 2] = 0.4 * x[:, 2] - 0.012
+    set_state(solver, x, rng.normal(size=x.shape) * 0.05)
+    rollout(solver, [0], least=5 * DT, most=5 * DT)
+    x, v = state(solver)
+    acted = Check(solver).assert_right(rounding=30.0, draws=2)
+    assert {"triangle_rim", "strain_limit", "viscosity", "dry_friction"} <= set(acted)
+    set_state(solver, x, v)
+    acted = Check(solver, 2, lift(x, 0, 20.0)).assert_right(rounding=300.0, draws=2)
+    assert {"tether", "triangle_face"} <= set(acted)
+    assert seed == 1 or acted["edge"] > 0
+
+
+def test_sleep_passes_nothing_on() -> None:
+    sleepy = replace(ROLLING, sleep_speed=0.1)
+    solver = two_sheets_and_a_cable(sleepy, lanes=1, precision="float64")
+    x, v = state(solver)
+    one = np.ones((1, *x.shape))
+    asleep = substep_vjp(solver, [0], one, one)
+    assert asleep.counts()["sleep"] == len(x)
+    assert np.array_equal(asleep.positions[0], one[0])
+    assert not asleep.velocities.any()
+    set_state(solver, x, v)
+    awake = substep_vjp(solver, [0], one, one, sleep=False)
+    assert "sleep" not in awake.counts()
+    assert np.abs(awake.velocities).min() > 0
+    set_state(solver, x, v)
+    again = substep_vjp(solver, [0], one, one)
+    assert again.counts() == asleep.counts(), "the one awake changed nothing for later ones"
+
+
+def test_stopping_distance_of_a_sliding_particle() -> None:
+    """The way v^2 / (2 mu g) has slopes v / (mu g) and -s / mu."""
+    builder, mu, speed = new_builder(), 0.4, 0.6
+    add_particles(builder, [[0.0, 0.0, 0.005]], velocities=[[speed, 0.0, 0.0]])
+    solver = finalize(builder, ideal(table_friction=mu), precision="float64")
+    run = DifferentiableRollout(solver)
+    end = run.forward([0], [0.3])[0, 0, 0, 0]
+    gradients = run.backward(np.array([[[[1.0, 0.0, 0.0]]]]))
+    assert end == pytest.approx(speed**2 / (2 * mu * G), rel=0.01)
+    assert gradients.velocities[0, 0, 0] == pytest.approx(speed / (mu * G), rel=0.02)
+    assert gradients.table_friction[0] == pytest.approx(-end / mu, rel=0.02)
+    assert gradients.positions[0, 0, 0] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_mass_and_stiffness_of_a_hanging_particle() -> None:
+    """It rests m g / k below its pin: slopes g / k by mass, -m g / k by the factor on stiffness."""
+    builder, mass, stiffness, rest, drag = new_builder(), 0.1, 100.0, 0.2, 30.0
+    pull = G * (1 - drag * DT)  # drag slows what a substep adds, too
+    add_particles(
+        builder,
+        [[0.0, 0.0, 1.0], [0.0, 0.0, 0.79]],
+        masses=[0.0, mass],
+        links=[(0, 1, rest)],
+        stiffness=stiffness,
+    )
+    solver = finalize(builder, ideal(damping=drag), precision="float64")
+    run = DifferentiableRollout(solver)
+    end = run.forward([0], [1.5])
+    gradients = run.backward(np.array([[[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]]))
+    assert end[0, 0, 1, 2] == pytest.approx(1.0 - rest - mass * pull / stiffness, abs=1e-5)
+    by_mass = -gradients.inverse_masses[0, 1] / mass**2
+    assert by_mass == pytest.approx(-pull / stiffness, rel=1e-3)
+    assert gradients.stiffness[0] == pytest.approx(mass * pull / stiffness, rel=1e-3)
+    # the pin carries it
+    assert gradients.positions[0, 0, 2] == pytest.approx(1.0, rel=1e-3)
+    assert gradients.inverse_masses[0, 0] == 0.0
+
+
+def test_fall_through_air() -> None:
+    """With drag d, where a body falls to and its slopes are closed forms."""
+    builder, drag, end = new_builder(), 2.0, 0.5
+    add_particles(builder, [[0.0, 0.0, 5.0]])
+    solver = finalize(builder, ideal(damping=drag), precision="float64")
+    run = DifferentiableRollout(solver)
+    run.forward([0], [end])
+    gradients = run.backward(np.array([[[[0.0, 0.0, 1.0]]]]))
+    decay = np.exp(-drag * end)
+    fallen = G / drag**2 * (decay - 1 + drag * end)
+    by_drag = -2 * fallen / drag + G / drag**2 * (end - end * decay)
+    assert gradients.damping[0] == pytest.approx(-by_drag, rel=1e-2)
+    assert gradients.velocities[0, 0, 2] == pytest.approx((1 - decay) / drag, rel=5e-3)
+
+
+def test_pinned_particles_give_numbers() -> None:
+    builder = new_builder()
+    at = [[0.0, 0.0, 0.1], [0.0, 0.0, 0.11], [0.0, 0.0, 0.105], [0.0, 0.0, 0.11]]
+    add_particles(
+        builder, at, masses=[0.0, 0.0, 0.1, 0.0], links=[(0, 1, 0.02), (1, 2, 0.01), (1, 3, 0.01)],
+        colliding=True,
+    )  # fmt: skip
+    solver = finalize(builder, ideal(), precision="float32")
+    run = DifferentiableRollout(solver)
+    run.forward([0], [0.02, 0.05])
+    gradients = run.backward(np.ones((1, 2, 4, 3)), np.ones((1, 2, 4, 3)))
+    for value in vars(gradients).values():
+        if isinstance(value, np.ndarray):
+            assert np.isfinite(value).all()
+    assert not gradients.inverse_masses[0, [0, 1, 3]].any()
+
+
+def play(
+    solver: SolverFusedXPBD, slots: dict[int, int], storage: str, memory: int = 2**28
+) -> dict[int, list[np.ndarray]]:
+    """End and derivatives by the world that a slot plays: grips, pushes, rest, several times."""
+    paths, pushes = {}, {}
+    for slot, seed in slots.items():
+        set_state(solver, heap(seed), 0 * heap(seed), slot)
+        start = state(solver, slot)[0][0].astype(float)
+        if seed % 2:
+            knots = start + np.array([[0, 0, 0], [0.03, 0.01 * seed, 0.02], [0.05, 0, -0.01]])
+            paths[slot] = GripPath(np.array([0, 0.05, 0.15]), knots, particle=0, lower=(0.1, 0.15))
+        else:
+            pushes[slot] = (Push(6, np.array([4.0 * seed, 9.0, 20.0]), 0.05),)
+    run = DifferentiableRollout(solver, storage=storage, memory=memory)
+    worlds = list(slots)
+    end = run.forward(worlds, [0.1, 0.25], paths=paths, pushes=pushes, until_rest=True)
+    cotangents = np.stack(
+        [np.random.default_rng(s).normal(size=(2, SHORT.beads, 3)) for s in slots.values()]
+    )
+    g = run.backward(cotangents)
+    again = run.backward(cotangents)
+    out = {}
+    for k, (slot, seed) in enumerate(slots.items()):
+        out[seed] = [end[k], g.positions[k], g.velocities[k], g.inverse_masses[k], g.fired[k]]
+        out[seed] += [getattr(g, name)[k] for name in PARAMETERS]
+        assert np.array_equal(again.positions[k], g.positions[k])
+        if slot in paths:
+            out[seed] += [g.way_points[slot], g.knot_times[slot], g.knot_rotations[slot]]
+    return out
+
+
+def test_bits_depend_neither_on_storage_nor_on_lanes() -> None:
+    together = cable_solver(5, 8, "float32")
+    slots = {slot: slot for slot in range(5)}
+    full = play(together, slots, "full")
+    again = play(together, slots, "replay", memory=2**20)
+    alone = cable_solver(1, 1, "float32")
+    for seed in slots:
+        lone = play(alone, {0: seed}, "replay")[seed]
+        for a, b, c in zip(full[seed], again[seed], lone, strict=True):
+            assert np.isfinite(a).all()
+            assert np.array_equal(a, b) and np.array_equal(a, c)
+    plain = cable_solver(5, 8, "float32")
+    for slot in slots:
+        set_state(plain, heap(slot), 0 * heap(slot), slot)
+    rollout(plain, [2, 4], least=0.1, most=0.1)
+    for slot in (2, 4):
+        set_state(together, heap(slot), 0 * heap(slot), slot)
+    DifferentiableRollout(together).forward([2, 4], [0.1])
+    for slot in (2, 4):
+        assert np.array_equal(state(plain, slot), state(together, slot))
+
+
+def test_states_at_the_times_that_were_asked_for() -> None:
+    builder, box = new_builder(), BoxConfig(mass=0.05)
+    add_cable(builder, SHORT, cable_line(SHORT, (0.4, 0.0), (0.6, 0.0)))
+    add_box(builder, box, (0.5, 0.2, 0.03))
+    solver = SolverFusedXPBD(builder.finalize(device="cpu"), SolverConfig(limits=LOOSE), lanes=1)
+    run = DifferentiableRollout(solver)
+    start = [solver.particle_q(0)[None], solver.particle_qd(0)[None]]
+    bodies = [b[None] for b in solver.data.body_poses(0)]
+    x = run.forward([0], [0.05, 0.1])
+    for values, now in (
+        (x, solver.particle_q(0)),
+        (run.velocities, solver.particle_qd(0)),
+        (run.body_poses, solver.body_q(0)),
+        (run.body_velocities, solver.body_qd(0)),
+    ):
+        assert values.shape == (1, 2, *now.shape)
+        assert np.array_equal(values[0, 1], now)
+    early, poses, twists = run.velocities[0, 0], run.body_poses[0, 0], run.body_velocities[0, 0]
+    run.forward(
+        [0],
+        [0.05],
+        positions=start[0],
+        velocities=start[1],
+        body_poses=bodies[0],
+        body_velocities=bodies[1],
+    )
+    assert np.array_equal(solver.particle_qd(0), early)
+    assert np.array_equal(solver.body_q(0), poses) and np.array_equal(solver.body_qd(0), twists)
+
+
+def test_what_sleeps_on_passes_its_pose_through() -> None:
+    solver = box_solver((BoxConfig(mass=0.05), (0, 0, 0.02)), config=SolverConfig(limits=LOOSE))
+    rollout(solver, [0], least=0.5, most=0.5)
+    run = DifferentiableRollout(solver)
+    run.forward([0], [0.1])
+    slope = np.array([[[[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0]]]])
+    asleep = run.backward(bodies=slope)
+    assert asleep.counts() == {"body_sleep": 120}
+    assert np.array_equal(asleep.body_poses, slope[:, 0])
+    assert not asleep.body_velocities.any()
+    # its last velocity is that of the contacts that its sleep undid: these count
+    awake = run.backward(bodies=slope, body_velocities=np.ones((1, 1, 1, 6)))
+    assert awake.counts().get("body_table", 0) > 0
+
+
+def test_memory_is_bounded() -> None:
+    solver = cable_solver(2, 1, "float32")
+    with pytest.raises(InputError, match="allow more memory"):
+        play(solver, {0: 0, 1: 1}, "full", memory=100_000)
+    play(solver, {0: 0, 1: 1}, "replay", memory=1_000_000)
+
+
+def test_what_cannot_be_differentiated_is_refused() -> None:
+    solver = cable_solver(2, 1)
+    with pytest.raises(InputError, match="storage"):
+        DifferentiableRollout(solver, storage="disk")
+    run = DifferentiableRollout(solver)
+    with pytest.raises(InputError, match="ascending"):
+        run.forward([0], [0.2, 0.1])
+    with pytest.raises(InputError, match="no parameter 'mass'"):
+        run.forward([0], [0.1], parameters={"mass": np.ones(1)})
+    with pytest.raises(InputError, match="one topology"):
+        run.forward([], [0.1])
