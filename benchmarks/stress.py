@@ -28,9 +28,10 @@ from warp_deform.episodes import MAX_HEIGHT
 from warp_deform.quiet import quiet_warp
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.registry import TASKS
-from warp_deform.worlds import REST_LIMIT, Worlds
+from warp_deform.worlds import Worlds
 from warp_deform.worlds.episode import StepReport
 from warp_deform.worlds.spaces import action_space, check_action
+from warp_deform.worlds.worlds import REST_LIMIT
 
 EPISODE = 10  # [actions]
 MOVING = 0.02  # [m/s] faster than this is not at rest

@@ -87,8 +87,8 @@ class EvalOptions(EvalSettings, CommandOptions):
     and place, action, score."""
     videos: Annotated[int, arg(metavar="N"), COUNT] = 4
     """Videos at most."""
-    video_arm: bool = True
-    """Also film each of them with the arm at work; left out, filming is quicker."""
+    no_video_arm: bool = False
+    """With --video, leave out the films with the arm: pictures and heat maps alone are quicker."""
     share: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to be made: a run's with the chosen snapshot alone, in half its bytes, to hand on."""
     workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
@@ -112,7 +112,7 @@ def evaluate(options: EvalOptions) -> Outcome:
         goals=options.goals,
         video=options.video,
         videos=options.videos,
-        video_arm=options.video_arm,
+        video_arm=not options.no_video_arm,
         workers=options.workers,
     )
     if options.share is not None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures.places import ROOT
 from fixtures.short_runs import SHORT, TASK, said, settle
 from fixtures.training_samples import block_episode
 
@@ -316,12 +317,12 @@ def test_goals_in_a_folder_that_grew_by_hand(run: RunFolder) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["evaluation", "failures", "film", "paper_results", "playing", "policy", "protocol", "report",
-     "report_curves", "report_run", "report_tables", "share", "snapshots"],
+    "path",
+    [path for room in ("evaluation", "policy", "report", "runs")
+     for path in sorted((ROOT / "learning" / room).glob("[!_]*.py"))],
+    ids=lambda path: f"{path.parent.name}-{path.stem}",
 )  # fmt: skip
-def test_public_names_are_exported(name: str) -> None:
-    path = Path(evaluation.__file__).with_name(f"{name}.py")
+def test_public_names_are_exported(path: Path) -> None:
     defined, exported = set(), set()
     for node in ast.parse(path.read_text()).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
