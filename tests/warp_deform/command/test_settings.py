@@ -17,6 +17,7 @@ from learning.command import refine, verbs
 from learning.evaluation import run as evaluation
 from learning.evaluation.settings import EvalSettings
 from learning.policy.policy import AGENTS
+from learning.refinement import waypoints
 from learning.refinement.refine import ACCEPT, RefineConfig
 from learning.refinement.settings import RefineSettings
 from learning.training import train as training
@@ -29,6 +30,7 @@ from warp_deform.collecting.settings import CollectSettings, DemonstratorName
 from warp_deform.command import main as cli
 from warp_deform.command import verbs as own_verbs
 from warp_deform.command.main import CommandOptions, main
+from warp_deform.errors import InputError
 from warp_deform.gradcheck import GradcheckConfig
 from warp_deform.planning import METHODS, SearchConfig
 from warp_deform.planning.demonstrators import DEMONSTRATORS
@@ -178,3 +180,28 @@ def test_help_loads_neither_torch_nor_a_simulator(line: str) -> None:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
     assert (done.returncode, done.stderr) == (0, "[]\n")
     assert f"warp-deform {line.removesuffix(' --help')}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("further", "raised"),
+    [
+        ({}, KeyboardInterrupt),
+        ({"workers": 2, "json": True, "task_module": "mine"}, KeyboardInterrupt),
+        ({"lifts": True}, InputError),
+        ({"accept": "solved"}, InputError),
+        ({"depth": 1}, InputError),
+    ],
+)
+def test_paths_are_bent_with_the_flags_of_every_verb_and_folder(
+    further: dict[str, Any], raised: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def record(config: waypoints.BendConfig) -> None:
+        assert (config.source, config.workers) == (Path("a"), further.get("workers"))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(waypoints, "bend", record)
+    options = refine.RefineOptions(
+        source=Path("a"), out=Path("b"), budget=20, way_points=True, **further
+    )
+    with pytest.raises(raised):
+        refine.refine(options)
