@@ -17,23 +17,22 @@ __all__ = ["ConvertOptions", "convert"]
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertOptions(CommandOptions):
-    """Convert a dataset to or from another format; the destination appears when it is whole."""
+    """Convert a dataset to or from another format. The destination appears when it is whole."""
 
     source: Annotated[Positional[Path], arg(metavar="SRC")]
-    """Folder of episodes; with --from, a task's folder of the original, which holds `color`,
-    `depth`, `action` and so on."""
+    """Folder of episodes. With --from it is a folder of the original code for one task, which holds
+    `color`, `depth`, `action` and so on."""
     target: Annotated[Positional[Path], arg(metavar="DST")]
-    """What is made: a folder, or with `--to robomimic` a file that ends with .hdf5."""
+    """Where to write: a folder, or with `--to robomimic` a file that ends with .hdf5."""
     to: Literal["lerobot", "robomimic"] | None = None
-    """Format to export to: a LeRobotDataset v3.0, or robomimic's HDF5 (needs the extra `export`).
-    """
+    """Format to write: a LeRobotDataset v3.0, or robomimic's HDF5 (needs the extra `export`)."""
     origin: Annotated[Literal["deformable-ravens"] | None, arg(name="from")] = None
-    """Format to import from: the pickles of the original code, read by a process that can run
-    nothing of theirs."""
+    """Format to read: the pickles of the original code. A process reads them that can run none of
+    their code."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """With --from: our name of the task; left out, the folder's name tells it."""
+    """With --from: the name of the task here. By default the folder's name tells it."""
     workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
-    """With --from: processes; left out, one per core, fewer for few episodes."""
+    """With --from: number of processes; by default one per core, and fewer for few episodes."""
 
 
 def convert(options: ConvertOptions) -> Outcome:

@@ -132,7 +132,7 @@ class Collection:
         for name in _OURS:
             if (self.folder / name).exists():
                 raise InputError(
-                    f"{self.folder} holds {name} but no {_DESCRIPTION}, so it is something else's; "
+                    f"{self.folder} holds {name} but no {_DESCRIPTION}, so it is no collection; "
                     "choose another folder"
                 )
 

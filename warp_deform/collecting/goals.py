@@ -73,13 +73,13 @@ def _goal(reader: EpisodeReader, seed: int) -> Goal:
     if not task.goal_conditioned:
         raise InputError(f"{path} is an episode of {info.task}, which has no goal image")
     if not info.success:
-        raise InputError(f"{path} did not reach its goal, so its last state is none")
+        raise InputError(f"{path} did not reach its goal, so its last state cannot serve as a goal")
     try:
         targets = np.array(info.extra[GOAL_TARGETS], dtype=float)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{path} does not say what its last state stands for as a goal, as recordings from "
-            "elsewhere may not; `warp-deform goals` makes goals"
+            f"{path} does not say what its last state means as a goal, perhaps because another "
+            "program recorded it; `warp-deform goals` makes goals"
         ) from error
     row = reader.read_step(seed, info.actions)
     kind = CONSTRUCTED if info.demonstrator == CONSTRUCTED else DEMONSTRATED

@@ -25,22 +25,24 @@ class CollectSettings:
     """What to collect, and how."""
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
-    """Name of the task, see `warp-deform list`."""
+    """Name of the task; `warp-deform list` shows all of them."""
     episodes: Annotated[int, arg(aliases=["-n"], metavar="N"), COUNT] = 10
-    """Successes to keep: the first N in the order of their seeds."""
+    """How many successes to keep: the first N in the order of their seeds."""
     seed: Annotated[int, SEED] = 0
-    """First seed. Training 0.., test 10,000.., validation 50,000.., goals 100,000.. ."""
+    """First seed. Training has seeds from 0, test from 10,000, validation from 50,000, and goals
+    from 100,000 on."""
     out: Annotated[Path, arg(metavar="DIR")]
-    """Folder for the episodes; complete ones that are there already are kept."""
+    """Folder for the episodes. If it holds some already, the collection goes on from there."""
     demonstrator: DemonstratorName = "scripted"
-    """Who acts: "scripted", the paper's; "visible", which picks only what the tip would really
-    meet; "mpc", which simulates eight candidates and takes the best; "planner", which searches two
-    actions ahead. All see the state."""
+    """Who acts. "scripted" is the paper's demonstrator. "visible" picks only what the tip would
+    really meet. "mpc" simulates eight candidates and takes the best. "planner" searches two actions
+    ahead. All of them see the simulator's state."""
     workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
-    """Processes; left out, one per core, fewer for few episodes. The result is the same."""
+    """Number of processes; by default one per core, and fewer for few episodes. The result does not
+    depend on it."""
     ray: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Address of a Ray cluster to work on that shares the folder (needs the extra `ray`)."""
+    """Address of a Ray cluster to work on. It has to share the folder (needs the extra `ray`)."""
     video: Annotated[Path | None, arg(metavar="FILE")] = None
-    """MP4 of the first two kept episodes."""
+    """Film the first two kept episodes into this MP4."""
     robot: RobotName = "ur5"
-    """The arm."""
+    """Which arm moves."""

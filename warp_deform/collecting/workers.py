@@ -147,7 +147,7 @@ class Workers:
                     yield from results
         except TerminatedWorkerError as error:
             raise WarpDeformError(
-                "a worker process was killed, perhaps for want of memory; what is complete is "
+                "a worker process was killed, perhaps because memory ran out; what is complete is "
                 "kept: run the same command again to go on, with fewer --workers"
             ) from error
 
@@ -234,7 +234,7 @@ def _connect(address: str) -> int:
         from ray.util.joblib import register_ray
     except ImportError as error:
         raise InputError(
-            f"Ray is not installed; in the clone run: {install_extra('ray')}, or leave out --ray"
+            f"Ray is not installed. Run {install_extra('ray')} in the clone, or leave out --ray"
         ) from error
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:

@@ -55,7 +55,7 @@ class Verb(NamedTuple):
 _GOES_ON = "the same command goes on"
 
 VERBS: dict[str, Verb] = {
-    "list": Verb("warp_deform.command.verbs:list_tasks", "the tasks and their Gymnasium ids"),
+    "list": Verb("warp_deform.command.verbs:list_tasks", "list the tasks and their Gymnasium ids"),
     "demo": Verb(
         "warp_deform.command.verbs:demo",
         "collect demonstrations of a task",
@@ -72,9 +72,11 @@ VERBS: dict[str, Verb] = {
     ),
     "inspect": Verb(
         "warp_deform.command.verbs:inspect",
-        "statistics and contact sheets of a dataset",
+        "show statistics of a dataset and draw its episodes",
     ),
-    "convert": Verb("learning.command.convert:convert", "datasets to and from other formats"),
+    "convert": Verb(
+        "learning.command.convert:convert", "convert datasets to and from other formats"
+    ),
     "train": Verb(
         "learning.command.verbs:train",
         "train an agent on demonstrations",
@@ -87,11 +89,11 @@ VERBS: dict[str, Verb] = {
     ),
     "report": Verb(
         "learning.command.verbs:report",
-        "tables and learning curves beside the paper's",
+        "write tables and learning curves beside the paper's",
     ),
     "sweep": Verb(
         "learning.command.verbs:sweep",
-        "train and evaluate a grid, as long as it takes",
+        "train and evaluate a whole grid of runs",
         kept=f"what is done is kept, {_GOES_ON}",
     ),
     "refine": Verb(
@@ -105,12 +107,12 @@ VERBS: dict[str, Verb] = {
     ),
     "franka": Verb(
         "hardware.command.franka:franka",
-        "the cable task on a Franka arm or its twin",
+        "run the cable task on a Franka arm or its twin",
         kept="episodes already written are complete",
     ),
     "doctor": Verb(
         "warp_deform.command.verbs:doctor",
-        "versions, devices, caches and what is missing",
+        "show versions, devices, caches and what is missing",
     ),
 }
 
@@ -122,7 +124,7 @@ class CommandOptions:
     json: bool = False
     """Print one JSON object, and nothing else, on stdout."""
     task_module: Annotated[str | None, arg(metavar="MODULE")] = None
-    """Module, or .py file, that registers tasks of your own; it is imported, so it runs."""
+    """Module or .py file that registers tasks of your own. It is imported, so its code runs."""
 
     def configure(self, kind: type[Config], **further: Any) -> Config:
         """The configuration `kind`, a dataclass: the fields that it shares with these options.

@@ -47,9 +47,9 @@ _Workers = Annotated[int | None, arg(metavar="W"), COUNT]
 
 @dataclass(frozen=True, kw_only=True)
 class ListOptions(CommandOptions):
-    """List the tasks: Gymnasium id, whether a goal image is given, actions allowed, objects.
+    """List the tasks with their Gymnasium ids, goals, numbers of actions and objects.
 
-    The benchmark's first, then further ones, of this package, of installed distributions and of
+    The benchmark's tasks come first, then others of this package, of installed packages, and of
     --task-module.
     """
 
@@ -88,7 +88,7 @@ def list_tasks(options: ListOptions) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(CollectSettings, CommandOptions):
-    """Collect successful demonstrations of a task; attempts that fail are counted, not kept."""
+    """Collect successful demonstrations of a task. Attempts that fail are only counted."""
 
 
 def demo(options: DemoOptions) -> Outcome:
@@ -116,19 +116,19 @@ class GoalsOptions(CommandOptions):
     task: _Task
     """Name of a goal-conditioned task."""
     count: Annotated[int, arg(name="goals", aliases=["-n"], metavar="N"), COUNT] = 20
-    """Goals to make; the paper evaluates on 20."""
+    """How many goals to make. The paper evaluates on 20."""
     seed: Annotated[int, SEED] = 100_000
-    """First seed; goals have seeds of their own."""
+    """First seed. Goals have seeds of their own."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder for the goals."""
     kind: Literal["demonstrated", "constructed"] = "demonstrated"
-    """Last states of demonstrations (the paper), or objects placed at the goal and settled."""
+    """Take the last states of demonstrations, as the paper does, or place objects at the goal."""
     demonstrator: DemonstratorName = "scripted"
-    """Whose demonstrations, see `warp-deform demo`."""
+    """Who demonstrates; `warp-deform demo --help` explains them."""
     workers: _Workers = None
-    """Processes; one per core when left out."""
+    """Number of processes; by default one per core."""
     robot: RobotName = "ur5"
-    """The arm."""
+    """Which arm moves."""
 
 
 def goals(options: GoalsOptions) -> Outcome:
@@ -155,16 +155,16 @@ def goals(options: GoalsOptions) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions(CommandOptions):
-    """Simulate recorded episodes again and compare every step's state hash."""
+    """Simulate recorded episodes again, and compare the hash of every state."""
 
     folder: _Folder
     """Folder of episodes."""
     verify: bool = False
-    """Fail (exit code 1) unless every state is the recorded one, bit for bit."""
+    """Fail with exit code 1 unless every state is the recorded one, bit for bit."""
     tolerance: Annotated[float | None, arg(metavar="M"), FlagRange(0.0, 1e3)] = None
-    """Compare positions within this distance [m] instead of bits, for another kind of processor."""
+    """Compare positions within this distance [m] and not bits, if the processor is another."""
     workers: _Workers = None
-    """Processes; left out, one per core, fewer for few episodes."""
+    """Number of processes; by default one per core, and fewer for few episodes."""
 
 
 def replay(options: ReplayOptions) -> Outcome:
@@ -185,14 +185,14 @@ def replay(options: ReplayOptions) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class InspectOptions(CommandOptions):
-    """Statistics of a folder of episodes, and a PNG for each with its steps."""
+    """Show statistics of a folder of episodes, and draw each with its steps into a PNG."""
 
     folder: _Folder
     """Folder of episodes."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for the contact sheets; `DIR/sheets` when left out."""
+    """Folder for the pictures; by default `DIR/sheets`."""
     sheets: Annotated[int, arg(metavar="N"), COUNT_OR_NONE] = 20
-    """Contact sheets at most; 0 for statistics alone."""
+    """Draw at most so many episodes; 0 shows statistics alone."""
 
 
 def inspect(options: InspectOptions) -> Outcome:
@@ -278,7 +278,7 @@ def gradcheck(options: GradcheckOptions) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions(CommandOptions):
-    """Show versions, devices, caches, optional parts, and what keeps this machine from working."""
+    """Show versions, devices, caches, optional parts, and what this machine lacks."""
 
 
 def doctor(options: DoctorOptions) -> Outcome:

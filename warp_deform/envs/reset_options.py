@@ -32,7 +32,7 @@ def check_options(options: Mapping[str, Any] | None, *known: str) -> Mapping[str
     """The options, {} for None; InputError if there is one that nothing here understands."""
     for name in options or {}:
         if name not in known:
-            raise InputError(f"reset knows no option {name!r}; it knows {', '.join(known)}")
+            raise InputError(f"reset has no option {name!r}; it has {', '.join(known)}")
     return options or {}
 
 
@@ -46,7 +46,7 @@ def goal_for(task: Task, given: GoalOption, *, seed: int) -> Goal:
         InputError: the task takes no goal, or this one is another task's.
     """
     if not task.goal_conditioned:
-        raise InputError(f"{task.name} takes no goal; leave the option out")
+        raise InputError(f"{task.name} is no goal-conditioned task; leave out the option goal")
     if isinstance(given, Goal):
         goal = given
     elif isinstance(given, str | os.PathLike):
@@ -75,5 +75,5 @@ def _read(task: Task, path: Path, seed: int) -> Goal:
     goal = load_goal(path)
     made = EpisodeReader(path.parent).info(goal.seed).task
     if made != task.name:
-        raise InputError(f"{path} is of {made}, not of {task.name}")
+        raise InputError(f"{path} holds a goal of {made}, not of {task.name}")
     return goal

@@ -111,7 +111,9 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         if not isinstance(goals, list | tuple):
             goals = [goals] * self.num_envs
         if len(goals) != self.num_envs:
-            raise InputError(f"{self.num_envs} environments need as many goals, got {len(goals)}")
+            raise InputError(
+                f"{self.num_envs} environments need {self.num_envs} goals, got {len(goals)}"
+            )
         for i in slots:
             if seeds[i] is not None:
                 self._rngs[i] = seeding.np_random(seeds[i])[0]
@@ -221,7 +223,9 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
             super().reset(seed=int(seed))
             return [int(seed) + i for i in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise InputError(f"{self.num_envs} environments need as many seeds, got {len(seed)}")
+            raise InputError(
+                f"{self.num_envs} environments need {self.num_envs} seeds, got {len(seed)}"
+            )
         return [None if s is None else int(s) for s in seed]
 
     def _masked(self, mask: Any) -> list[int]:

@@ -99,10 +99,10 @@ def test_vector_errors_name_the_environment() -> None:
     with pytest.raises(InputError, match="shape"):
         envs.step(MIDDLE)
     for arguments, said in (
-        ({"seed": [1]}, "2 environments need as many seeds"),
-        ({"options": {"goal": [None]}}, "2 environments need as many goals"),
+        ({"seed": [1]}, "2 environments need 2 seeds"),
+        ({"options": {"goal": [None]}}, "2 environments need 2 goals"),
         ({"options": {"reset_mask": np.zeros(2, bool)}}, "reset_mask"),
-        ({"options": {"mask": 0}}, "knows no option"),
+        ({"options": {"mask": 0}}, "has no option"),
     ):
         with pytest.raises(InputError, match=said):
             envs.reset(**arguments)
