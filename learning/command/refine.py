@@ -22,8 +22,8 @@ class RefineOptions(RefineSettings, CommandOptions):
     """Improve recorded demonstrations by search; the same command goes on where it was stopped."""
 
     method: Literal["enumerate", "random", "cem", "gradient"] = "cem"
-    """How to search beyond the task's candidates: not at all, by draws, by draws ever closer to the
-    best (the cross-entropy method), or down the slope of the task's loss."""
+    """How to search beyond the task's candidates: not at all, by random draws, by draws ever closer
+    to the best (the cross-entropy method), or down the gradient of the task's loss."""
     depth: Literal[1, 2] = 2
     """Actions to look ahead."""
     budget: Annotated[int, arg(metavar="N"), COUNT] = 64
@@ -31,8 +31,8 @@ class RefineOptions(RefineSettings, CommandOptions):
     lifts: bool = False
     """Let the search move the lift of an action too; policies lift as the task does."""
     way_points: bool = False
-    """Bend the recorded actions' paths instead, by the gradient. No policy can act so: the folder
-    then holds paths, no demonstrations."""
+    """Bend the paths of the recorded actions instead, by the gradient. No policy can follow such
+    paths, so the folder then holds paths and no demonstrations."""
 
 
 def refine(options: RefineOptions) -> Outcome:
@@ -60,7 +60,7 @@ def refine(options: RefineOptions) -> Outcome:
 
 def _bend(options: RefineOptions) -> Outcome:
     """Bend the paths of a folder's actions."""
-    from warp_deform.planning.search import SLOPE_COST
+    from warp_deform.planning.search import GRADIENT_COST
     from warp_deform.planning.waypoints import WayPointConfig
 
     from ..refinement.waypoints import BendConfig, bend
@@ -68,10 +68,13 @@ def _bend(options: RefineOptions) -> Outcome:
     applies = {field.name for kind in (FolderSettings, CommandOptions) for field in fields(kind)}
     given = {name: getattr(options, name) for name in (*applies, "budget", "way_points")}
     if options != RefineOptions(**given):
-        raise InputError("--way-points goes by the gradient and takes --budget and --workers alone")
-    steps = options.budget // (SLOPE_COST + 1)
+        raise InputError("of the search's flags --way-points takes only --budget and --workers")
+    steps = options.budget // (GRADIENT_COST + 1)
     if steps < 1:
-        raise InputError(f"a step of way-points costs {SLOPE_COST + 1}: give --budget that or more")
+        raise InputError(
+            f"a step of waypoints costs {GRADIENT_COST + 1} simulated actions; "
+            "give --budget that or more"
+        )
     config = options.configure(BendConfig, bending=WayPointConfig(steps=steps))
     report = bend(config)
     text = (

@@ -1,7 +1,7 @@
 """Paths between pick and place that are better than straight ones, for recorded actions.
 
 Every action of a folder of demonstrations is run again from the state in which it was recorded,
-along its straight path and along paths whose way-points go down the slope of the task's loss. The
+along its straight path and along paths whose waypoints descend the gradient of the task's loss. The
 best one is written, with what both lead to. That is no demonstration: an action's seven numbers,
 which are all that a policy has, cannot say such a path. So the folder holds no episodes.
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..planning.gradients import LANES, gradients_for
 from ..planning.search import MOST_GROWTH
-from ..planning.slopes import LANES, slopes_for
 from ..tasks.task import Task
 from ..worlds.state import WorldState
 from ..worlds.worlds import Worlds
@@ -41,7 +41,7 @@ def compare_actions(task: Task, count: int, *, seed: int) -> list[ActionSample]:
     Raises:
         InputError: the task has no derivatives of actions.
     """
-    slopes = slopes_for(task, "ur5", _PRECISION)
+    gradients = gradients_for(task, "ur5", _PRECISION)
     worlds = Worlds(task, LANES, lanes=LANES, precision=_PRECISION, rest_limit=REST)
     samples: list[ActionSample] = []
     for start in actions_of_episodes(worlds, seed) if count else ():
@@ -50,16 +50,16 @@ def compare_actions(task: Task, count: int, *, seed: int) -> list[ActionSample]:
             for sign in (1, -1):
                 moved.append(start.action.copy())
                 moved[-1][at] += sign * STEP
-        told, *same = slopes.of([(start.before, action) for action in moved])
+        ours, *same = gradients.of([(start.before, action) for action in moved])
         kept = worlds.state(0)
         real = _losses(worlds, start.before, moved[1:])
         worlds.restore(0, kept)
-        by_place = told.by_place[:2]
+        by_place = ours.by_place[:2]
         samples.append(
             ActionSample(
-                growth=told.growth,
-                usable=told.usable and told.growth <= MOST_GROWTH,
-                cosine_same=_cosine(by_place, [slope.loss for slope in same]),
+                growth=ours.growth,
+                usable=ours.usable and ours.growth <= MOST_GROWTH,
+                cosine_same=_cosine(by_place, [gradient.loss for gradient in same]),
                 cosine_real=_cosine(by_place, real),
             )
         )

@@ -50,7 +50,7 @@ ARM = 0.05
 EPSILON = 2.2e-16
 """Relative rounding of float64; positions are below 1 m."""
 KINK = 1e-6
-"""Slopes on both sides of a state that differ by more than this share: a branch begins there."""
+"""One-sided derivatives that differ by more than this share: a branch begins there."""
 CHUNK = 14
 """Directions of one launch."""
 WORLDS = 1 + 2 * CHUNK

@@ -26,7 +26,7 @@ def central(changes: np.ndarray, steps: np.ndarray, rounding: float) -> tuple[fl
 
 
 def kink(second: np.ndarray, steps: np.ndarray, rounding: float) -> tuple[float, float]:
-    """By how much the slopes on both sides of x differ, and a bound of its error.
+    """By how much the one-sided derivatives at x differ, and a bound of its error.
 
     Args:
         second: f(x + h) - 2 f(x) + f(x - h) at the steps h

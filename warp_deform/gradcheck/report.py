@@ -42,7 +42,7 @@ class Row:
     Attributes:
         constraint: kind whose states are counted, see `Kind`, or "all"
         parameter: what is differentiated by, or "all"; of actions "place", by the rollout that
-            counts, and "place, as differentiated", by the one that slopes are taken of
+            counts, and "place, as differentiated", by the one that is differentiated
         relative_error: 99th percentile over states, see `Sample.error`
         cosine: between all directional derivatives and their differences; of actions the mean
         share: of comparisons that cross no branch; of actions those that a search would use

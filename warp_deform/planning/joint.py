@@ -34,7 +34,7 @@ def move_both(
 ) -> list[Pair]:
     """Pairs tried as they would run, after each of `steps` steps from each of `pairs`.
 
-    A pair whose slope cannot be used stops there.
+    A pair whose gradient cannot be used stops there.
 
     Args:
         scale: (4,), lengths of the first step by place x, y [m], yaw [rad], lift [m]
@@ -50,17 +50,17 @@ def move_both(
     tries: list[tuple[np.ndarray, Follow]] = []
     stuck = [False] * len(moving)
     for _ in range(steps):
-        told = lookahead.slopes().of_pairs([(state, first, f) for first, f, _ in moving])
-        lookahead.rollouts += (JOINT_COST - 2) * len(told)
-        slopes = np.zeros((len(moving), 8))
+        of_pairs = lookahead.gradients().of_pairs([(state, first, f) for first, f, _ in moving])
+        lookahead.rollouts += (JOINT_COST - 2) * len(of_pairs)
+        gradients = np.zeros((len(moving), 8))
         for i, (action, follow, _) in enumerate(moving):
-            by_first = places.slope(told[i][0], action)
-            by_second = places.slope(told[i][1], follow.like)
+            by_first = places.gradient(of_pairs[i][0], action)
+            by_second = places.gradient(of_pairs[i][1], follow.like)
             if by_first is None or by_second is None:
                 stuck[i] = True
             else:
-                slopes[i] = np.concatenate([by_first, by_second])
-        changes = descent.step(slopes)
+                gradients[i] = np.concatenate([by_first, by_second])
+        changes = descent.step(gradients)
         for i, (action, follow, pair) in enumerate(moving):
             if stuck[i]:
                 continue

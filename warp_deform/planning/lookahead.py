@@ -15,7 +15,7 @@ from ..tasks.task import Action, Task
 from ..worlds.spaces import action_space
 from ..worlds.state import WorldState
 from ..worlds.worlds import Worlds
-from .slopes import LANES, Slopes, slopes_for
+from .gradients import LANES, ActionGradients, gradients_for
 
 LOOKAHEAD_REST = 1.0
 """Longest wait for rest after a tried action [s]; what still moves is judged as it is."""
@@ -73,16 +73,16 @@ class Lookahead:
         self._worlds = Worlds(
             task, count, robot=robot, lanes=LANES, precision=precision, rest_limit=LOOKAHEAD_REST
         )
-        self._slopes = functools.partial(slopes_for, task, robot, precision)
+        self._gradients = functools.partial(gradients_for, task, robot, precision)
         self.rollouts = 0
 
-    def slopes(self) -> Slopes:
+    def gradients(self) -> ActionGradients:
         """The worlds in which the same actions are differentiated.
 
         Raises:
             InputError: the task has none.
         """
-        return self._slopes()
+        return self._gradients()
 
     def try_each(
         self, jobs: Sequence[tuple[WorldState, Action]], *, keep: bool = False

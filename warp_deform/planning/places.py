@@ -9,12 +9,12 @@ import numpy as np
 from ..rendering.pixels import BOUNDS
 from ..robots.primitive import LIFT
 from ..tasks.task import Action, Task
-from .slopes import PLACE, Slope
+from .gradients import PLACE, PlaceGradient
 
 __all__ = ["MOST_GROWTH", "Places"]
 
 MOST_GROWTH = 1e5
-"""A slope whose rollout is more chaotic than that is not used."""
+"""A gradient whose rollout is more chaotic than that is not used."""
 _LOW, _HIGH = np.array(BOUNDS[:2]).T
 _INSIDE = 1e-3
 """A moved lift stays so far from that at which the next stage begins [m]."""
@@ -55,11 +55,11 @@ class Places:
             inside[6] = np.clip(inside[6], *self._lifts(float(like[6])))
         return inside
 
-    def slope(self, slope: Slope, action: Action) -> np.ndarray | None:
-        """The slope (4,) by what may move of an action; None: not to be used."""
-        if not slope.usable or slope.growth > MOST_GROWTH:
+    def gradient(self, gradient: PlaceGradient, action: Action) -> np.ndarray | None:
+        """The gradient (4,) by what may move of an action; None: not to be used."""
+        if not gradient.usable or gradient.growth > MOST_GROWTH:
             return None
-        by_place = slope.by_place.copy()
+        by_place = gradient.by_place.copy()
         if action[5] == 0.0:
             by_place[2] = 0.0  # a task that places without a turn has no use for one
         if not self.lifts:

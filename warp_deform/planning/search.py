@@ -2,9 +2,10 @@
 
 All methods begin with the candidates of the task. `enumerate` takes the best of them; `random`
 tries others drawn around them; `cem`, the cross-entropy method over a mixture of picks, draws
-around the best so far, ever closer; `gradient` moves the best down the slope of the task's loss by
-Adam, and draws around those whose slope cannot be used or paid. Every action that a search returns
-has been tried as it would run. Two actions ahead, each of the best states is searched again.
+around the best so far, ever closer; `gradient` moves the best down the gradient of the task's
+loss by Adam, and draws around those whose gradient cannot be used or paid. Every action that a
+search returns has been tried as it would run. Two actions ahead, each of the best states is
+searched again.
 Sources: Rubinstein, Kroese, "The Cross-Entropy Method", 2004; Kingma, Ba, "Adam", 2015.
 """
 
@@ -29,8 +30,8 @@ METHODS = ("enumerate", "random", "cem", "gradient")
 """The methods of `search` by name."""
 JOINT_STEPS = 8
 """Most steps that two actions go downhill together."""
-SLOPE_COST = 4
-"""Rollouts that a slope counts as: a taped one, its repetition and the backward sweep."""
+GRADIENT_COST = 4
+"""Rollouts that a gradient counts as: a taped one, its repetition and the backward sweep."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +55,7 @@ class SearchConfig:
     lift_spread: float = 0.02
     """Standard deviation of drawn lifts [m]."""
     steps: int = 3
-    """Steps of `gradient` down the slope."""
+    """Steps of `gradient` down the gradient."""
     rate: float = 0.015
     """Length of its first steps [m]; turns go ten times as far [rad]."""
     depth: int = 2
@@ -198,24 +199,24 @@ class _Around:
     def _downhill(self, tried: Sequence[Outlook], budget: int) -> list[Outlook]:
         """Move the best of `tried` downhill, and try where they get; spends up to `budget`."""
         config, rng = self._config, self._rng
-        each = SLOPE_COST * config.steps + config.steps
-        if budget < each:  # too little for a slope
+        each = GRADIENT_COST * config.steps + config.steps
+        if budget < each:  # too little for a gradient
             return self._closer(tried, budget)
         elites = sorted(tried, key=lambda o: o.rank, reverse=True)[: budget // each]
-        slopes, actions = self._lookahead.slopes(), [o.action for o in elites]
+        gradients, actions = self._lookahead.gradients(), [o.action for o in elites]
         descent = Descent((len(elites), 4), _scale(config))
         stuck = [False] * len(elites)
         jobs: list[Action] = []
         origins: list[str] = []
         for k in range(1, config.steps + 1):
-            told = slopes.of([(self._state, action) for action in actions])
-            self._lookahead.rollouts += SLOPE_COST * len(told)
+            of_actions = gradients.of([(self._state, action) for action in actions])
+            self._lookahead.rollouts += GRADIENT_COST * len(of_actions)
             by_place = np.zeros((len(elites), 4))
             for i, action in enumerate(actions):
-                slope = self.places.slope(told[i], action)
-                stuck[i] |= slope is None
+                gradient = self.places.gradient(of_actions[i], action)
+                stuck[i] |= gradient is None
                 if not stuck[i]:
-                    by_place[i] = slope
+                    by_place[i] = gradient
             changes = descent.step(by_place)
             for i, elite in enumerate(elites):
                 near = self.places.drawn(elite.action, rng, 1 / k)

@@ -3,7 +3,7 @@
 The straight carry of an action becomes a chain of way-points, which Adam moves together with the
 place by the adjoint of the solver. The tip goes along it as fast as it went along the straight
 line. Every iterate is run as it is, and the best is kept; the straight line is the first. Where a
-slope cannot be used, the next iterate is drawn around the best so far.
+gradient cannot be used, the next iterate is drawn around the best so far.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from ..worlds.episode import ALOFT_EVERY, Carry, Plan
 from ..worlds.state import WorldState
 from ..worlds.worlds import CALM, RETREAT_LEAST, Worlds
 from .descent import Descent
+from .gradients import LANES, gradients_for, loss_and_gradients
 from .places import MOST_GROWTH
-from .slopes import LANES, loss_and_slopes, slopes_for
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -67,8 +67,8 @@ class Bent:
     Attributes:
         path: the best; None where the straight one stayed the best, or there is none
         before: None where the tip takes nothing, the arm does not reach, or the place is the pick
-        steps: how many had a slope that could be used, the others were drawn
-        growth: largest of the slopes that were used
+        steps: how many had a gradient that could be used, the others were drawn
+        growth: largest of the gradients that were used
     """
 
     path: GripPath | None
@@ -86,7 +86,7 @@ class WayPoints:
 
     def __init__(self, task: Task, *, robot: str, precision: str = "float32") -> None:
         self._worlds = Worlds(task, LANES, robot=robot, lanes=LANES, precision=precision)
-        self._slopes = slopes_for(task, robot, precision)
+        self._gradients = gradients_for(task, robot, precision)
 
     def bend(self, jobs: Sequence[tuple[WorldState, Action]], config: WayPointConfig) -> list[Bent]:
         """The best path found for each action from its state, in the order given.
@@ -132,7 +132,7 @@ class WayPoints:
             worlds.restore(slot, worlds.state(slot))  # which looks at where it ended
             end = worlds.episodes[slot].snapshot
             before = jobs[slot][0].episode
-            loss, _, _ = loss_and_slopes(worlds.task, before, end.particle_q, end.body_q)
+            loss, _, _ = loss_and_gradients(worlds.task, before, end.particle_q, end.body_q)
             ran[slot] = Ran(loss, float(worlds.score(slot)), worlds.hash(slot))
         return ran
 
@@ -158,16 +158,16 @@ class WayPoints:
         used, growth = dict.fromkeys(slots, 0), dict.fromkeys(slots, 0.0)
         for _ in range(config.steps if slots else 0):
             paths = {slot: bends[slot].path(values[k]) for k, slot in enumerate(slots)}
-            told = self._slopes.by_knots({slot: led[slot] for slot in slots}, paths)
+            of_slots = self._gradients.by_knots({slot: led[slot] for slot in slots}, paths)
             by_value, drawn = np.zeros_like(values), set[int]()
             for k, slot in enumerate(slots):
-                slope = told.get(slot)
-                if slope is None or not slope.usable or slope.growth > MOST_GROWTH:
+                gradient = of_slots.get(slot)
+                if gradient is None or not gradient.usable or gradient.growth > MOST_GROWTH:
                     drawn.add(k)
                     continue
                 used[slot] += 1
-                growth[slot] = max(growth[slot], slope.growth)
-                by_value[k] = bends[slot].chained(values[k], slope.by_points, slope.by_times)
+                growth[slot] = max(growth[slot], gradient.growth)
+                by_value[k] = bends[slot].chained(values[k], gradient.by_points, gradient.by_times)
             change = descent.step(by_value)
             for k, slot in enumerate(slots):
                 near = found[k] + rngs[k].normal(0.0, config.rate, values.shape[1])

@@ -343,7 +343,7 @@ def test_nobody_takes_bent_paths_for_demonstrations(
     for given, expected in (
         (["--out", str(demo)], "another folder"),
         (["--out", str(demo.parent)], "holds something else"),
-        (["--out", str(tmp_path / "new"), "--depth", "1"], "--budget and --workers alone"),
+        (["--out", str(tmp_path / "new"), "--depth", "1"], "only --budget and --workers"),
         (["--out", str(tmp_path / "new"), "--budget", "4"], "costs 5"),
     ):
         assert main(["refine", str(demo), "--way-points", *given]) == 2

@@ -1,6 +1,6 @@
 """Planning: outlooks depend on state and action alone; searches keep to their budget and pay.
 
-Slopes, of bodies and of two actions too, are compared with differences of the same losses.
+Gradients, of bodies and of two actions too, are compared with differences of the same losses.
 """
 
 from dataclasses import replace
@@ -12,10 +12,10 @@ from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.planning import METHODS, Lookahead, SearchConfig, places, search
 from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.planning.follow import Follow
+from warp_deform.planning.gradients import ActionGradients, loss_and_gradients
 from warp_deform.planning.joint import move_both
 from warp_deform.planning.places import Places
 from warp_deform.planning.search import _Around
-from warp_deform.planning.slopes import Slopes, loss_and_slopes
 from warp_deform.planning.waypoints import WayPointConfig, WayPoints, _Bend
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.registry import task
@@ -184,12 +184,12 @@ def test_a_slope_that_is_too_chaotic_is_not_used_and_the_origin_says_so(started,
 def test_slopes_are_those_of_the_damped_rollout(started):
     worlds, _ = started
     job = worlds.state(1), _moves(worlds, 1, 1)[0]
-    slopes = Slopes(worlds.task, robot="ur5", precision="float32")
-    (first,), (again,) = slopes.of([job]), slopes.of([job])
+    gradients = ActionGradients(worlds.task, robot="ur5", precision="float32")
+    (first,), (again,) = gradients.of([job]), gradients.of([job])
     assert first.loss == again.loss and np.array_equal(first.by_place, again.by_place)
     undamped = task(LINE)
     undamped.slope_damping = None
-    (wild,) = Slopes(undamped, robot="ur5", precision="float32").of([job])
+    (wild,) = ActionGradients(undamped, robot="ur5", precision="float32").of([job])
     assert first.growth < 1e4 and wild.growth > 10 * first.growth
 
 
@@ -200,7 +200,7 @@ def test_slopes_are_those_of_the_damped_rollout(started):
 def block():
     worlds = Worlds("block-notarget", 2)
     worlds.reset({0: 3, 1: 4})
-    return worlds, Slopes(worlds.task, robot="ur5", precision="float32")
+    return worlds, ActionGradients(worlds.task, robot="ur5", precision="float32")
 
 
 def _near_miss(worlds):
@@ -210,16 +210,16 @@ def _near_miss(worlds):
 
 
 def test_slopes_of_a_task_with_a_body_are_those_of_differences(block):
-    worlds, slopes = block
+    worlds, gradients = block
     state, action = worlds.state(0), _near_miss(worlds)
-    told = slopes.of([(state, action)])[0]
-    assert told.usable and told.by_place.shape == (4,) and np.isfinite(told.growth)
+    computed = gradients.of([(state, action)])[0]
+    assert computed.usable and computed.by_place.shape == (4,) and np.isfinite(computed.growth)
     for at, step in zip(range(3, 7), (1e-3, 1e-3, 1e-2, 1e-3), strict=True):
         moved = [action + sign * step * np.eye(7)[at] for sign in (1, -1)]
-        plus, minus = slopes.of([(state, m) for m in moved])
+        plus, minus = gradients.of([(state, m) for m in moved])
         difference = (plus.loss - minus.loss) / (2 * step)
-        assert told.by_place[at - 3] == pytest.approx(difference, abs=2e-3)
-    assert np.linalg.norm(told.by_place[:2]) > 0.9, "as the block goes where it is put"
+        assert computed.by_place[at - 3] == pytest.approx(difference, abs=2e-3)
+    assert np.linalg.norm(computed.by_place[:2]) > 0.9, "as the block goes where it is put"
 
 
 def test_a_body_is_put_right_by_its_slope(block):
@@ -235,18 +235,18 @@ def test_a_body_is_put_right_by_its_slope(block):
 
 
 def test_slopes_of_two_actions_chain_through_the_state_between(block):
-    worlds, slopes = block
+    worlds, gradients = block
     state, first = worlds.state(0), _near_miss(worlds)
     follow = Follow.of(worlds.task, state.episode.snapshot, first)
     assert follow is not None and follow.body == 0
     second = replace(follow, like=first + np.array([0, 0, 0, -0.03, 0.01, 0.1, 0]))
-    by_first, by_second = slopes.of_pairs([(state, first, second)])[0]
+    by_first, by_second = gradients.of_pairs([(state, first, second)])[0]
     assert by_first.usable and by_second.usable and by_first.loss == by_second.loss
     for at, step in ((3, 1e-3), (5, 1e-2)):
         both = []
         for change in (step, -step):
             moved = first + change * np.eye(7)[at]
-            both.append(slopes.of_pairs([(state, moved, second)])[0][0].loss)
+            both.append(gradients.of_pairs([(state, moved, second)])[0][0].loss)
         difference = (both[0] - both[1]) / (2 * step)
         assert by_first.by_place[at - 3] == pytest.approx(difference, abs=5e-3)
     assert abs(by_first.by_place[2]) > 0.01, "a turn that the first makes stays"
@@ -257,12 +257,12 @@ def test_losses_are_differentiated_by_particles_and_bodies():
     worlds.reset({0: 0})
     episode = worlds.episodes[0]
     ends = [episode.snapshot.particle_q.astype(float), episode.snapshot.body_q.astype(float)]
-    loss, *by = loss_and_slopes(worlds.task, episode, *ends)
+    loss, *by = loss_and_gradients(worlds.task, episode, *ends)
     assert [g.shape for g in by] == [x.shape for x in ends] and all(g.any() for g in by)
     for x, g in zip(ends, by, strict=True):
         at, step = np.unravel_index(np.abs(g[..., :2]).argmax(), g[..., :2].shape), 1e-6
         x[at] += step
-        moved, _, _ = loss_and_slopes(worlds.task, episode, *ends)
+        moved, _, _ = loss_and_gradients(worlds.task, episode, *ends)
         x[at] -= step
         assert (moved - loss) / step == pytest.approx(g[at], rel=1e-3, abs=1e-5)
 

@@ -1,4 +1,4 @@
-"""How what is left to do changes with where an action places, by the solver's adjoint.
+"""Gradients of the task's loss with respect to where an action places, by the solver's adjoint.
 
 A heap of beads is chaotic: the exact derivative of where it ends is large and points nowhere. Where
 a task says so (`Task.slope_damping`), the rollout that is differentiated is damped more than the
@@ -21,11 +21,17 @@ from ..worlds.state import WorldState
 from ..worlds.worlds import Worlds
 from .follow import Follow
 
-__all__ = ["KnotSlope", "Slope", "Slopes", "loss_and_slopes", "slopes_for"]
+__all__ = [
+    "ActionGradients",
+    "KnotGradient",
+    "PlaceGradient",
+    "gradients_for",
+    "loss_and_gradients",
+]
 
 LANES = 8
 PLACE = slice(3, 7)
-"""The part of an action that slopes are taken by: place x, y [m], yaw [rad], lift [m]."""
+"""Of an action, what gradients are with respect to: place x, y [m], yaw [rad], lift [m]."""
 SETTLE = 0.3
 """How long a world runs on after the longest path, before the loss is taken [s]."""
 _MEMORY = 2**29  # bytes
@@ -33,7 +39,7 @@ _STEP = 1e-5  # of the finite differences of a path by its action, which is smoo
 
 
 @dataclass(frozen=True, eq=False)
-class Slope:
+class PlaceGradient:
     """Loss of the task after an action, and its derivatives by place x, y [1/m], yaw [1/rad] and by
     the lift [1/m], at which the tip goes on with the speeds of the same stage.
 
@@ -50,7 +56,7 @@ class Slope:
 
 
 @dataclass(frozen=True, eq=False)
-class KnotSlope:
+class KnotGradient:
     """The same by the knots of a path that was given: (K, 3) [1/m] and (K,) [1/s]."""
 
     loss: float
@@ -60,7 +66,7 @@ class KnotSlope:
     usable: bool
 
 
-_NONE = Slope(np.inf, np.zeros(4), np.inf, False)
+_NONE = PlaceGradient(np.inf, np.zeros(4), np.inf, False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +96,7 @@ class _Leg:
     bodies: np.ndarray
 
 
-class Slopes:
+class ActionGradients:
     """Worlds in which actions are differentiated, `LANES` at a time; `rollouts` counts them."""
 
     def __init__(self, task: Task, *, robot: str, precision: str) -> None:
@@ -99,32 +105,32 @@ class Slopes:
         self._run = DifferentiableRollout(self._worlds.solver, memory=_MEMORY, sleep=False)
         self.rollouts = 0
 
-    def of(self, jobs: Sequence[tuple[WorldState, Action]]) -> list[Slope]:
-        """The slope of every action from its state, in the order given."""
-        slopes: list[Slope] = []
+    def of(self, jobs: Sequence[tuple[WorldState, Action]]) -> list[PlaceGradient]:
+        """The gradient of every action from its state, in the order given."""
+        of_jobs: list[PlaceGradient] = []
         for first in range(0, len(jobs), LANES):
-            slopes += self._of_lanes(jobs[first : first + LANES])
+            of_jobs += self._of_lanes(jobs[first : first + LANES])
         self.rollouts += len(jobs)
-        return slopes
+        return of_jobs
 
     def of_pairs(
         self, jobs: Sequence[tuple[WorldState, Action, Follow]]
-    ) -> list[tuple[Slope, Slope]]:
-        """Slopes of the loss after two actions by the place of the first and of the second.
+    ) -> list[tuple[PlaceGradient, PlaceGradient]]:
+        """Gradients of the loss after two actions by the place of the first and of the second.
 
         The second picks what it follows where the first leaves it. Its loss is that of the task
         before the first. Speeds that the first leaves do not count: they die before the second.
         """
-        slopes: list[tuple[Slope, Slope]] = []
+        of_jobs: list[tuple[PlaceGradient, PlaceGradient]] = []
         for first in range(0, len(jobs), LANES):
-            slopes += self._of_pair_lanes(jobs[first : first + LANES])
+            of_jobs += self._of_pair_lanes(jobs[first : first + LANES])
         self.rollouts += 2 * len(jobs)
-        return slopes
+        return of_jobs
 
     def by_knots(
         self, jobs: Mapping[int, tuple[WorldState, Action]], paths: Mapping[int, GripPath]
-    ) -> dict[int, KnotSlope]:
-        """Slopes of up to `LANES` actions that take other paths than their own, by slot.
+    ) -> dict[int, KnotGradient]:
+        """Gradients of up to `LANES` actions that take other paths than their own, by slot.
 
         Slots whose tip takes nothing are left out.
         """
@@ -135,15 +141,15 @@ class Slopes:
         losses, ends = self._losses(leg, {slot: state.episode for slot, (state, _) in jobs.items()})
         gradients = self._backward(ends)
         growth = _growth(gradients, ends)
-        slopes = {}
+        of_slots = {}
         for k, slot in enumerate(leg.slots):
             by = gradients.way_points[slot], gradients.knot_times[slot]
             usable = bool(np.isfinite(losses[k]) and all(np.isfinite(part).all() for part in by))
-            slopes[slot] = KnotSlope(losses[k], *by, float(growth[k]), usable)
-        return slopes
+            of_slots[slot] = KnotGradient(losses[k], *by, float(growth[k]), usable)
+        return of_slots
 
-    def _of_lanes(self, jobs: Sequence[tuple[WorldState, Action]]) -> list[Slope]:
-        slopes = [_NONE] * len(jobs)
+    def _of_lanes(self, jobs: Sequence[tuple[WorldState, Action]]) -> list[PlaceGradient]:
+        of_jobs = [_NONE] * len(jobs)
         leg = self._leg(dict(enumerate(jobs)))
         if leg is not None:
             before = {slot: state.episode for slot, (state, _) in enumerate(jobs)}
@@ -151,17 +157,17 @@ class Slopes:
             gradients = self._backward(ends)
             growth = _growth(gradients, ends)
             for k, slot in enumerate(leg.slots):
-                slopes[slot] = _slope(leg, k, losses[k], gradients, float(growth[k]))
-        return slopes
+                of_jobs[slot] = _place_gradient(leg, k, losses[k], gradients, float(growth[k]))
+        return of_jobs
 
     def _of_pair_lanes(
         self, jobs: Sequence[tuple[WorldState, Action, Follow]]
-    ) -> list[tuple[Slope, Slope]]:
-        worlds, slopes = self._worlds, [(_NONE, _NONE)] * len(jobs)
+    ) -> list[tuple[PlaceGradient, PlaceGradient]]:
+        worlds, of_jobs = self._worlds, [(_NONE, _NONE)] * len(jobs)
         firsts = {slot: (state, action) for slot, (state, action, _) in enumerate(jobs)}
         leg = self._leg(firsts)
         if leg is None:
-            return slopes
+            return of_jobs
         between = {slot: worlds.state(slot) for slot in leg.slots}
         for slot, state in between.items():
             worlds.restore(slot, state)  # which looks at where the first ended
@@ -172,11 +178,14 @@ class Slopes:
         }
         second = self._leg(seconds)
         if second is None:
-            return slopes
+            return of_jobs
         losses, ends = self._losses(second, {slot: firsts[slot][0].episode for slot in firsts})
         after = self._backward(ends)
         growth = _growth(after, ends)
-        told = [_slope(second, k, losses[k], after, float(growth[k])) for k in range(len(losses))]
+        of_seconds = [
+            _place_gradient(second, k, losses[k], after, float(growth[k]))
+            for k in range(len(losses))
+        ]
         particles, bodies = np.zeros_like(leg.particles), np.zeros_like(leg.bodies)
         for k, slot in enumerate(second.slots):
             at = leg.slots.index(slot)
@@ -193,9 +202,9 @@ class Slopes:
             at = leg.slots.index(slot)
             most = float(ends.most()[k])
             grown = float(whole[at]) / most if most > 0 else np.inf
-            first = _slope(leg, at, losses[k], gradients, grown)
-            slopes[slot] = first, told[k]
-        return slopes
+            first = _place_gradient(leg, at, losses[k], gradients, grown)
+            of_jobs[slot] = first, of_seconds[k]
+        return of_jobs
 
     def _leg(
         self,
@@ -223,18 +232,18 @@ class Slopes:
 
     def _losses(self, leg: _Leg, before: Mapping[int, RunningEpisode]) -> tuple[list[float], _Ends]:
         """The task's loss where each slot ends, and its derivatives."""
-        told = [
-            loss_and_slopes(self._worlds.task, before[slot], particles, bodies)
+        each_end = [
+            loss_and_gradients(self._worlds.task, before[slot], particles, bodies)
             for slot, particles, bodies in zip(leg.slots, leg.particles, leg.bodies, strict=True)
         ]
-        losses, by_particles, by_bodies = zip(*told, strict=True)
+        losses, by_particles, by_bodies = zip(*each_end, strict=True)
         return list(losses), _Ends(np.stack(by_particles), np.stack(by_bodies))
 
     def _backward(self, ends: _Ends) -> Gradients:
         return self._run.backward(ends.particles[:, None], bodies=ends.bodies[:, None])
 
 
-def loss_and_slopes(
+def loss_and_gradients(
     task: Task, episode: RunningEpisode, particle_q: np.ndarray, body_q: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """The task's loss of an end state, and its derivatives (P, 3) by particles, (B, 7) by bodies.
@@ -249,15 +258,17 @@ def loss_and_slopes(
         for array in (particle_q, body_q)
     ]
     value = task.loss(episode.layout, episode.snapshot, *ends)
-    slopes = torch.autograd.grad(value, ends, allow_unused=True, materialize_grads=True)
-    return value.item(), slopes[0].numpy(), slopes[1].numpy()
+    gradients = torch.autograd.grad(value, ends, allow_unused=True, materialize_grads=True)
+    return value.item(), gradients[0].numpy(), gradients[1].numpy()
 
 
-def _slope(leg: _Leg, k: int, loss: float, gradients: Gradients, growth: float) -> Slope:
+def _place_gradient(
+    leg: _Leg, k: int, loss: float, gradients: Gradients, growth: float
+) -> PlaceGradient:
     """Of the k-th slot of a leg."""
     by_place = _chained(leg, leg.slots[k], gradients, range(PLACE.start, PLACE.stop))
     usable = bool(np.isfinite(by_place).all() and np.isfinite(loss))
-    return Slope(loss, by_place, growth, usable)
+    return PlaceGradient(loss, by_place, growth, usable)
 
 
 def _growth(gradients: Gradients, ends: _Ends) -> np.ndarray:
@@ -300,6 +311,6 @@ def _by_turn(leg: _Leg, slot: int, gradients: Gradients) -> float:
 
 
 @functools.lru_cache(maxsize=2)
-def slopes_for(task: Task, robot: str, precision: str) -> Slopes:
+def gradients_for(task: Task, robot: str, precision: str) -> ActionGradients:
     """This process's worlds to differentiate actions in, built once and used again."""
-    return Slopes(task, robot=robot, precision=precision)
+    return ActionGradients(task, robot=robot, precision=precision)
