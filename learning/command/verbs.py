@@ -140,8 +140,8 @@ def report(options: ReportOptions) -> Outcome:
         raise InputError("no run is named; name folders that `warp-deform train` made with --out")
     from ..report.report import write_report
 
-    found = write_report(options.runs, options.out)
-    return Outcome(data=found.data, text=found.text)
+    written = write_report(options.runs, options.out)
+    return Outcome(data=written.data, text=written.text)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,16 +166,16 @@ def sweep(options: SweepOptions) -> Outcome:
 
     config = read_sweep(options.file)
     quiet_warp()
-    found = run_sweep(config, workers=options.workers, ray=options.ray)
+    outcome = run_sweep(config, workers=options.workers, ray=options.ray)
     failure = None
-    if found["failed"]:
-        first = found["failed"][0]
+    if outcome["failed"]:
+        first = outcome["failed"][0]
         failure = (
-            f"{len(found['failed'])} of {found['runs']} runs failed; first {first['run']}: "
+            f"{len(outcome['failed'])} of {outcome['runs']} runs failed; first {first['run']}: "
             f"{first['error']}"
         )
-    done = found["runs"] - len(found["failed"])
-    text = f"{done} of {found['runs']} runs are done, {found['skipped']} were before"
-    if found["report"] is not None:
-        text += f"; tables and curves: {found['report']}"
-    return Outcome(data=found, text=text, failure=failure)
+    done = outcome["runs"] - len(outcome["failed"])
+    text = f"{done} of {outcome['runs']} runs are done, {outcome['skipped']} were before"
+    if outcome["report"] is not None:
+        text += f"; tables and curves: {outcome['report']}"
+    return Outcome(data=outcome, text=text, failure=failure)

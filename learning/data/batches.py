@@ -124,12 +124,12 @@ def state_batch(
         InputError: a lift is no stage's.
     """
     grid, copies = data.task.grid, data.task.rotated_copies
-    found, transforms = [], []
+    pairs, transforms = [], []
     for state, action in (data.state(*each) for each in moments):
-        found.append((state, action))
+        pairs.append((state, action))
         if augment:  # drawn between the moments, which `rng` may draw too
             transforms.append(draw_transform(action, rng=rng, grid=grid, copies=copies))
-    states, actions = (np.stack(each) for each in zip(*found, strict=True))
+    states, actions = (np.stack(each) for each in zip(*pairs, strict=True))
     if augment:
         states = move_states(data.task.ground_truth_rows, states, transforms)
         actions = move_actions(actions, transforms)

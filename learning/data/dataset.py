@@ -150,9 +150,9 @@ class Demonstrations:
 
     def spared(self, count: int) -> Demonstrations:
         """So many others, drawn from those that are not among these."""
-        found = copy.copy(self)
-        found._take(choose(self._rest, count, seed=self._seed))
-        return found
+        spared = copy.copy(self)
+        spared._take(choose(self._rest, count, seed=self._seed))
+        return spared
 
     def __len__(self) -> int:
         """Number of demonstrations."""
@@ -194,15 +194,15 @@ class Demonstrations:
 
     def moment(self, episode: int, t: int) -> Moment:
         """Moment t of a demonstration; its goal is how the demonstration ended (hindsight)."""
-        found = self._episodes[episode]
-        rows = np.load(found.path, mmap_mode="r", allow_pickle=False)
+        recorded = self._episodes[episode]
+        rows = np.load(recorded.path, mmap_mode="r", allow_pickle=False)
         now, end = rows[t], rows[-1]
         return Moment(
             np.array(now["color"]),
             np.array(now["height"]),
             np.array(end["color"]),
             np.array(end["height"]),
-            found.actions[t],
+            recorded.actions[t],
         )
 
     def state(self, episode: int, t: int) -> tuple[np.ndarray, np.ndarray]:
@@ -211,12 +211,12 @@ class Demonstrations:
         Where the task has a goal, the second half is the goal's state: here that of the
         demonstration's end (hindsight), as in `moment`.
         """
-        found = self._episodes[episode]
-        state = found.ground_truth[t].copy()
+        recorded = self._episodes[episode]
+        state = recorded.ground_truth[t].copy()
         if self.task.goal_conditioned:
             half = len(state) // 2
-            state[half:] = found.ground_truth[-1, :half]
-        return state, found.actions[t]
+            state[half:] = recorded.ground_truth[-1, :half]
+        return state, recorded.actions[t]
 
 
 def _counts(entry: Mapping[str, Any]) -> bool:

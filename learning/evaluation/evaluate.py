@@ -126,10 +126,10 @@ def stopped_early(run: RunFolder) -> bool:
     for step in filter(None, run.steps()):
         kept = _Kept(run, step, protocol, by=settings.get("versions"))
         if kept.whole:
-            found = summarise([kept.played[seed] for seed in protocol.seeds], task=kept.task)
-            if found["n_success"] == episodes:
+            summary = summarise([kept.played[seed] for seed in protocol.seeds], task=kept.task)
+            if summary["n_success"] == episodes:
                 return True
-            values.append(found[measure(kept.task)])
+            values.append(summary[measure(kept.task)])
     waited = len(values) - 1 - int(np.argmax(values or [0]))
     return patience is not None and waited >= patience
 
@@ -321,7 +321,7 @@ def _read_played(path: Path) -> dict[int, Played]:
     what = f"{path} is damaged, remove it to have its episodes played again"
     record = read_json(path)
     check_fields(record, {"episodes": list}, what=what)
-    found = {}
+    episodes = {}
     for entry in record["episodes"]:
         check_fields({"episode": entry}, {"episode": dict}, what=what)
         entry.setdefault("enclosed", None)  # as nobody asked once
@@ -330,5 +330,5 @@ def _read_played(path: Path) -> dict[int, Played]:
         for distance in distances or ():
             check_fields({"goal_l2": distance}, {"goal_l2": float}, what=what)
         values = {**entry, "goal_l2": None if distances is None else tuple(distances)}
-        found[entry["seed"]] = Played(**{name: values[name] for name in _PLAYED})
-    return found
+        episodes[entry["seed"]] = Played(**{name: values[name] for name in _PLAYED})
+    return episodes

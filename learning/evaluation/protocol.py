@@ -128,8 +128,8 @@ def goals_of(folder: Path, protocol: Protocol, seeds: Sequence[int]) -> dict[int
     reader = EpisodeReader(folder)
     number = protocol.n_goals if protocol.given is None else len(reader)
     turns = {seed: (seed - protocol.seeds.start) % number for seed in seeds}
-    found = {k: load_goal(reader.path(reader.seeds[k])) for k in set(turns.values())}
-    return {seed: found[k] for seed, k in turns.items()}
+    goals = {k: load_goal(reader.path(reader.seeds[k])) for k in set(turns.values())}
+    return {seed: goals[k] for seed, k in turns.items()}
 
 
 def check_goals(folder: Path, task: str) -> Path:

@@ -88,7 +88,7 @@ def evaluate_run(
 
     def play(what: str, of: Sequence[int], protocol: Protocol) -> list[Evaluation]:
         count = workers or max(1, min(joblib.cpu_count(), protocol.episodes // _LEAST_EPISODES))
-        total, found = len(of) * protocol.episodes, []
+        total, evaluations = len(of) * protocol.episodes, []
         with progress_bar(f"eval {task}, {what}", total, shown=progress) as advance:
             for step in of:
                 solved: list[bool] = []
@@ -98,8 +98,10 @@ def evaluate_run(
                     advance()
                     advance.note = f"step {step}: {sum(solved)} of {len(solved)} solved"
 
-                found.append(evaluate_snapshot(run, step, protocol, workers=count, heard=heard))
-        return found
+                evaluations.append(
+                    evaluate_snapshot(run, step, protocol, workers=count, heard=heard)
+                )
+        return evaluations
 
     validation = Protocol(
         split="validation",
@@ -193,10 +195,10 @@ def _beside(
     earlier: Mapping[str, Any], report: Mapping[str, Any], first_seed: int
 ) -> dict[str, Any]:
     """An earlier evaluation, or one without a test, with results on other seeds beside it."""
-    found = dict(earlier) or {**report, "test": None, "paper": None}
+    combined = dict(earlier) or {**report, "test": None, "paper": None}
     played = {"first_seed": first_seed, **{key: report[key] for key in _OWN}}
-    found["other_seeds"] = {**report["other_seeds"], str(first_seed): played}
-    return found
+    combined["other_seeds"] = {**report["other_seeds"], str(first_seed): played}
+    return combined
 
 
 def _earlier(run: RunFolder) -> dict[str, Any]:

@@ -85,8 +85,8 @@ def heat_maps(
     attention = agent.attention(image).flatten().softmax(0)
     transport = agent.transport(image, pick, n_rotations=config.n_rotations_eval)
     place = transport.flatten().softmax(0).view(-1, *config.shape).amax(0)
-    found = (each.view(config.shape).cpu().numpy() for each in (attention, place))
-    return HeatMaps(*(_enlarge(each, config.scale) for each in found))
+    maps = (each.view(config.shape).cpu().numpy() for each in (attention, place))
+    return HeatMaps(*(_enlarge(each, config.scale) for each in maps))
 
 
 def film_episodes(

@@ -247,7 +247,7 @@ def _recordings(source: Path) -> list[tuple[int, int]]:
                 f"{source} has no folder {part!r}; give a task's folder of the original, with "
                 f"{', '.join(_PARTS)}"
             ) from error
-    found: dict[int, int] = {}
+    steps_by_number: dict[int, int] = {}
     for name in sorted(set().union(*names.values())):
         match = _NAME.fullmatch(name)
         lacking = [part for part in _PARTS if name not in names[part]]
@@ -257,12 +257,12 @@ def _recordings(source: Path) -> list[tuple[int, int]]:
         if lacking:
             raise InputError(f"{source / lacking[0] / name} is missing")
         number, steps = int(match[1]), int(match[2])
-        if number in found:
+        if number in steps_by_number:
             raise InputError(f"{source} has two episodes of number {number}")
-        found[number] = steps
-    if not found:
+        steps_by_number[number] = steps
+    if not steps_by_number:
         raise InputError(f"{source} holds no episodes")
-    return sorted(found.items())
+    return sorted(steps_by_number.items())
 
 
 def _pictures(value: Any, steps: int, dtype: type) -> list[np.ndarray]:

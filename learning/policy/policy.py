@@ -153,12 +153,12 @@ class ImagePolicy:
             aim = _picture(observation, "goal_") if goal is None else _picture(goal, "")
         device = next(self.agent.parameters()).device
         image = self.agent.image(current, aim)[None].to(device)
-        found = self.agent.act(image, avoid=self._near(avoid) if len(avoid) else None)
+        choice = self.agent.act(image, avoid=self._near(avoid) if len(avoid) else None)
         grid = self._task.grid
-        pick, place = grid.to_world(found.pick[0]), grid.to_world(found.place[0])
+        pick, place = grid.to_world(choice.pick[0]), grid.to_world(choice.place[0])
         yaw = self._task.pick_yaw(current[0], pick)
-        place_yaw = found.place_yaw[0] if yaw == 0.0 else wrap_angle(yaw + found.place_yaw[0])
-        return np.array([*pick, yaw, *place, place_yaw, found.lift[0]])
+        place_yaw = choice.place_yaw[0] if yaw == 0.0 else wrap_angle(yaw + choice.place_yaw[0])
+        return np.array([*pick, yaw, *place, place_yaw, choice.lift[0]])
 
     def memory(self) -> Memory:
         """A new episode's memory, whose `Memory.avoid` is for `act`."""
@@ -271,7 +271,7 @@ def _changed(now: np.ndarray, before: np.ndarray) -> bool:
 
 def _picture(source: Mapping[str, np.ndarray], prefix: str) -> tuple[np.ndarray, np.ndarray]:
     """Colour and height under the names `prefix` + "color" and "height"."""
-    found = []
+    arrays = []
     for name, shape, kind in (("color", (*SHAPE, 3), np.uint8), ("height", SHAPE, np.float32)):
         array = source.get(prefix + name)
         if array is None:
@@ -282,5 +282,5 @@ def _picture(source: Mapping[str, np.ndarray], prefix: str) -> tuple[np.ndarray,
                 f"{prefix + name}: shape {shape} of {np.dtype(kind)} is needed, got {array.shape} "
                 f"of {array.dtype}"
             )
-        found.append(array)
-    return found[0], found[1]
+        arrays.append(array)
+    return arrays[0], arrays[1]

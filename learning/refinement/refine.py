@@ -255,7 +255,7 @@ class _Searcher:
         there = worlds.hash(slot) == steps[t].state_hash
         recorded = steps[t].action if there else None
         lookahead = lookahead_for(worlds.task, worlds.robot.name, worlds.precision, _TRIED_AT_ONCE)
-        found = search(
+        outlooks = search(
             lookahead,
             worlds.task,
             worlds.state(slot),
@@ -263,11 +263,11 @@ class _Searcher:
             self._config,
             also=[] if recorded is None else [recorded],
         )
-        if not found:
+        if not outlooks:
             return None
-        best = found[0]
+        best = outlooks[0]
         if best.solved:  # the search goes by promise, but the score is what counts now
-            best = max((o for o in found if o.solved), key=lambda o: (o.grade, o.score))
+            best = max((o for o in outlooks if o.solved), key=lambda o: (o.grade, o.score))
         same = recorded is not None and best.action.tobytes() == recorded.tobytes()
         self.origins.append(RECORDED if same else best.origin)
         return best.action

@@ -134,12 +134,12 @@ def version_notes(runs: Sequence[RunResult]) -> list[str]:
     notes = []
     for members in _grouped(runs).values():
         for name in _VERSIONS:
-            found = {str(run.settings.get("versions", {}).get(name)) for run in members}
-            if len(found) > 1:
+            values = {str(run.settings.get("versions", {}).get(name)) for run in members}
+            if len(values) > 1:
                 first = members[0]
                 notes.append(
                     f"{first.task}, {first.agent}, {first.demos} demonstrations ({first.variant}): "
-                    f"trained by different versions of {name}, {', '.join(sorted(found))}, and "
+                    f"trained by different versions of {name}, {', '.join(sorted(values))}, and "
                     "taken together all the same"
                 )
     return notes
@@ -262,8 +262,8 @@ def _together(
 def _curve(snapshots: Sequence[Mapping[str, Mapping[str, Any]]], task: str) -> tuple[Point, ...]:
     """Results by step, over the runs that have the step."""
     steps = sorted({int(step) for each in snapshots for step in each})
-    found = []
+    points = []
     for step in steps:
         there = [_value(each[str(step)], task) for each in snapshots if str(step) in each]
-        found.append(Point(step, *_together(there)))
-    return tuple(found)
+        points.append(Point(step, *_together(there)))
+    return tuple(points)

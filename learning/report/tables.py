@@ -101,8 +101,8 @@ def csv_text(cells: Sequence[Cell]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     for cell in cells:
-        found = (column(cell) for column in columns.values())
-        writer.writerow("" if each is None else each for each in found)
+        values = (column(cell) for column in columns.values())
+        writer.writerow("" if each is None else each for each in values)
     return text.getvalue()
 
 

@@ -107,17 +107,17 @@ class RunFolder:
             raise InputError(
                 f"{self.path} holds no training run; `warp-deform train` makes one with --out"
             )
-        found, what = read_json(self.settings), f"{self.settings} is not what training writes"
-        check_fields(found, _SETTINGS, what=what)
-        check_fields(found["agent"], _AGENT, what=what)
-        check_fields(found["schedule"], {"steps": int}, what=what)
+        settings, what = read_json(self.settings), f"{self.settings} is not what training writes"
+        check_fields(settings, _SETTINGS, what=what)
+        check_fields(settings["agent"], _AGENT, what=what)
+        check_fields(settings["schedule"], {"steps": int}, what=what)
         optional = {"validate": int, "trained_steps": int, "versions": dict, "demonstrators": list,
                     "hold_out": int, "revisions": list}  # fmt: skip
-        check_fields(found, {k: v for k, v in optional.items() if k in found}, what=what)
-        check_fields({"patience": None, **found}, {"patience": (int, type(None))}, what=what)
-        if not all(seed.isdecimal() for seed in found["demonstrations"]):
+        check_fields(settings, {k: v for k, v in optional.items() if k in settings}, what=what)
+        check_fields({"patience": None, **settings}, {"patience": (int, type(None))}, what=what)
+        if not all(seed.isdecimal() for seed in settings["demonstrations"]):
             raise InputError(f"{what}: a demonstration is not named by its seed")
-        return found
+        return settings
 
     def read_report(self) -> dict[str, Any]:
         """What `eval_info.json` says, see `report_run.evaluate_run`.
@@ -125,10 +125,10 @@ class RunFolder:
         Raises:
             InputError: the file is missing or damaged.
         """
-        found = read_json(self.report)
+        report = read_json(self.report)
         what = f"{self.report} is not what this release's `warp-deform eval` writes, evaluate again"
-        check_fields(found, _REPORT, what=what)
-        return found
+        check_fields(report, _REPORT, what=what)
+        return report
 
     def snapshot(self, step: int) -> Path:
         """Path of the weights after so many steps."""
@@ -260,12 +260,12 @@ def read_json(path: Path) -> dict[str, Any]:
         InputError: the file is missing or holds something else.
     """
     try:
-        found = json.loads(path.read_bytes())
+        content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read as JSON") from error
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise InputError(f"{path} holds no JSON object")
-    return found
+    return content
 
 
 def write_json(path: Path, record: Mapping[str, Any]) -> None:
@@ -285,11 +285,11 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 def _digest(weights: Mapping[str, Tensor]) -> str:
     """BLAKE2b-128 of names and values."""
-    found = hashlib.blake2b(digest_size=16)
+    digest = hashlib.blake2b(digest_size=16)
     for name in sorted(weights):
-        found.update(name.encode())
-        found.update(weights[name].reshape(-1).view(torch.uint8).numpy().data)
-    return found.hexdigest()
+        digest.update(name.encode())
+        digest.update(weights[name].reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def _write_tensors(

@@ -51,20 +51,20 @@ def join_processes(device: str, *, threads: int) -> Iterator[Process]:
     """
     if device not in DEVICES:
         raise InputError(f"device is {device!r}; it must be 'cpu' or 'cuda'")
-    world, here = int(os.environ.get("WORLD_SIZE", 1)), torch.device(device)
+    world, torch_device = int(os.environ.get("WORLD_SIZE", 1)), torch.device(device)
     if device == "cuda":
-        here = _own_gpu()
-        torch.cuda.set_device(here)
+        torch_device = _own_gpu()
+        torch.cuda.set_device(torch_device)
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     if world > 1:
         torch.distributed.init_process_group(
             "nccl" if device == "cuda" else "gloo",
             timeout=_PATIENCE,
-            device_id=here if device == "cuda" else None,
+            device_id=torch_device if device == "cuda" else None,
         )
     try:
-        yield Process(rank(), world, here)
+        yield Process(rank(), world, torch_device)
     finally:
         if world > 1:
             torch.distributed.destroy_process_group()

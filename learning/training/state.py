@@ -82,7 +82,7 @@ class Trained:
         Raises:
             InputError: the state is damaged, or another run's.
         """
-        found, step, key = self._run.read_state()
+        stored, step, key = self._run.read_state()
         if not step:
             return 0
         for parameter in self.weights.values():
@@ -91,24 +91,26 @@ class Trained:
                 **{name: torch.zeros_like(parameter) for name in _MOMENTS},
             }
         wanted = self._tensors()
-        shapes, here = ({k: v.shape for k, v in each.items()} for each in (found, wanted))
-        if key != self._key or shapes != here:
+        stored_shapes, wanted_shapes = (
+            {k: v.shape for k, v in each.items()} for each in (stored, wanted)
+        )
+        if key != self._key or stored_shapes != wanted_shapes:
             raise InputError(f"{self._run.state} is another run's; train into another folder")
         with torch.no_grad():
             for name, each in wanted.items():
-                each.copy_(found[name])
+                each.copy_(stored[name])
         self.optimizer.param_groups[0]["steps"] = step
         return step
 
     def _tensors(self) -> dict[str, Tensor]:
         """Weights, average and moments under one name each; not copied."""
-        found = {f"weights.{name}": each.detach() for name, each in self.weights.items()}
+        tensors = {f"weights.{name}": each.detach() for name, each in self.weights.items()}
         if self._average is not None:
-            found |= {f"averaged.{name}": each for name, each in self._average.items()}
+            tensors |= {f"averaged.{name}": each for name, each in self._average.items()}
         for name, parameter in self.weights.items():
             for key in _MOMENTS:
-                found[f"{key}.{name}"] = self.optimizer.state[parameter][key]
-        return found
+                tensors[f"{key}.{name}"] = self.optimizer.state[parameter][key]
+        return tensors
 
 
 def on_cpu(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -132,7 +134,7 @@ def claim(
     processes: int,
     write: bool,
 ) -> str:
-    """Write the run's settings into its folder (where told to); returns their digest.
+    """Write the run's settings into its folder (if `write`); returns their digest.
 
     Raises:
         InputError: the folder holds another run.
@@ -157,11 +159,11 @@ def claim(
     if not write:
         return key
     if run.settings.exists():
-        found = read_json(run.settings)
-        _compare(run, json.loads(json.dumps(deciding)), found)
-        here, known = asdict(running_revision()), found.get("revisions", [])
-        if here not in known:
-            write_json(run.settings, {**found, "revisions": [*known, here]})
+        settings = read_json(run.settings)
+        _compare(run, json.loads(json.dumps(deciding)), settings)
+        revision, known = asdict(running_revision()), settings.get("revisions", [])
+        if revision not in known:
+            write_json(run.settings, {**settings, "revisions": [*known, revision]})
         return key
     if run.state.exists() or run.log.exists() or run.steps():
         raise InputError(
@@ -170,24 +172,24 @@ def claim(
     run.create()
     reader = EpisodeReader(config.data)
     names = sorted({reader.info(seed).demonstrator for seed in data.seeds})
-    told = {
+    described = {
         "data": str(config.data),
         "left_out": data.left_out,
         "demonstrators": names,
         "revisions": [asdict(running_revision())],
     }
-    write_json(run.settings, {**deciding, **told})
+    write_json(run.settings, {**deciding, **described})
     return key
 
 
-def _compare(run: RunFolder, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+def _compare(run: RunFolder, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
     """Refuse a folder whose settings are not those that are wanted."""
-    if "rounded" in found:
+    if "rounded" in stored:
         raise InputError(
             f"{run.path} is a shared policy, not trained further; choose another --out"
         )
     for name, value in wanted.items():
-        there = found.get(name)
+        there = stored.get(name)
         if there == value:
             continue
         if name == "versions" and isinstance(there, dict):

@@ -94,8 +94,8 @@ def train(config: TrainConfig) -> TrainReport:
     began = time.perf_counter()
     run = RunFolder(config.out)
     joined = join_processes(config.device, threads=config.threads)
-    with joined as here, run.nothing_by_halves():
-        rank, world, device = here
+    with joined as process, run.nothing_by_halves():
+        rank, world, device = process
         if config.exact:
             torch.backends.cudnn.allow_tf32 = False  # on by default, with 10 bits of mantissa
         # What is trained, and on what
@@ -112,12 +112,12 @@ def train(config: TrainConfig) -> TrainReport:
         agent = make_agent(description, seed=config.seed).to(device)
         held_out = HeldOut(agent, data.spared(config.hold_out)) if config.hold_out else None
         validation = Validation(
-            run, episodes=plan.validate, here=here, trained=data.seeds, task=config.task
+            run, episodes=plan.validate, process=process, trained=data.seeds, task=config.task
         )
         if not run.settings.exists():
             _rehearse(config, data, agent, plan, device)
         key = claim(run, config, plan, description, data, processes=world, write=rank == 0)
-        here.wait()
+        process.wait()
 
         # Go on where a run was interrupted, perhaps while its last snapshot was validated
         trained = Trained(agent, plan, run, key)
@@ -172,17 +172,20 @@ def train(config: TrainConfig) -> TrainReport:
                         log.flush()
                         trained.store(step)
 
-                # What is told meanwhile
+                # What is reported meanwhile
                 advance()
                 loss_so_far = log.last_loss()
-                parts = ["" if loss_so_far is None else f"loss {loss_so_far:.3g}", validation.told]
+                parts = [
+                    "" if loss_so_far is None else f"loss {loss_so_far:.3g}",
+                    validation.note,
+                ]
                 advance.note = ", ".join(filter(None, parts))
                 if due:
                     advance.milestone()
         if config.untrained and rank == 0:
             initial = dict(make_agent(description, seed=config.seed).named_parameters())
             run.write_snapshot(0, on_cpu(initial), {"agent": asdict(description)})
-        here.wait()
+        process.wait()
         steps = run.steps()
         return TrainReport(
             task=config.task,
@@ -195,7 +198,7 @@ def train(config: TrainConfig) -> TrainReport:
             planned_steps=plan.steps,
             patience=config.patience,
             snapshots=tuple(steps),
-            validation=validation.found,
+            validation=validation.results,
             loss=log.last_loss(),
             held_out=run.held_out(),
             seconds=time.perf_counter() - began,

@@ -1,6 +1,6 @@
-"""Validation while training: every snapshot plays the same episodes, which `eval` plays not again.
+"""Validation while training: every snapshot plays the same episodes; `eval` does not repeat them.
 
-It says when training has nothing left to gain, and, for who waits, how good the policy is by now.
+It says when training has nothing left to gain, and reports how good the policy is so far.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Validation"]
 
-_TOLD = ("n_success", "n_episodes", "mean_score")
+_REPORTED = ("n_success", "n_episodes", "mean_score")
 
 
 class Validation:
@@ -25,7 +25,7 @@ class Validation:
     Args:
         run: whose snapshots; its settings say what ends training
         episodes: of validation seeds that each plays; 0: nothing is played, and nothing ends
-        here: the first process plays, the others wait
+        process: of rank 0 plays, others wait
         trained: seeds of the demonstrations
         task: its name
 
@@ -34,13 +34,13 @@ class Validation:
     """
 
     def __init__(
-        self, run: RunFolder, *, episodes: int, here: Process, trained: Iterable[int], task: str
+        self, run: RunFolder, *, episodes: int, process: Process, trained: Iterable[int], task: str
     ) -> None:
-        self._run, self._here = run, here
+        self._run, self._process = run, process
         self._protocol: Protocol | None = None
-        self.told = ""
+        self.note = ""
         """How the snapshot that played last did, in a few words."""
-        self.found: dict[int, dict[str, Any]] = {}
+        self.results: dict[int, dict[str, Any]] = {}
         """`n_success`, `n_episodes` and `mean_score` of snapshots by step."""
         if episodes:
             from ..evaluation.protocol import Protocol, check_splits  # loads the simulator
@@ -54,12 +54,12 @@ class Validation:
             return False
         from ..evaluation.evaluate import evaluate_snapshot, stopped_early
 
-        for step in steps if self._here.rank == 0 else ():
-            found = evaluate_snapshot(self._run, step, self._protocol).summary
-            self.found[step] = {name: found[name] for name in _TOLD}
-            self.told = (
-                f"validation {found['n_success']} of {found['n_episodes']} solved, "
-                f"mean score {found['mean_score']:.3f}"
+        for step in steps if self._process.rank == 0 else ():
+            summary = evaluate_snapshot(self._run, step, self._protocol).summary
+            self.results[step] = {name: summary[name] for name in _REPORTED}
+            self.note = (
+                f"validation {summary['n_success']} of {summary['n_episodes']} solved, "
+                f"mean score {summary['mean_score']:.3f}"
             )
-        self._here.wait()
+        self._process.wait()
         return stopped_early(self._run)
