@@ -88,7 +88,7 @@ class EvalOptions(EvalSettings, CommandOptions):
     videos: Annotated[int, arg(metavar="N"), COUNT] = 4
     """Videos at most."""
     no_video_arm: bool = False
-    """With --video, leave out the films with the arm: pictures and heat maps alone are quicker."""
+    """Do not film the arm with --video: pictures and heat maps alone are quicker."""
     share: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to be made: a run's with the chosen snapshot alone, in half its bytes, to hand on."""
     workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
