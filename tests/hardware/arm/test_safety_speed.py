@@ -145,14 +145,19 @@ def test_the_page_names_the_limits_as_they_are() -> None:
     rows = {row[0]: row[1] for row in cells if len(row) == 3}
     expected = {
         "workspace": [*FLAT.x, *FLAT.y, FLAT.margin_m],
-        "floor, ceiling": [FLAT.min_tcp_height_m, FLAT.max_z_m, 3],
+        "floor": [FLAT.min_tcp_height_m],
+        "corners of the open fingers and the hand": [3],
+        "ceiling": [FLAT.max_z_m],
         "lean of the hand": [FLAT.max_tilt_rad, round(np.degrees(FLAT.max_tilt_rad))],
-        "speed of the TCP": [FLAT.max_speed, FLAT.max_descent_speed],
+        "speed of the TCP": [FLAT.max_speed],
+        "speed of the TCP downwards": [FLAT.max_descent_speed],
         "turning of the hand": [MAX_TURN_SPEED],
         "joint speed between poses": [FLAT.max_joint_speed, 0.2],
-        "joints": [100 * FLAT.joint_margin, FLAT.max_joint_step_rad],
-        "fingers": [FLAT.max_grasp_force_N],
-        "arrival": [1e3 * FLAT.arrival_tolerance_m, round(np.degrees(FLAT.arrival_tolerance_rad))],
+        "joint positions": [100 * FLAT.joint_margin],
+        "joint step": [FLAT.max_joint_step_rad],
+        "force of the fingers": [FLAT.max_grasp_force_N],
+        "arrival, distance": [1e3 * FLAT.arrival_tolerance_m],
+        "arrival, angle": [round(np.degrees(FLAT.arrival_tolerance_rad))],
         "below 0.05 m above the table": [FLAT.max_contact_force_N],
     }
     for what, numbers in expected.items():

@@ -307,8 +307,9 @@ def test_a_step_of_calibrate_has_its_own_flags(
 
 def test_the_documented_lines_of_calibrate_are_understood() -> None:
     text = (ROOT / "docs" / "hardware.md").read_text()
-    lines = re.findall(r"^\| `franka (calibrate [a-z]+(?: [^`]*)?)`", text, re.MULTILINE)
+    lines = re.findall(r"^    warp-deform franka (calibrate .+)$", text, re.MULTILINE)
     assert {line.split()[1] for line in lines} == STEPS.keys()
+    assert any("--pairs" in line for line in lines)
     for line in lines:
         words = line.replace("--table-z Z", "--table-z -0.02").split()
         assert _parse("warp-deform franka", franka, words) is not None, line
