@@ -7,11 +7,12 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 
-.PHONY: help venv demo test lint format bench docs clean
+.PHONY: help venv demo test check lint format bench docs clean
 
 help:
 	@echo "make demo    demonstrations of cable-shape and bag-items-1 and their videos, under demo/"
 	@echo "make test    the tests, on every core"
+	@echo "make check   lint, and the quick half of the tests: while you edit"
 	@echo "make lint    ruff and mypy"
 	@echo "make format  let ruff rewrite what it can"
 	@echo "make bench   time the simulator"
@@ -36,6 +37,10 @@ demo: $(STAMP)
 # Neighbours share kernels and fixtures: a worker begins with a run of them, and steals later.
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto --dist worksteal --durations 20 tests
+
+# What tests/slow.txt lists is left out.
+check: lint
+	$(BIN)/python -m pytest -n auto --dist worksteal --quick -q tests
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -10,6 +10,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import pytest
 import warp
+from fixtures.places import ROOT, TESTS
 
 # Newton's kernels only run forward here; without their adjoints they compile in a third of the time
 warp.config.enable_backward = False
@@ -17,6 +18,21 @@ warp.config.enable_backward = False
 # a shell that runs the suite in the background has it ignore Ctrl-C, and so would what tests start
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+SLOW = frozenset((TESTS / "slow.txt").read_text().split())
+"""Files that take long, as `benchmarks/test_times.py` found."""
+
+
+def pytest_addoption(parser):
+    parser.addoption("--quick", action="store_true", help="leave out what tests/slow.txt lists")
+
+
+def pytest_ignore_collect(collection_path, config):
+    """True leaves a file out; None leaves the choice to others."""
+    if config.getoption("--quick") and collection_path.is_relative_to(ROOT):
+        return collection_path.relative_to(ROOT).as_posix() in SLOW or None
+    return None
 
 
 @pytest.fixture(scope="module")

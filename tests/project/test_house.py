@@ -69,3 +69,9 @@ def test_version_is_the_same_everywhere() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {warp_deform.__version__}\n" in citation
     assert re.fullmatch(r"\d+\.\d+\.\d+", warp_deform.__version__)
+
+
+def test_slow_files_exist_and_are_some() -> None:
+    slow = (ROOT / "tests" / "slow.txt").read_text().split()
+    assert slow == sorted(set(slow)) and all((ROOT / name).is_file() for name in slow)
+    assert 0 < len(slow) < len(list((ROOT / "tests").rglob("test_*.py"))) / 2
