@@ -185,10 +185,10 @@ def test_outcomes() -> None:
     assert (np.diff(report.frames.times) > 0).all()
 
 
-def test_the_demonstrator_solves_most_of_a_few_seeds(tmp_path: Path) -> None:
+def test_the_demonstrator_solves_most_of_twenty_seeds(tmp_path: Path) -> None:
     side, act = worlds(8), demonstrator("scripted")
     runs = {}
-    for slot, run in play(side, range(8), act=act, look=observe):
+    for slot, run in play(side, range(20), act=act, look=observe):
         runs[run.seed] = run
         if run.seed == 0:
             EpisodeWriter(tmp_path).write(record(side, slot, run, demonstrator="scripted"))
@@ -198,7 +198,7 @@ def test_the_demonstrator_solves_most_of_a_few_seeds(tmp_path: Path) -> None:
     assert stored.info.task == NAME and len(stored.steps) == len(runs[0].actions) + 1
     np.testing.assert_array_equal(stored.steps[0].color, runs[0].rows[0].color)
     solved = [run for run in runs.values() if run.ended == SOLVED]
-    assert len(solved) >= 5
+    assert len(solved) >= 13
     assert 3.0 < np.mean([len(run.actions) for run in solved]) < 8.0
     outcomes = [outcome for run in runs.values() for outcome in run.outcomes]
     assert outcomes.count("placed") > 0.9 * len(outcomes)
