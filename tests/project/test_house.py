@@ -6,6 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
+import cv2
 import pytest
 from fixtures.places import ROOT
 
@@ -46,6 +47,16 @@ def test_text_holds_no_machine_path_and_nothing_undone(path: Path) -> None:
 def test_readme_is_short() -> None:
     for readme in ROOT.glob("README.md"):
         assert len(readme.read_text().splitlines()) <= 120
+
+
+def test_readme_moves_and_pictures_are_small() -> None:
+    """A picture that is loaded with a page has 2 MB at most; the README's has many frames."""
+    (picture,) = re.findall(r"!\[[^\]]+\]\((\S+)\)", (ROOT / "README.md").read_text())
+    moving = cv2.imreadanimation(str(ROOT / picture))[1]
+    assert len(moving.frames) > 50 and moving.loop_count == 0
+    pictures = [path for path in (ROOT / "docs" / "images").iterdir() if path.is_file()]
+    assert ROOT / picture in pictures
+    assert [path.name for path in pictures if path.stat().st_size > 2e6] == []
 
 
 def test_constraints_pin_versions_and_name_no_host() -> None:
