@@ -30,7 +30,7 @@ def seconds_by_file(report: Path) -> dict[str, float]:
 
 
 def slow_files(seconds: dict[str, float], budget: float) -> list[str]:
-    """All but the quickest files whose times sum up to `budget` [s], in the order of their names."""
+    """All but the quickest files whose times sum up to `budget` [s], by name."""
     left = budget
     slow = []
     for name, time in sorted(seconds.items(), key=lambda item: item[1]):
