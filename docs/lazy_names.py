@@ -1,4 +1,4 @@
-"""Names that a package hands on by `hand_on`, for the reference pages, which read and never import.
+"""Lazy names of packages (`lazy_exports`) for the reference pages, which read and never import.
 
 A griffe extension. A package says in `_HOME` which module defines each name; what reads the source
 alone sees neither the names nor the `__all__` that is computed from them.

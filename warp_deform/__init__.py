@@ -12,7 +12,7 @@ The public names below load their modules on first use.
 
 from __future__ import annotations
 
-from .support.handed_on import hand_on
+from .support.lazy_exports import lazy_exports
 from .support.version import __version__
 from .tasks.registration import register_environments, register_task
 
@@ -30,7 +30,7 @@ _HOME = {
 
 __all__ = ["__version__", *_HOME, "register_task"]
 
-__getattr__ = hand_on(__name__, _HOME)
+__getattr__ = lazy_exports(__name__, _HOME)
 
 
 def __dir__() -> list[str]:

@@ -18,7 +18,7 @@ import warp_deform
 from warp_deform.tasks.registration import env_id, register_environments
 from warp_deform.tasks.registry import TASKS
 
-HAND_ON = {"warp_deform", "hardware", "warp_deform.solver"}
+RE_EXPORT = {"warp_deform", "hardware", "warp_deform.solver"}
 MODULES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     for package in ("warp_deform", "learning", "hardware")
@@ -94,11 +94,11 @@ def _targets(node: ast.stmt) -> list[str]:
 
 
 def test_a_public_name_has_one_import_path() -> None:
-    """What the packages of `HAND_ON` hand on from below is the one exception."""
+    """What the packages of `RE_EXPORT` re-export from below is the one exception."""
     listed: dict[tuple[str, str], list[str]] = {}
     for name in MODULES:
         module = importlib.import_module(name)
-        for public in getattr(module, "__all__", ()) if name not in HAND_ON else ():
+        for public in getattr(module, "__all__", ()) if name not in RE_EXPORT else ():
             value = getattr(module, public)
             if inspect.isclass(value) or inspect.isfunction(value):
                 listed.setdefault((value.__module__, value.__qualname__), []).append(name)

@@ -72,10 +72,10 @@ OPTIONAL = {
 }  # fmt: skip
 COMPUTED_IMPORTS = {
     "warp_deform/command/main.py",
-    "warp_deform/support/handed_on.py",
-    "warp_deform/tasks/elsewhere.py",
+    "warp_deform/support/lazy_exports.py",
+    "warp_deform/tasks/external.py",
 }
-ADDS_TO_PATH = {"warp_deform/tasks/elsewhere.py"}
+ADDS_TO_PATH = {"warp_deform/tasks/external.py"}
 """Where a user's own module is looked for."""
 FILES = sorted(path for package in MAY_IMPORT for path in (ROOT / package).rglob("*.py"))
 

@@ -216,7 +216,7 @@ def _dispatch(arguments: list[str]) -> int:
     check_flags(options)
     with _stdout_to_stderr():
         if options.task_module is not None:
-            from ..tasks.elsewhere import import_tasks
+            from ..tasks.external import import_tasks
 
             import_tasks(options.task_module)
         outcome = verb(options)
@@ -246,7 +246,7 @@ def _usage() -> str:
 
 def _completion() -> str:
     """The script that `--completion` prints: flags are those of every verb's help."""
-    from ..tasks.elsewhere import offered
+    from ..tasks.external import offered
     from ..tasks.registry import FURTHER_TASKS, TASKS
     from .completion import completion_script
 

@@ -5,7 +5,7 @@ The names load on first use, so that reading the configuration loads no simulato
 
 from __future__ import annotations
 
-from ..support.handed_on import hand_on
+from ..support.lazy_exports import lazy_exports
 
 _HOME = {
     "GradcheckConfig": ".config",
@@ -17,4 +17,4 @@ _HOME = {
 
 __all__ = list(_HOME)
 
-__getattr__ = hand_on(__name__, _HOME)
+__getattr__ = lazy_exports(__name__, _HOME)

@@ -5,7 +5,7 @@ The public names load on first use, so that reading a task loads neither Warp no
 
 from __future__ import annotations
 
-from ..support.handed_on import hand_on
+from ..support.lazy_exports import lazy_exports
 
 _HOME = {
     "DifferentiableRollout": ".differentiable",
@@ -22,4 +22,4 @@ _HOME = {
 
 __all__ = list(_HOME)
 
-__getattr__ = hand_on(__name__, _HOME)
+__getattr__ = lazy_exports(__name__, _HOME)

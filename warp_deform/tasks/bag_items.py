@@ -22,8 +22,8 @@ from .bag_physics import CARRY, INSERT, OPEN
 from .demonstrators import pick_place
 from .free_space import FreeSpace, first_that_fits
 from .ground_truth import Row, pose_rows
-from .past import PastAction
-from .shapes import to_world
+from .history import PastAction
+from .target_shapes import to_world
 from .task import Action, Layout, Snapshot, Stage
 
 if TYPE_CHECKING:

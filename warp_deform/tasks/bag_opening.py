@@ -22,10 +22,10 @@ from ..robots.primitive import PrimitiveConfig, find_grasp
 from .bag_physics import BAG_PRIMITIVE, BAG_SOLVER, INSERT, OPEN
 from .demonstrators import farthest_bead, pick_place, ring_maps, visible_point
 from .ground_truth import Row, Rows, pose_rows
+from .history import PastAction
 from .losses import mean_distance, ring_area
 from .metrics import hull_area
-from .past import PastAction
-from .shapes import chain_yaw
+from .target_shapes import chain_yaw
 from .task import Action, Layout, Snapshot, Task
 
 if TYPE_CHECKING:

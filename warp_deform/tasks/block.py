@@ -18,7 +18,7 @@ from .demonstrators import pick_place_pose, visible_point
 from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows
 from .metrics import pose_error, wrap_angle
-from .shapes import to_world
+from .target_shapes import to_world
 from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:

@@ -33,8 +33,8 @@ from .chain_shapes import curved_chain, straight_chain, tossed_chain
 from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows
 from .metrics import mask_iou
-from .shapes import chain_yaw
 from .strand_grasp import find_grasp, map_direction, wrap_half_turn
+from .target_shapes import chain_yaw
 from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:

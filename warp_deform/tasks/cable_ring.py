@@ -20,7 +20,7 @@ from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows
 from .losses import mean_distance
 from .metrics import hull_area
-from .shapes import chain_yaw
+from .target_shapes import chain_yaw
 from .task import Action, Layout, Snapshot, Task
 
 if TYPE_CHECKING:

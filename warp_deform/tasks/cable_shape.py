@@ -20,7 +20,7 @@ from .free_space import FreeSpace
 from .ground_truth import Row, Rows, pose_rows
 from .losses import mean_distance
 from .metrics import share_in_zone, wrap_angle
-from .shapes import chain_yaw, sample_shape, to_world
+from .target_shapes import chain_yaw, sample_shape, to_world
 from .task import Action, Layout, Snapshot, Task
 
 if TYPE_CHECKING:

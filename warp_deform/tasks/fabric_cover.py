@@ -20,7 +20,7 @@ from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows
 from .losses import cover_distance
 from .metrics import wrap_angle
-from .shapes import to_world
+from .target_shapes import to_world
 from .task import Action, Layout, Snapshot, Stage, Task
 
 if TYPE_CHECKING:

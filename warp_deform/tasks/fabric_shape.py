@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..rendering.pixels import SHAPE, pixel_to_world
-from .shapes import to_world
+from .target_shapes import to_world
 
 __all__ = ["fold_corner", "square_corners", "square_mask"]
 

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from ..errors import InputError
 from .checking import check_task
-from .elsewhere import offered, offered_version
+from .external import offered, offered_version
 from .registry import FURTHER_TASKS, TASKS, add_task, registered
 from .task import Task
 

@@ -18,7 +18,7 @@ from .cable_mask_goal import CableMaskGoal
 from .cable_ring import CableRing, CableRingNotarget
 from .cable_shape import CableShape, CableShapeNotarget
 from .checking import check_task
-from .elsewhere import load_offered, offered
+from .external import load_offered, offered
 from .fabric_cover import FabricCover
 from .fabric_flat import FabricFlat, FabricFlatNotarget
 from .task import Task

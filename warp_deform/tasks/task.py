@@ -28,7 +28,7 @@ from ..robots.primitive import PrimitiveConfig, Stage
 from ..xpbd.config import SolverConfig
 from .free_space import FreeSpace
 from .ground_truth import Rows, row_count
-from .past import PastAction
+from .history import PastAction
 
 if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
     import newton

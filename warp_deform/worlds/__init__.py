@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from ..support.handed_on import hand_on
+from ..support.lazy_exports import lazy_exports
 
 _HOME = {
     "Worlds": ".worlds",
@@ -13,4 +13,4 @@ _HOME = {
 
 __all__ = list(_HOME)
 
-__getattr__ = hand_on(__name__, _HOME)
+__getattr__ = lazy_exports(__name__, _HOME)

@@ -14,7 +14,7 @@ from ..rendering.drawables import Drawables
 from ..robots.arm import Robot
 from ..robots.primitive import Grasp, Motion, Outcome, carry, find_grasp
 from ..rollout.launch import Frames, GripPath, Rollout
-from ..tasks.past import Aloft, PastAction
+from ..tasks.history import Aloft, PastAction
 from ..tasks.task import Layout, Snapshot, Task
 from ..xpbd.guards import Problem
 

@@ -32,7 +32,7 @@ from warp_deform.tasks.block import BlockNotarget
 from warp_deform.tasks.ground_truth import pose_rows, row_kinds, yaw_columns
 from warp_deform.tasks.registry import TASKS
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.tasks.shapes import sample_shape
+from warp_deform.tasks.target_shapes import sample_shape
 
 ACTION = np.array([0.45, -0.1, 0.0, 0.55, 0.2, 0.7, 0.04])
 turns = st.floats(-math.pi, math.pi)

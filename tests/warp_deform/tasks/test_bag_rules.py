@@ -14,7 +14,7 @@ from warp_deform.planning import Lookahead, Outlook, SearchConfig, demonstrators
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.bag_items import BagItems1, BagItems2
 from warp_deform.tasks.bag_physics import CARRY, INSERT, OPEN
-from warp_deform.tasks.past import Aloft, PastAction
+from warp_deform.tasks.history import Aloft, PastAction
 from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import TASKS
 from warp_deform.tasks.task import Layout, Snapshot

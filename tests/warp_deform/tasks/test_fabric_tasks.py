@@ -20,7 +20,7 @@ from warp_deform.tasks.fabric_flat import FabricFlat, FabricFlatNotarget
 from warp_deform.tasks.fabric_pull import beyond, corners, on_table, takes
 from warp_deform.tasks.fabric_shape import fold_corner, square_corners, square_mask
 from warp_deform.tasks.free_space import FreeSpace, NoFreeSpace
-from warp_deform.tasks.past import PastAction
+from warp_deform.tasks.history import PastAction
 from warp_deform.tasks.task import Layout, Snapshot, Task
 from warp_deform.worlds import Worlds
 from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng

@@ -11,7 +11,7 @@ from warp_deform.errors import InputError
 from warp_deform.objects.cable import CableConfig, cable_ring
 from warp_deform.rendering.pixels import PIXEL_SIZE, SHAPE, world_to_pixel
 from warp_deform.tasks.free_space import FreeSpace, NoFreeSpace
-from warp_deform.tasks.shapes import Shape, chain_yaw, sample_shape
+from warp_deform.tasks.target_shapes import Shape, chain_yaw, sample_shape
 
 
 def test_free_space_never_gives_a_covered_or_unreachable_pixel() -> None:

@@ -22,7 +22,7 @@ from warp_deform.tasks.cable_shape import CableShape, CableShapeNotarget
 from warp_deform.tasks.demonstrators import farthest_bead, ring_maps, visible_point
 from warp_deform.tasks.free_space import FreeSpace, NoFreeSpace
 from warp_deform.tasks.registry import TASKS, task
-from warp_deform.tasks.shapes import chain_yaw, to_world
+from warp_deform.tasks.target_shapes import chain_yaw, to_world
 from warp_deform.tasks.task import Layout, Snapshot
 
 quick = settings(derandomize=True, deadline=None, max_examples=40)

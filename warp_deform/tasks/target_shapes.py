@@ -1,4 +1,4 @@
-"""Target geometry of the cable-shape family: one to four sides of a rectangle.
+"""Target shapes of the cable-shape tasks: one to four sides of a rectangle.
 
 Source: Seita et al., ICRA 2021, appendix on the tasks, and the rules of the published code, which
 this follows to the bead: targets start at the +x side, and at a corner neighbours may be 30 %

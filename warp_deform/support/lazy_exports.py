@@ -1,4 +1,4 @@
-"""Names that a package hands on, each loaded when it is first asked for (PEP 562)."""
+"""Lazy exports of a package: public names that are loaded when first asked for (PEP 562)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import importlib
 import sys
 from collections.abc import Callable, Mapping
 
-__all__ = ["hand_on"]
+__all__ = ["lazy_exports"]
 
 
-def hand_on(package: str, homes: Mapping[str, str]) -> Callable[[str], object]:
+def lazy_exports(package: str, homes: Mapping[str, str]) -> Callable[[str], object]:
     """Return the `__getattr__` of a package.
 
     Args:

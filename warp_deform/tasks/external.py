@@ -1,4 +1,4 @@
-"""Tasks from elsewhere: those of installed distributions, and modules that the user names.
+"""Tasks from outside this package: of installed distributions, and of modules that the user names.
 
 A distribution offers tasks as entry points of the group `warp_deform.tasks`, whose names are the
 tasks', followed by `-v2` where the task's version is 2. Names are read from metadata; code is

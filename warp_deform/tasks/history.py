@@ -1,4 +1,4 @@
-"""What the actions of an episode so far did: what each held, and where things were when it hung."""
+"""The history of an episode: what each past action held, and where things were while it hung."""
 
 from __future__ import annotations
 
