@@ -19,9 +19,9 @@ from ..calibration.charuco import BoardSpec, Corners
 from ..cameras.camera import CameraIntrinsics
 from ..rig.config import RigConfig
 from ..support.json_file import read_json, read_numbers, require, write_json
-from .kept_measurements import Kept
+from .measurement_file import MeasurementFile
 
-__all__ = ["HandView", "kept_hand_views", "kept_lens_views"]
+__all__ = ["HandView", "hand_view_file", "lens_view_file"]
 
 T = TypeVar("T")
 
@@ -42,15 +42,15 @@ class HandView:
     corners: Corners
 
 
-def kept_hand_views(
+def hand_view_file(
     config: RigConfig, board: BoardSpec, intrinsics: CameraIntrinsics
-) -> Kept[HandView]:
+) -> MeasurementFile[HandView]:
     """Return the setup's kept views of `calibrate hand`, none yet or those of `views.json`.
 
     Raises:
         InputError: the file is damaged, or of another robot, camera, size of picture or board
     """
-    return _kept(
+    return _measurement_file(
         config.setup / "views.json",
         {"robot_id": config.robot_id, **_origin(config, board, intrinsics.size)},
         write=lambda view: {"base_T_tcp": view.base_T_tcp.tolist(), **_record(view.corners)},
@@ -58,13 +58,15 @@ def kept_hand_views(
     )
 
 
-def kept_lens_views(config: RigConfig, board: BoardSpec, size: tuple[int, int]) -> Kept[Corners]:
+def lens_view_file(
+    config: RigConfig, board: BoardSpec, size: tuple[int, int]
+) -> MeasurementFile[Corners]:
     """Return the setup's kept views of `calibrate lens`, none yet or those of `lens_views.json`.
 
     Raises:
         InputError: the file is damaged, or of another camera, size of picture or board
     """
-    return _kept(
+    return _measurement_file(
         config.setup / "lens_views.json",
         _origin(config, board, size),
         write=_record,
@@ -72,13 +74,13 @@ def kept_lens_views(config: RigConfig, board: BoardSpec, size: tuple[int, int]) 
     )
 
 
-def _kept(
+def _measurement_file(
     path: Path,
     origin: dict[str, Any],
     *,
     write: Callable[[T], dict[str, Any]],
     read: Callable[[object, str], T],
-) -> Kept[T]:
+) -> MeasurementFile[T]:
     """Views and their file, which holds what they are of beside them."""
 
     def write_all(path: Path, views: list[T]) -> None:
@@ -95,7 +97,7 @@ def _kept(
         rows = require(record, "views", list, what=f"views {path}")
         return [read(row, f"view {n} of {path}") for n, row in enumerate(rows, start=1)]
 
-    return Kept(path, "view", read=read_all, write=write_all)
+    return MeasurementFile(path, "view", read=read_all, write=write_all)
 
 
 def _origin(config: RigConfig, board: BoardSpec, size: tuple[int, int]) -> dict[str, Any]:

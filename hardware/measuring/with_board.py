@@ -40,8 +40,8 @@ from ..rig.config import RigConfig
 from ..rig.rig import open_camera, read_calibration
 from ..rig.workplace import workplace_of
 from ..support.json_file import write_json
-from .board_views import HandView, kept_hand_views, kept_lens_views
-from .kept_measurements import gather
+from .board_views import HandView, hand_view_file, lens_view_file
+from .measurement_file import gather
 from .steps import confirm, keep, lens_of, make_calibration, marked, open_arm, touched_table
 from .touch_off import close_fingers, touch_off
 
@@ -92,12 +92,12 @@ def measure_lens(
         np.array([[size[0], 0.0, size[0] / 2], [0.0, size[0], size[1] / 2], [0.0, 0.0, 1.0]]),
         np.zeros(0),
     )
-    kept = kept_lens_views(config, board, size)
+    measured = lens_view_file(config, board, size)
     path = config.setup / "lens.json"
     with camera or open_camera(config, rough) as device:
 
         def take(index: int) -> Corners:
-            name = f"view {index + 1} of {max(views, len(kept.items), index + 1)}"
+            name = f"view {index + 1} of {max(views, len(measured.items), index + 1)}"
             while operator.wait(f"{name}: hold the board still, tilted, elsewhere"):
                 try:
                     return find_corners(device.read().rgb, board)
@@ -108,10 +108,10 @@ def measure_lens(
         def fit(taken: list[Corners]) -> tuple[CameraIntrinsics, float]:
             return calibrate_intrinsics(taken, board, size)
 
-        with kept.guarded():
-            intrinsics, rms = gather(kept, wanted=views, take=take, fit=fit, operator=operator)
+        with measured.guarded():
+            intrinsics, rms = gather(measured, wanted=views, take=take, fit=fit, operator=operator)
             write_json(path, {"schema": 1, **intrinsics.to_record(), "error_px": rms})
-    kept.remove()
+    measured.remove()
     return {"lens": path, "error_px": rms}
 
 
@@ -261,11 +261,12 @@ def measure_hand_eye(
         camera or open_camera(config, lens) as device,
     ):
         intrinsics = device.read().intrinsics
-        kept = kept_hand_views(config, board, intrinsics)
+        measured = hand_view_file(config, board, intrinsics)
 
         def take(index: int) -> HandView:
+            count = max(views, len(measured.items), index + 1)
             text = (
-                f"view {index + 1} of {max(views, len(kept.items), index + 1)}: guide the hand so "
+                f"view {index + 1} of {count}: guide the hand so "
                 "that it sees the board from elsewhere, tilted by some 25 degrees, and hold still"
             )
             while operator.wait(text):
@@ -287,8 +288,8 @@ def measure_hand_eye(
                     raise PoorFit(f"view {index + 1}: {error}", worst=index) from error
             return calibrate_hand_eye(np.array([v.base_T_tcp for v in taken]), np.array(seen))
 
-        with kept.guarded():
-            hand_eye = gather(kept, wanted=views, take=take, fit=fit, operator=operator)
+        with measured.guarded():
+            hand_eye = gather(measured, wanted=views, take=take, fit=fit, operator=operator)
             confirm(operator, "release the user stop; the arm then goes home")
             # What a person has guided and looked through must not be lost to a stop still pressed.
             until_cleared(arm, operator, arm.home)
@@ -307,7 +308,7 @@ def measure_hand_eye(
                 },
             )
             path = keep(config, calibration)
-        kept.remove()
+        measured.remove()
     return {"calibration": path, "report": hand_eye.report(), "error_m": hand_eye.error_m}
 
 

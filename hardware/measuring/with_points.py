@@ -30,7 +30,7 @@ from ..episodes.operators import until_cleared
 from ..rig.config import REAL_ROBOTS, RigConfig
 from ..rig.rig import open_camera
 from ..rig.workplace import workplace_of
-from .kept_measurements import Kept, gather
+from .measurement_file import MeasurementFile, gather
 from .points_file import TouchedPoint, origin_line, read_points, write_points
 from .steps import confirm, keep, lens_of, make_calibration, marked, open_arm, touched_table
 from .touch_off import close_fingers
@@ -87,15 +87,15 @@ def measure_points(
         close_fingers(arm)
         with camera or open_camera(config, lens) as device:
             frame = device.read()
-        kept = _kept(config, frame.intrinsics, arm.limits)
+        measured = _measurement_file(config, frame.intrinsics, arm.limits)
         seen = config.setup / "points_seen.png"
 
         def take(index: int) -> TouchedPoint:
-            before, after = kept.items[:index], kept.items[index + 1 :]
+            before, after = measured.items[:index], measured.items[index + 1 :]
             circles = np.array([point[:2] for point in [*before, *after]]).reshape(-1, 2)
             picture = marked(frame.rgb, circles)
             write_picture(seen, picture)
-            name = f"point {index + 1} of {max(points, len(kept.items), index + 1)}"
+            name = f"point {index + 1} of {max(points, len(measured.items), index + 1)}"
             while True:
                 at = show(picture, f"{name}, a mark without a circle in {seen}", operator)
                 xy = None if at is None else _touched(arm, operator, name)
@@ -113,10 +113,10 @@ def measure_points(
         def fit(taken: list[TouchedPoint]) -> HomographyFit:
             return _fit(taken, frame.intrinsics, arm.limits)
 
-        with kept.guarded():
-            found = gather(kept, wanted=points, take=take, fit=fit, operator=operator)
-            data = _save(config, kept.items, found, frame.intrinsics, table)
-        kept.remove()
+        with measured.guarded():
+            found = gather(measured, wanted=points, take=take, fit=fit, operator=operator)
+            data = _save(config, measured.items, found, frame.intrinsics, table)
+        measured.remove()
     return data
 
 
@@ -276,9 +276,9 @@ def _two_numbers(said: str) -> tuple[float, float] | None:
     return (a, b) if math.isfinite(a) and math.isfinite(b) else None
 
 
-def _kept(
+def _measurement_file(
     config: RigConfig, intrinsics: CameraIntrinsics, limits: SafetyLimits
-) -> Kept[TouchedPoint]:
+) -> MeasurementFile[TouchedPoint]:
     origin = origin_line(config, intrinsics)
 
     def read(path: Path) -> list[TouchedPoint]:
@@ -289,7 +289,7 @@ def _kept(
             raise InputError(f"{path}: {error}; or remove that line") from error
         return points
 
-    return Kept(
+    return MeasurementFile(
         config.setup / "points.csv",
         "point",
         read=read,

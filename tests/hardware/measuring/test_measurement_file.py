@@ -21,7 +21,7 @@ from hardware.calibration.calibration import Calibration
 from hardware.calibration.charuco import BoardSpec, Corners
 from hardware.calibration.poor_fit import PoorFit
 from hardware.cameras.camera import CameraError
-from hardware.measuring.kept_measurements import Kept, gather
+from hardware.measuring.measurement_file import MeasurementFile, gather
 from hardware.measuring.with_board import measure_hand_eye, measure_lens
 from hardware.rig.config import RigConfig
 from hardware.rig.rig import read_intrinsics
@@ -33,8 +33,8 @@ VIEWS = 10
 # Gathering.
 
 
-def numbers(path: Path) -> Kept[int]:
-    return Kept(
+def numbers(path: Path) -> MeasurementFile[int]:
+    return MeasurementFile(
         path,
         "number",
         read=lambda path: json.loads(path.read_text())["numbers"],
@@ -43,7 +43,7 @@ def numbers(path: Path) -> Kept[int]:
 
 
 def test_the_worst_is_taken_again_and_the_old_one_kept_until_then(tmp_path: Path) -> None:
-    kept = numbers(tmp_path / "n.json")
+    measured = numbers(tmp_path / "n.json")
     taken: list[int] = []
 
     def take(index: int) -> int:
@@ -57,17 +57,17 @@ def test_the_worst_is_taken_again_and_the_old_one_kept_until_then(tmp_path: Path
             raise PoorFit("one is off", worst=items.index(-1))
         return sum(items)
 
-    def run(kept: Kept[int]) -> int:
-        with kept.guarded():
-            return gather(kept, wanted=3, take=take, fit=fit, operator=Terminal(lambda _: ""))
+    def run(measured: MeasurementFile[int]) -> int:
+        with measured.guarded():
+            return gather(measured, wanted=3, take=take, fit=fit, operator=Terminal(lambda _: ""))
 
     with pytest.raises(InputError, match=r"stopped; 3 numbers are kept in .*n\.json: the same"):
-        run(kept)
-    assert taken == [0, 1, 2, 1] and numbers(kept.path).items == [0, -1, 20]
-    assert run(numbers(kept.path)) == 30 and taken == [0, 1, 2, 1, 1]
-    assert numbers(kept.path).items == [0, 10, 20]
-    kept.remove()
-    assert not kept.path.exists()
+        run(measured)
+    assert taken == [0, 1, 2, 1] and numbers(measured.path).items == [0, -1, 20]
+    assert run(numbers(measured.path)) == 30 and taken == [0, 1, 2, 1, 1]
+    assert numbers(measured.path).items == [0, 10, 20]
+    measured.remove()
+    assert not measured.path.exists()
 
 
 def test_a_result_that_blames_none_gets_one_more(tmp_path: Path) -> None:
@@ -82,9 +82,9 @@ def test_a_result_that_blames_none_gets_one_more(tmp_path: Path) -> None:
             raise InputError("all alike")
         return len(items)
 
-    kept = numbers(tmp_path / "n.json")
-    result = gather(kept, wanted=3, take=lambda i: i, fit=fit, operator=Terminal(answer))
-    assert result == 5 and kept.items == [0, 1, 2, 3, 4]
+    measured = numbers(tmp_path / "n.json")
+    result = gather(measured, wanted=3, take=lambda i: i, fit=fit, operator=Terminal(answer))
+    assert result == 5 and measured.items == [0, 1, 2, 3, 4]
     assert [text.split("\n")[0] for text in said] == ["all alike", "all alike"]
 
 
@@ -100,18 +100,18 @@ def test_the_same_one_is_not_taken_again_for_ever(tmp_path: Path) -> None:
             raise PoorFit("number 2 is off", worst=1)
         return len(items)
 
-    kept = numbers(tmp_path / "n.json")
-    assert gather(kept, wanted=4, take=take, fit=fit, operator=Terminal(lambda _: "")) == 6
+    measured = numbers(tmp_path / "n.json")
+    assert gather(measured, wanted=4, take=take, fit=fit, operator=Terminal(lambda _: "")) == 6
     assert taken == [0, 1, 2, 3, 1, 4, 1, 5]
 
 
 def test_nothing_is_named_where_nothing_was_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    kept = numbers(tmp_path / "n.json")
-    with pytest.raises(InputError, match="no; nothing was written"), kept.guarded():
+    measured = numbers(tmp_path / "n.json")
+    with pytest.raises(InputError, match="no; nothing was written"), measured.guarded():
         raise InputError("no")
-    with pytest.raises(CameraError, match=r"^gone$"), kept.guarded():
+    with pytest.raises(CameraError, match=r"^gone$"), measured.guarded():
         raise CameraError("gone")
     assert capsys.readouterr().err == ""
 

@@ -1,4 +1,4 @@
-"""What a person measures one by one: kept in a file from the first on, and gone on from.
+"""Measurements that a person takes one by one: written to a file each, so that a stop loses none.
 
 Guiding an arm from point to point takes minutes, so neither a stop, nor a lost connection, nor a
 result that is refused may cost what was measured before.
@@ -17,13 +17,13 @@ from warp_deform.errors import InputError
 from ..agents.human import Terminal
 from ..calibration.poor_fit import PoorFit
 
-__all__ = ["Kept", "gather"]
+__all__ = ["MeasurementFile", "gather"]
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 
-class Kept(Generic[T]):
+class MeasurementFile(Generic[T]):
     """Measurements and their file.
 
     Args:
@@ -84,7 +84,7 @@ class Kept(Generic[T]):
 
 
 def gather(
-    kept: Kept[T],
+    measured: MeasurementFile[T],
     *,
     wanted: int,
     take: Callable[[int], T],
@@ -103,20 +103,20 @@ def gather(
     Raises:
         InputError: stopped
     """
-    if kept.items and not operator.wait(kept.where()):
+    if measured.items and not operator.wait(measured.where()):
         raise InputError("stopped")
     again: int | None = None
     while True:
-        while len(kept.items) < wanted:
-            kept.put(take(len(kept.items)))
+        while len(measured.items) < wanted:
+            measured.put(take(len(measured.items)))
         try:
-            return fit(kept.items)
+            return fit(measured.items)
         except InputError as error:
             if not operator.go_on(error):
                 raise
             worst = error.worst if isinstance(error, PoorFit) else None
         if worst is None or worst == again:
-            wanted, again = len(kept.items) + 1, None
+            wanted, again = len(measured.items) + 1, None
         else:
-            kept.put(take(worst), at=worst)
+            measured.put(take(worst), at=worst)
             again = worst
