@@ -153,12 +153,12 @@ class FrankapyRobot(Closing):
 
     def _wait(self, server: str, wait: Callable[[], None], rospy: Any) -> None:
         limit = self.config.connect_timeout_s
-        told: list[str] = []
+        messages: list[str] = []
 
         def tell() -> None:
-            if not told:
-                told.append(f"frankapy: waiting up to {limit:g} s for {server}")
-                self._say(told[0])
+            if not messages:
+                messages.append(f"frankapy: waiting up to {limit:g} s for {server}")
+                self._say(messages[0])
 
         try:
             # In a thread: the name server itself may be a machine that does not answer.

@@ -252,8 +252,8 @@ def _recordings(source: Path) -> list[tuple[int, int]]:
         match = _NAME.fullmatch(name)
         lacking = [part for part in _PARTS if name not in names[part]]
         if match is None:
-            here = next(part for part in _PARTS if name in names[part])
-            raise InputError(f"{source / here / name} is not named EEEEEE-T.pkl; remove it")
+            part = next(part for part in _PARTS if name in names[part])
+            raise InputError(f"{source / part / name} is not named EEEEEE-T.pkl; remove it")
         if lacking:
             raise InputError(f"{source / lacking[0] / name} is missing")
         number, steps = int(match[1]), int(match[2])

@@ -23,12 +23,12 @@ def read_runs(paths: Sequence[Path]) -> tuple[list[RunResult], list[str]]:
     """
     folders: dict[Path, Path] = {}
     for path in paths:
-        here = [path] if (path / "run.json").is_file() else sorted(_inside(path))
-        if not here:
+        runs_of_path = [path] if (path / "run.json").is_file() else sorted(_inside(path))
+        if not runs_of_path:
             raise InputError(
                 f"{path} holds no training run; `warp-deform train` makes one with --out"
             )
-        folders |= {each.resolve(): each for each in here}
+        folders |= {each.resolve(): each for each in runs_of_path}
     runs, notes = [], []
     for folder in folders.values():
         run = RunFolder(folder)

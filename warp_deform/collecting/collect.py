@@ -119,13 +119,13 @@ def collect(config: CollectConfig) -> CollectReport:
 
 def _attempt_all(config: CollectConfig, attempts: dict[int, Attempt], workers: Workers) -> None:
     """Attempt seeds, round after round, until there are successes enough or no hope of them."""
-    here = Workers(1)
+    own_process = Workers(1)
     done = sum(attempt.success for attempt in attempts.values())
     with progress_bar(f"demo {config.task}", config.episodes, done=done) as advance:
-        crew = here
+        crew = own_process
         while todo := _plan(config, attempts):
             # The first few run here, while the workers start: kernels are compiled once.
-            few = todo[:SLOTS] if crew is here and workers.apart else todo
+            few = todo[:SLOTS] if crew is own_process and workers.apart else todo
             chunks = [_Chunk(config, part) for part in _split(few, crew.count)]
             for attempt in crew.run(attempt_chunk, chunks):
                 attempts[attempt.seed] = attempt

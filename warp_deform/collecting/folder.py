@@ -187,11 +187,11 @@ def _difference(found: Any, wanted: Mapping[str, Any], path: str = "") -> str:
         return f"{path.rstrip('.')} is {str(found)[:60]} there"
     keys = sorted({*found, *wanted}, key=lambda key: (key != "task", key))
     for key in keys:
-        here, there = wanted.get(key), found.get(key)
-        if here != there:
-            if isinstance(here, dict):
-                return _difference(there, here, f"{path}{key}.")
-            return f"{path}{key} is {str(there)[:60]} there and {str(here)[:60]} here"
+        ours, theirs = wanted.get(key), found.get(key)
+        if ours != theirs:
+            if isinstance(ours, dict):
+                return _difference(theirs, ours, f"{path}{key}.")
+            return f"{path}{key} is {str(theirs)[:60]} there and {str(ours)[:60]} here"
     return "nothing differs"
 
 

@@ -168,8 +168,8 @@ class VideoWriter:
 
 def _last_line(text: str) -> str:
     lines = [line.strip() for line in text.splitlines()]
-    told = [line for line in lines if line and line != "Conversion failed!"]
-    return told[-1] if told else "it gave no reason"
+    reasons = [line for line in lines if line and line != "Conversion failed!"]
+    return reasons[-1] if reasons else "it gave no reason"
 
 
 def _even(frame: np.ndarray) -> np.ndarray:
