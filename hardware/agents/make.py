@@ -1,4 +1,4 @@
-"""Who chooses the actions, by the names of the command line."""
+"""`make_chooser`: the chooser of actions that `--agent` names on the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the arm waits for a picture and what part of the table is worked on: a setup's setting.
+"""`Workplace`: the home pose for pictures and the part of the table that is worked on, per setup.
 
 The home pose and the workspace are given as flags when a setup is calibrated, and stored with it;
 whatever runs afterwards has them from there. Safety limits, views and simulated twins are made from

@@ -1,4 +1,4 @@
-"""Poses as the interface writes them, sixteen numbers by columns: valid, apart, moved on."""
+"""Poses as sixteen numbers by columns, as the interface sends them: checks and differences."""
 
 from __future__ import annotations
 

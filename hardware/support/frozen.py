@@ -1,4 +1,4 @@
-"""Arrays of frozen dataclasses that are frozen too: what was computed from them may be kept."""
+"""Read-only arrays for frozen dataclasses, so that what is computed from them may be cached."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A policy to hand on: a run's folder with the chosen snapshot alone, in half its bytes."""
+"""Export of a trained policy: the chosen snapshot alone, rounded to half its bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pick, and where its thing is placed, weighed together.
+"""Choosing the pick: its probability is weighed with how surely its place is known.
 
 The paper takes the most probable pick, then its most probable place. Where a demonstrator might
 have picked one of several things, the most probable one is often one that the network cannot tell

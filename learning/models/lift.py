@@ -1,4 +1,4 @@
-"""Which of a task's lifts to carry at, from what the picked spot looks like.
+"""Which of a task's lifts to carry at, predicted from the image around the picked point.
 
 The original chooses the height of the motion by a hidden stage read from the simulator; here it is
 part of the action and predicted from the crop around the pick.

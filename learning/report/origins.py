@@ -1,4 +1,4 @@
-"""Who made the runs of a report: steps, CPU time, versions and revisions of the code."""
+"""Where the runs of a report come from: steps, CPU time, versions and revisions of the code."""
 
 from __future__ import annotations
 

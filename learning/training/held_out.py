@@ -1,4 +1,4 @@
-"""Demonstrations that are not learnt from: the loss on them says which snapshot to take.
+"""Held-out demonstrations: the loss on what is not learnt from says which snapshot to take.
 
 Where nothing can be played, on a robot say, this stands in for validation episodes.
 

@@ -1,4 +1,4 @@
-"""Goals out of files: what an episode's last row shows.
+"""Goals from files: a goal is what the last row of an episode file shows.
 
 A goal is stored as an episode whose last row shows it: a whole demonstration, or a single row. So
 every folder of demonstrations is a set of goals too, and one reader serves both.

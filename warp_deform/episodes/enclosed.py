@@ -1,4 +1,4 @@
-"""Where an episode's file says whether the bag enclosed its items, and how many do."""
+"""`ENCLOSED`: the key of an episode file that says whether the bag enclosed its items."""
 
 from __future__ import annotations
 

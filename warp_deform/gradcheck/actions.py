@@ -1,4 +1,4 @@
-"""How well the derivative of a whole action by its place says what a millimetre does."""
+"""Gradients of whole actions by their place, compared with differences over a millimetre."""
 
 from __future__ import annotations
 

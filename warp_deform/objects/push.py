@@ -1,4 +1,4 @@
-"""Pushes: bounded perturbations that bring an object out of order."""
+"""`Push`: a bounded acceleration of one particle, which brings an object out of order."""
 
 from __future__ import annotations
 

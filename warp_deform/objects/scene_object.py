@@ -1,4 +1,4 @@
-"""What can stand in a scene and be simulated."""
+"""`SceneObject`: any of the objects that can stand in a scene and be simulated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An action that picks the same thing wherever an action before it leaves that."""
+"""`Follow`: the same action after another one, picking the same thing wherever that leaves it."""
 
 from __future__ import annotations
 

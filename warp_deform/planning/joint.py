@@ -1,4 +1,4 @@
-"""Two actions moved downhill together: the loss after the second, by the places of both."""
+"""Gradient descent on the places of two consecutive actions at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where an action may place: the numbers that a search moves, their limits, and draws of them."""
+"""`Places`: the four numbers of a place that a search moves, their limits, and random draws."""
 
 from __future__ import annotations
 

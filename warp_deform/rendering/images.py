@@ -1,4 +1,4 @@
-"""What looking at the table from above gives."""
+"""`Images`: colour, height and segmentation of the table, seen from straight above."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers that users hand in: what is none, or lies out of its range, is refused by name."""
+"""Checks of numbers that users hand in: wrong types and values out of range are refused by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The benchmark's tasks, one file each.
+"""The benchmark's tasks, one file each, and what they share.
 
-`registry` names them, `task` holds what a task is. Importing them loads neither Newton nor torch.
+A file named like a task holds it: `cable_ring` holds cable-ring. `registry` lists all tasks, `task`
+says what a task is. The other files are what several tasks use: the physics of their objects
+(`*_physics`), scores (`metrics`), losses, shapes, grasps, free space. Importing them loads neither
+Newton nor torch.
 """
