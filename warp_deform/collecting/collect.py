@@ -24,6 +24,7 @@ from .folder import Attempt, Collection, append_attempt, check_seeds
 from .goals import load_goals
 from .recording import observe, record, task_config
 from .settings import CollectSettings
+from .video import check_video, film
 from .workers import Workers, worker_count
 
 __all__ = ["CollectConfig", "CollectReport", "collect"]
@@ -97,8 +98,6 @@ def collect(config: CollectConfig) -> CollectReport:
     """
     began = time.perf_counter()
     if config.video is not None:
-        from .video import check_video
-
         check_video(config.video)
     config = replace(config, out=Path(config.out).resolve())
     on_cluster = config.ray is not None and config.workers is None
@@ -111,8 +110,6 @@ def collect(config: CollectConfig) -> CollectReport:
         collection.keep(set(kept))
     report = _report(config, kept, attempts, time.perf_counter() - began)
     if config.video is not None and kept:
-        from .video import film
-
         film(config.out, config.video, seeds=kept[:FILMED])
     return report
 

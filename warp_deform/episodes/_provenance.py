@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
+from ..support.version import __version__
 
 HASH_BYTES = 16
 _PACKAGES = ("warp-lang", "newton", "numpy", "torch")
@@ -95,8 +96,6 @@ def cpu_fingerprint() -> str:
 @functools.cache
 def _versions() -> tuple[tuple[str, str], ...]:
     # The code that runs says its own version: it may be a checkout that was never installed.
-    from ..support.version import __version__
-
     found = [("python", platform.python_version()), ("warp-deform", __version__)]
     for package in _PACKAGES:
         try:

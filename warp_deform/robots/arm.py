@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from functools import cached_property
@@ -236,8 +237,6 @@ class Robot:
     @cached_property
     def _meshes(self) -> tuple[tuple[str, np.ndarray, trimesh.Trimesh], ...]:
         """What `meshes` returns; trimesh is imported here, not with the module."""
-        import io
-
         import trimesh
 
         drawn = []
