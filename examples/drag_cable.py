@@ -2,7 +2,7 @@
 
     python examples/drag_cable.py [--out line.png]
 
-A `GripPath` is a list of way-points over simulated time; one launch runs all of it.
+A `GripPath` is a list of waypoints over simulated time; one launch runs all of it.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ class Pull:
         )
 
     def loss(self, logs: np.ndarray, seen: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
-        """Pseudo-Huber loss against the frames seen, and its slopes by the logarithms."""
+        """Pseudo-Huber loss against the frames seen, and its gradient by the logarithms."""
         error = (self.simulate(np.exp(logs), seen.shape[1]) - seen) / scale
         root = np.sqrt(1 + error**2)
         by = self.run.backward(error / root / error.size / scale)

@@ -1,8 +1,8 @@
-"""Straighten a folded cable with one pull: Adam finds its way-points along the adjoint's slopes.
+"""Straighten a folded cable with one pull: Adam finds its waypoints by the adjoint's gradients.
 
 python examples/straighten_cable.py
 
-The end is led at about 0.3 m/s. Slopes are those of a damped rollout; the plain one judges.
+The end is led at about 0.3 m/s. Gradients are those of a damped rollout; the plain one judges.
 """
 
 import newton
@@ -23,9 +23,9 @@ TIP, TAIL, GOAL = FOLDS[-1, :2], LINE[0, :2], LINE[-1, :2]
 BEYOND = 1.5 * TAIL - 0.5 * GOAL  # half a cable before the line
 DIRECT = np.linspace(TIP, GOAL, 17)
 DETOUR = np.vstack([np.linspace(TIP, BEYOND, 7)[:6], np.linspace(BEYOND, GOAL, 11)])
-TIMES = np.append(0.0, np.linspace(0.2, 4.2, 16))  # of the way-points [s]
+TIMES = np.append(0.0, np.linspace(0.2, 4.2, 16))  # of the waypoints [s]
 HEIGHT = CABLE.radius + np.pad(np.full(15, 0.03), 1)  # [m]
-FASTEST, STEPS, DAMPING = 0.3, 80, 20.0  # [m/s]; of Adam; where slopes are taken [1/s]
+FASTEST, STEPS, DAMPING = 0.3, 80, 20.0  # [m/s]; of Adam; for gradients [1/s]
 
 
 class Pull:
@@ -52,7 +52,7 @@ class Pull:
 
 
 def descend(pull: Pull, guess: np.ndarray) -> np.ndarray:
-    """The best way-points that Adam comes by: near the line, and slow."""
+    """The best waypoints that Adam comes by: near the line, and slow."""
     knots, best = torch.tensor(guess, requires_grad=True), (np.inf, guess)
     adam = torch.optim.Adam([knots], lr=0.03, betas=(0.9, 0.99))
     for step in range(STEPS):

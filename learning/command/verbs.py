@@ -33,14 +33,14 @@ _Folder = Annotated[Positional[Path], arg(metavar="RUN")]
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions(TrainSettings, CommandOptions):
-    """Train an agent on demonstrations; the same command goes on where it was interrupted.
+    """Train an agent on demonstrations. After an interruption the same command continues.
 
     With --preset fast every snapshot plays validation episodes, and training ends when one solves
-    them all. Off a terminal a line on stderr tells every 30 s how far it is.
+    them all. Without a terminal, a line on stderr reports the progress every 30 s.
     """
 
     no_augment: bool = False
-    """Do not turn, shift or mirror what is seen at random, as the paper does (but for mirrors)."""
+    """Do not turn, shift or mirror pictures at random. (The paper turns and shifts them.)"""
 
 
 def train(options: TrainOptions) -> Outcome:
@@ -68,31 +68,32 @@ def train(options: TrainOptions) -> Outcome:
 class EvalOptions(EvalSettings, CommandOptions):
     """Choose a run's best snapshot on validation seeds and play the test seeds with it.
 
-    Goals are constructed from goal seeds unless given. Results are kept: what was played, in
-    training too, is not played again.
+    Goals are constructed from goal seeds unless given. Results are kept, and episodes that were
+    played before, also in training, are not played again.
     """
 
     run: _Folder
     """Folder of a training run."""
     no_retry: bool = False
-    """Keep agents over pictures from remembering what they missed and what they just put down, to
-    pick elsewhere: so the paper's play."""
+    """Do not let agents remember what they missed and what they just put down, and pick elsewhere.
+    The paper's agents have no such memory."""
     first_seed: Annotated[int | None, arg(metavar="S"), SEED] = None
-    """Play test episodes of seeds S and up in place of 10,000 and up; their result is kept apart
+    """Play test episodes of seeds S and up instead of 10,000 and up. Their result is kept apart
     from that of the test seeds."""
     goals: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder of goals that the test episodes share in turn, see `warp-deform goals`."""
+    """Folder of goals, see `warp-deform goals`. Test episodes use them in turn."""
     video: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder for an MP4 of each of the first test episodes: observation, goal, heat maps of pick
     and place, action, score."""
     videos: Annotated[int, arg(metavar="N"), COUNT] = 4
-    """Videos at most."""
+    """Largest number of videos."""
     no_video_arm: bool = False
-    """Do not film the arm with --video: pictures and heat maps alone are quicker."""
+    """Do not film the arm with --video. Pictures and heat maps alone take less time."""
     share: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder to be made: a run's with the chosen snapshot alone, in half its bytes, to hand on."""
+    """New folder for a copy of the run to hand on: the chosen snapshot alone, in half its bytes."""
     workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
-    """Processes; left out, one per core, fewer for few episodes. The result is the same."""
+    """Number of processes, by default one per core, and fewer for few episodes. It does not change
+    the result."""
 
 
 def evaluate(options: EvalOptions) -> Outcome:
@@ -124,13 +125,13 @@ def evaluate(options: EvalOptions) -> Outcome:
 class ReportOptions(CommandOptions):
     """Tables and learning curves of evaluated runs, with the paper's numbers beside them.
 
-    Runs that differ in their seed alone are taken together.
+    Runs that differ only in their seed are pooled.
     """
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUNS")]
     """Folders of training runs, or folders that hold some."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for report.md, report.csv, report.tex and the curves; left out, only the text is
+    """Folder for report.md, report.csv, report.tex and the curves. Without it only the text is
     shown."""
 
 

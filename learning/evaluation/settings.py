@@ -21,13 +21,13 @@ class EvalSettings:
     """How a run is evaluated; see `run.evaluate_run`."""
 
     episodes: Annotated[int, arg(metavar="N"), COUNT] = 200
-    """Test episodes."""
+    """Number of test episodes."""
     validation_episodes: Annotated[int, arg(metavar="N"), COUNT] = 20
-    """Validation episodes a snapshot, seeds 50,000 and up."""
+    """Number of validation episodes per snapshot, with seeds 50,000 and up."""
     paper: bool = False
-    """Also the paper's protocol: every snapshot plays 20 test episodes with demonstrated goals, and
-    the best result counts, which is optimistic."""
+    """Also use the paper's protocol: every snapshot plays 20 test episodes with demonstrated goals,
+    and the best result counts. This is optimistic."""
     stage_rule: Literal["action", "privileged"] = "action"
-    """Who chooses the lift: the policy, or the paper's rule, which reads the simulator."""
+    """What chooses the lift: the policy, or the paper's rule, which reads the simulator."""
     robot: RobotName = "ur5"
     """The arm."""

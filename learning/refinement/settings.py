@@ -22,11 +22,11 @@ class FolderSettings:
     """From which folder into which, in how many processes."""
 
     source: Annotated[Positional[Path], arg(metavar="DIR")]
-    """Folder of demonstrations, simulated ones, of any tasks; it stays as it is."""
+    """Folder of simulated demonstrations, of any tasks. It is not changed."""
     out: Annotated[Path, arg(metavar="DIR")]
-    """Folder for the refined ones, and for copies of those that did not become better."""
+    """Folder for the refined demonstrations, and for copies of those that did not improve."""
     workers: Annotated[int | None, arg(metavar="W"), COUNT] = None
-    """Processes; left out, one per core. The result is the same."""
+    """Number of processes, by default one per core. It does not change the result."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,5 +34,5 @@ class RefineSettings(FolderSettings):
     """What to refine, and when it counts as better."""
 
     accept: Literal["score", "solved"] = "score"
-    """When an episode takes the place of the original: if it has no lower last score and no more
-    actions, or if it solves the task in fewer actions or in as many with a higher score."""
+    """When an episode replaces the original. score: it has no lower last score and no more actions.
+    solved: it solves the task in fewer actions, or in as many with a higher score."""

@@ -54,7 +54,7 @@ class BendConfig(FolderSettings):
     """The paths of which folder are bent, and how; `out` is then a folder for paths."""
 
     bending: WayPointConfig = field(default_factory=WayPointConfig)
-    """How way-points are moved."""
+    """How waypoints are moved."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def bend(config: BendConfig) -> BendReport:
     ]
     count = worker_count(config.workers, _COLLECTED * len(infos))
     left = sum(map(len, todo.values()))
-    bar = progress_bar("refine, way-points", len(infos), done=len(infos) - left)
+    bar = progress_bar("refine, waypoints", len(infos), done=len(infos) - left)
     with Workers(min(count, max(1, len(chunks)))) as crew, bar as advance:
         for _ in crew.run(_bend_chunk, chunks):
             advance()
@@ -153,7 +153,7 @@ def read_path(written: Mapping[str, Any]) -> GripPath:
             lower=None if written["lower"] is None else tuple(written["lower"]),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"this is no path of way-points: {error}") from error
+        raise InputError(f"this is no path of waypoints: {error}") from error
 
 
 @dataclass(frozen=True)

@@ -27,14 +27,14 @@ class _Trained:
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """Name of the task, see `warp-deform list`."""
     agent: AgentName
-    """Transporters see pictures (goal-split and goal-stack the goal's too), the others see the
-    simulator's state."""
+    """Transporters see pictures; goal-split and goal-stack also see the goal's picture. The others
+    see the simulator's state."""
     data: Annotated[Path, arg(metavar="DIR")]
     """Folder of demonstrations, see `warp-deform demo`."""
     demos: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Demonstrations to learn from, drawn by --seed; when left out, all that are not held out."""
+    """Number of demonstrations to learn from, drawn by --seed. By default, all not held out."""
     seed: Annotated[int, SEED] = 0
-    """Of the initial weights, of what is drawn, and of which demonstrations are used."""
+    """Seed of the initial weights, of the random draws, and of the choice of demonstrations."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder of the run."""
 
@@ -46,26 +46,26 @@ class TrainMethod:
     preset: PresetName = "paper"
     """The paper's network and schedule, or one for two CPU cores."""
     steps: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Steps of training; the preset's when left out."""
+    """Number of training steps. By default, the preset's."""
     batch: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Moments a step; the preset's when left out."""
+    """Transitions per step. By default, the preset's."""
     lr: Annotated[float | None, arg(metavar="LR"), FlagRange(1e-12, 1e3)] = None
-    """Step size of Adam; the preset's when left out."""
+    """Step size of Adam. By default, the preset's."""
     snapshots: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Snapshots, evenly spread; when left out, the preset's: of `paper` 10, of `fast` after 1/16,
-    1/8, 1/4, 1/2 and all of the steps."""
+    """Number of snapshots, evenly spread. By default, `paper` keeps 10, and `fast` keeps one after
+    1/16, 1/8, 1/4, 1/2 and all of the steps."""
     validate: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
-    """Validation episodes that every snapshot plays; training ends when one solves them all, and
-    `eval` does not play them again. When left out, the preset's: 20 of `fast` (0 with --hold-out),
-    0 of `paper`."""
+    """Validation episodes that every snapshot plays. Training ends when a snapshot solves them all, and
+    `eval` does not play them again. By default, 20 for `fast` (0 with --hold-out) and 0 for
+    `paper`."""
     patience: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Also stop when so many snapshots in a row played no better; needs validation."""
+    """Also stop after this many snapshots in a row without improvement. This needs validation."""
     bf16: bool = False
-    """Convolve in bfloat16: quicker where the processor multiplies it natively."""
+    """Convolve in bfloat16, which is faster where the processor multiplies it natively."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the network computes; under `torchrun`, each process takes one GPU."""
+    """Where the network computes. Under `torchrun`, each process takes one GPU."""
     untrained: bool = False
-    """Also keep the untrained network, as the snapshot of step 0: learning curves begin there."""
+    """Also keep the untrained network as the snapshot of step 0, where learning curves begin."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,10 +73,11 @@ class TrainSettings(TrainMethod, _Trained):
     """What to train, and how."""
 
     exact: bool = False
-    """Compute by the original's operations, several times slower; see docs/learning.md."""
+    """Compute with the original's operations, which is several times slower; see docs/learning.md."""
     hold_out: Annotated[int, arg(metavar="N"), COUNT_OR_NONE] = 0
-    """Further demonstrations, not learnt from: the snapshot of the lowest loss on them is taken."""
+    """Number of further demonstrations that are not learnt from. The snapshot with the lowest loss on
+    them is used until `eval` chooses one."""
     threads: Annotated[int, arg(metavar="N"), FlagRange(1, 4096)] = 1
-    """Threads of torch, in each process; another number may change the last bits."""
+    """Threads of torch in each process. Another number may change the last bits."""
     tensorboard: bool = False
-    """Write for TensorBoard too, which has to be installed."""
+    """Also write logs for TensorBoard, which must be installed."""

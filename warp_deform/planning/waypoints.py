@@ -1,6 +1,6 @@
 """The way between pick and place moved downhill: paths that the action's seven numbers cannot say.
 
-The straight carry of an action becomes a chain of way-points, which Adam moves together with the
+The straight carry of an action becomes a chain of waypoints, which Adam moves together with the
 place by the adjoint of the solver. The tip goes along it as fast as it went along the straight
 line. Every iterate is run as it is, and the best is kept; the straight line is the first. Where a
 gradient cannot be used, the next iterate is drawn around the best so far.
@@ -37,7 +37,7 @@ _LOW, _HIGH = np.array(BOUNDS[:2]).T
 
 @dataclass(frozen=True, kw_only=True)
 class WayPointConfig:
-    """How way-points are moved."""
+    """How waypoints are moved."""
 
     points: int = 6
     """Way-points between the lift and the descent."""
@@ -48,7 +48,9 @@ class WayPointConfig:
 
     def __post_init__(self) -> None:
         if min(self.points, self.steps) < 1 or not self.rate > 0:
-            raise InputError("way-points need one point, one step and a rate above 0 at least")
+            raise InputError(
+                "waypoints need at least one point, at least one step, and a rate above 0"
+            )
 
 
 @dataclass(frozen=True)
@@ -207,7 +209,7 @@ class WayPoints:
 
 @dataclass(frozen=True, eq=False)
 class _Bend:
-    """How numbers make a path: way-points (n, 3) of the carry [m], then the place's shift (2,) [m].
+    """How numbers make a path: waypoints (n, 3) of the carry [m], then the place's shift (2,) [m].
 
     base: the straight path; first, last: its knots where the carry begins and ends
     start: the numbers (3 n + 2,) of the straight path

@@ -309,7 +309,7 @@ def test_bent_paths_are_labelled_and_run_again_to_what_is_written(bent: tuple[Pa
     job = way_points._recorded(worlds, recording, 300)[number]
     again = WayPoints(worlds.task, robot="ur5").run({0: job}, {0: read_path(written["path"])})
     assert asdict(again[0]) == written["after"]
-    with pytest.raises(InputError, match="no path of way-points"):
+    with pytest.raises(InputError, match="no path of waypoints"):
         read_path({"times": [0]})
 
 
