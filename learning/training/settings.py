@@ -55,8 +55,8 @@ class TrainMethod:
     """Number of snapshots, evenly spread. By default, `paper` keeps 10, and `fast` keeps one after
     1/16, 1/8, 1/4, 1/2 and all of the steps."""
     validate: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
-    """Validation episodes that every snapshot plays. Training ends when a snapshot solves them all, and
-    `eval` does not play them again. By default, 20 for `fast` (0 with --hold-out) and 0 for
+    """Validation episodes that every snapshot plays. Training ends when a snapshot solves them all,
+    and `eval` does not play them again. By default, 20 for `fast` (0 with --hold-out) and 0 for
     `paper`."""
     patience: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Also stop after this many snapshots in a row without improvement. This needs validation."""
