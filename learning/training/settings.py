@@ -73,10 +73,10 @@ class TrainSettings(TrainMethod, _Trained):
     """What to train, and how."""
 
     exact: bool = False
-    """Compute with the original's operations, which is several times slower; see docs/learning.md."""
+    """Use the original's operations, which are several times slower; see docs/learning.md."""
     hold_out: Annotated[int, arg(metavar="N"), COUNT_OR_NONE] = 0
-    """Number of further demonstrations that are not learnt from. The snapshot with the lowest loss on
-    them is used until `eval` chooses one."""
+    """Number of further demonstrations that are not learnt from. The snapshot with the lowest loss
+    on them is used until `eval` chooses one."""
     threads: Annotated[int, arg(metavar="N"), FlagRange(1, 4096)] = 1
     """Threads of torch in each process. Another number may change the last bits."""
     tensorboard: bool = False
