@@ -60,7 +60,7 @@ def refine(options: RefineOptions) -> Outcome:
 
 def _bend(options: RefineOptions) -> Outcome:
     """Bend the paths of a folder's actions."""
-    from warp_deform.planning.search import GRADIENT_COST
+    from warp_deform.planning.action_search import GRADIENT_COST
     from warp_deform.planning.waypoints import WayPointConfig
 
     from ..refinement.waypoints import BendConfig, bend

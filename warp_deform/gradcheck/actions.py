@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..planning.gradients import LANES, gradients_for
-from ..planning.search import MOST_GROWTH
+from ..planning.places import MOST_GROWTH
 from ..tasks.task import Task
 from ..worlds.state import WorldState
 from ..worlds.worlds import Worlds

@@ -10,12 +10,12 @@ import pytest
 
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.planning import METHODS, Lookahead, SearchConfig, places, search
+from warp_deform.planning.action_pairs import move_both
+from warp_deform.planning.action_search import _Around
 from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.planning.follow import Follow
 from warp_deform.planning.gradients import ActionGradients, loss_and_gradients
-from warp_deform.planning.joint import move_both
 from warp_deform.planning.places import Places
-from warp_deform.planning.search import _Around
 from warp_deform.planning.waypoints import WayPointConfig, WayPoints, _Bend
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.registry import task

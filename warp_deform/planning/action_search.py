@@ -6,6 +6,7 @@ around the best so far, ever closer; `gradient` moves the best down the gradient
 loss by Adam, and draws around those whose gradient cannot be used or paid. Every action that a
 search returns has been tried as it would run. Two actions ahead, each of the best states is
 searched again.
+
 Sources: Rubinstein, Kroese, "The Cross-Entropy Method", 2004; Kingma, Ba, "Adam", 2015.
 """
 
@@ -19,12 +20,12 @@ import numpy as np
 from ..errors import InputError
 from ..tasks.task import Action, Task
 from ..worlds.state import WorldState
+from .action_pairs import JOINT_COST, Pair, move_both
 from .descent import Descent
-from .joint import JOINT_COST, Pair, move_both
 from .lookahead import Lookahead, Outlook
-from .places import MOST_GROWTH, Places
+from .places import Places
 
-__all__ = ["MOST_GROWTH"]  # `warp_deform.planning` is the import path of the rest
+__all__ = ["GRADIENT_COST"]  # `warp_deform.planning` is the import path of the rest
 
 METHODS = ("enumerate", "random", "cem", "gradient")
 """The methods of `search` by name."""
