@@ -30,13 +30,13 @@ _Views = Annotated[int, arg(metavar="N"), FlagRange(8, 500)]
 @dataclass(frozen=True, kw_only=True)
 class _SetupFlags(CommandOptions):
     setup: SetupFlag = field(default_factory=lambda: Path("franka-setup"))
-    """Folder of the setup, into which everything is written."""
+    """Folder of the setup, where the results are kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _BoardFlags(_SetupFlags):
     square_mm: Annotated[float, FlagRange(5.0, 500.0)] = 36.0
-    """Side of the printed board's squares: measure the print."""
+    """Side of the squares of the printed board [mm]. Measure the print."""
 
     @property
     def board(self) -> BoardSpec:
@@ -58,93 +58,94 @@ class _CameraFlags(_SetupFlags):
 @dataclass(frozen=True, kw_only=True)
 class _PlaceFlags(_SetupFlags):
     robot: RobotName = "dry_run"
-    """The robot that touches: panda, fr3 or frankapy."""
+    """The robot: panda, fr3 or frankapy."""
     host: str | None = None
-    """Its address."""
+    """Address of the robot."""
     home: HomeFlag = None
-    """Joint positions [rad] at which pictures are taken; left out, as stored in --setup, at first
-    the vendor's and the paper's. They are stored with what is measured."""
+    """Joint positions [rad] of the home pose, from which pictures are taken. The default is what
+    --setup has stored, or else the vendor's. They are stored with what is measured."""
     workspace: WorkspaceFlag = None
-    """Ends of the workspace along x and y [m]; left out, as stored, at first 0.335 0.635 -0.3 0.3.
-    They are stored with what is measured."""
+    """Ends of the workspace along x and y [m]. The default is what --setup has stored, or else
+    0.335 0.635 -0.3 0.3. They are stored with what is measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _ArmFlags(_PlaceFlags):
     execute: bool = False
-    """Let the arm move, without which nothing is measured."""
+    """Let the arm move. Without this flag nothing moves, and nothing is measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoardOptions(_BoardFlags):
     """Write the ChArUco board to print.
 
-    Print it at 254 dots an inch, and give the side of its squares to the other steps.
+    Print it at 254 dots an inch, measure a square, and give its side to the other steps.
     """
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensOptions(_BoardFlags, _CameraFlags):
-    """Measure a video device's intrinsics with the board.
+    """Measure the intrinsics of a video device with the board.
 
-    Views are kept when this is stopped, and gone on from.
+    The views are kept if you stop, and the same command continues with them.
     """
 
     views: _Views = 15
-    """Views of the board."""
+    """Number of views of the board."""
     size: Annotated[tuple[int, int], FlagRange(16, 8192)] = (1280, 720)
     """Width and height of the video device's pictures."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TableOptions(_ArmFlags):
-    """Touch the foam with the closed fingers, at five points; the arm moves."""
+    """Measure the table: the arm moves and touches the foam at five points, with closed fingers."""
 
     table_z: Annotated[float | None, arg(metavar="M"), FlagRange(-1.0, 1.0)] = None
-    """A height in the base frame that is certainly 1 to 3 cm below the foam's top; needed."""
+    """A height in the base frame that is certainly 1 to 3 cm below the foam's top. Required."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOptions(_BoardFlags, _CameraFlags, _ArmFlags):
-    """Find the camera by the board, flat on the table: you guide the fingertips onto corners.
+    """Locate the camera with the board flat on the table: you guide the fingertips onto corners.
 
-    Of camera, points and hand one is enough.
+    One of camera, points and hand is enough.
     """
 
     corners: Annotated[tuple[int, ...], FlagRange(0, 23)] = (0, 5, 18, 23)
-    """The board's corners to touch, by number."""
+    """Numbers of the board's corners that you touch."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointsOptions(_CameraFlags, _ArmFlags):
-    """Find the camera without a board: marks on the foam are clicked and touched.
+    """Locate the camera without a board: you click marks on the foam and touch them.
 
-    Of camera, points and hand one is enough. Points are kept when this is stopped, and gone on
-    from.
+    One of camera, points and hand is enough. The points are kept if you stop, and the same command
+    continues with them.
     """
 
     points: Annotated[int, arg(metavar="N"), FlagRange(5, 500)] = 9
-    """Marks to touch, at least 5."""
+    """Number of marks to touch, at least 5."""
     typed: bool = False
     """Type each mark's column and row instead of clicking it."""
     pairs: Annotated[Path | None, arg(metavar="FILE.csv")] = None
-    """Take them from this file, a line of column, row [px], x, y [m] for each, and move nothing."""
+    """Read the points from this file, and move nothing. A line has column, row [px], x, y [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HandOptions(_BoardFlags, _CameraFlags, _ArmFlags):
-    """Find a camera on the hand by looking at the board from many sides.
+    """Locate a camera on the hand: it sees the board from many sides, to which you guide the hand.
 
-    Of camera, points and hand one is enough. Views are kept when this is stopped, and gone on from.
+    One of camera, points and hand is enough. The views are kept if you stop, and the same command
+    continues with them.
     """
 
     views: _Views = 15
-    """Views of the board."""
+    """Number of views of the board."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EmptyOptions(_CameraFlags, _PlaceFlags):
-    """Take a picture of the empty foam, the arm at home: masks are then better; moves nothing."""
+    """Take a picture of the empty foam from home, for better masks; moves nothing."""
 
 
 CalibrateOptions = (

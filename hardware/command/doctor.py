@@ -49,10 +49,10 @@ _TAKE_PRIORITY = (
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions(CommandOptions):
-    """What this machine has for a robot, what is missing, and how to get it; moves nothing."""
+    """Show what this machine has for a robot, what is missing and how to get it. Moves nothing."""
 
     robot: RobotName = "sim"
-    """What must work for the exit code to be 0; sim needs nothing but this package."""
+    """Robot that must work for the exit code to be 0. sim needs nothing but this package."""
     host: str | None = None
     """Address of a robot to connect to and read."""
     setup: SetupFlag = field(default_factory=lambda: Path("franka-setup"))
@@ -211,7 +211,7 @@ def _calibration(setup: Path, *, needed: bool) -> Check:
 
     path = setup / "calibration.json"
     if not path.is_file():
-        advice = "calibrate board, lens, table and camera, see docs/hardware.md"
+        advice = "calibrate board, lens, table and camera; docs/hardware.md explains the steps"
         return Check("calibration", False, needed, f"no {path}", advice)
     try:
         calibration = Calibration.load(path)

@@ -20,20 +20,21 @@ __all__ = ["EmulateOptions", "emulate"]
 
 @dataclass(frozen=True, kw_only=True)
 class EmulateOptions(CommandOptions):
-    """Serve an emulated Franka Panda to the vendor's own client, until Ctrl-C."""
+    """Serve an emulated Franka Panda to the vendor's own client until Ctrl-C."""
 
     host: str = "127.0.0.1"
-    """Address of this machine to listen on, 127.x.y.z."""
+    """Address to listen on: one of this machine, 127.x.y.z."""
     chain: Annotated[int | None, arg(metavar="SEED"), SEED] = None
     """Toss a bead chain onto foam under the hand, and show it to --camera sim."""
     table_z: Annotated[float | None, arg(metavar="M"), FlagRange(-1.0, 1.0)] = None
-    """Height of a bare table instead [m]."""
+    """Height [m] of a bare table, in place of foam and chain."""
     object_width: Annotated[float | None, arg(metavar="M"), FlagRange(0.0, 0.08)] = None
-    """Width of what every grasp finds [m]; nothing when left out."""
+    """Width [m] of the object that every grasp finds. The default is no object."""
     workspace: WorkspaceFlag = None
-    """Ends of the workspace along x and y [m] into which the chain is tossed, as `run` has them."""
+    """Ends of the workspace [m] along x and y, into which the chain is tossed, as of `run`."""
     paced: bool = False
-    """1 kHz by the wall clock, as a robot; else in lock-step, as fast as it goes."""
+    """Run at 1 kHz by the wall clock, as a robot does. The default is as fast as possible, in
+    lock-step."""
 
 
 def emulate(options: EmulateOptions) -> Outcome:

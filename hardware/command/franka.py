@@ -55,20 +55,22 @@ class RunOptions(_RigOptions):
     """
 
     agent: AgentName = "planner"
-    """planner simulates actions from what the mask shows; policy is a training run's; scripted
-    knows the simulated chain; human clicks, typed types where to pick and place."""
+    """Who chooses the actions. planner simulates actions on the chain that the mask shows; policy
+    acts as --policy was trained; scripted knows the simulated chain; random moves any point of the
+    cable; with human you click, and with typed you type, where to pick and place."""
     policy: Annotated[Path | None, arg(metavar="RUN")] = None
-    """Training run or snapshot of cable-mask-goal, for --agent policy."""
+    """Training run or snapshot of cable-mask-goal that --agent policy plays."""
     goal: Annotated[Path | None, arg(metavar="FILE.png")] = None
-    """Mask to reach, see `capture-goal`; left out with --camera sim, a curve drawn by --seed."""
+    """Mask to reach, as `capture-goal` writes it. With --camera sim the default is a curve that
+    --seed draws."""
     max_actions: Annotated[int | None, arg(metavar="N"), FlagRange(1, 1000)] = None
-    """Actions at most; 10, and 1 where nothing moves."""
+    """Most actions of an episode. The default is 10, and 1 where nothing moves."""
     budget: Annotated[int | None, arg(metavar="N"), FlagRange(1, 10_000)] = None
-    """Simulated actions that the planner spends on each real one; 32."""
+    """Actions that the planner simulates for each one that it takes. The default is 32."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for the recording; left out, the next number in franka-episodes."""
+    """Folder for the recording. The default is the next number in franka-episodes."""
     note: str = ""
-    """The operator's words, recorded."""
+    """A note of the operator, which is kept in the recording."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +81,7 @@ class CollectOptions(RunOptions):
     """
 
     agent: AgentName = "human"
-    """Who demonstrates, see `run`."""
+    """Who chooses the actions: the agents of `run`."""
     episodes: Annotated[int, arg(aliases=["-n"], metavar="N"), FlagRange(1, 100_000)] = 1
     """Episodes to record."""
 
@@ -92,12 +94,12 @@ class CaptureGoalOptions(_RigOptions):
     """
 
     out: Annotated[Path, arg(metavar="FILE.png")]
-    """The mask; the picture is written beside it."""
+    """File for the mask. The camera's picture is written beside it."""
 
 
 _CALIBRATE = (
-    "Measure the setup: board, lens, table, camera, in this order; see docs/hardware.md. Of "
-    "camera, points and hand one is enough."
+    "Measure the setup, in the order board, lens, table, camera. points or hand can take the place "
+    "of camera. docs/hardware.md explains each step."
 )
 
 _Options = (

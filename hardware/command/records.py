@@ -18,10 +18,10 @@ _Folders = Annotated[Positional[tuple[Path, ...]], arg(metavar="EPISODE")]
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreOptions(CommandOptions):
-    """Score recorded episodes anew, from their pictures."""
+    """Compute the scores of recorded episodes anew, from their masks."""
 
     episodes: _Folders
-    """Folders that `run` or `collect` recorded, killed ones too."""
+    """Folders that `run` or `collect` recorded; interrupted ones are welcome."""
 
 
 def score(options: ScoreOptions) -> Outcome:
@@ -84,12 +84,12 @@ def score(options: ScoreOptions) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions(CommandOptions):
-    """Go through a recorded episode again: pictures to masks to overlaps, and what was done."""
+    """Compute masks and overlaps of an episode again from its pictures, and compare them."""
 
     episode: Annotated[Positional[Path], arg(metavar="EPISODE")]
-    """Folder that `run` or `collect` recorded, killed ones too."""
+    """Folder that `run` or `collect` recorded; an interrupted one is welcome."""
     video: Annotated[Path | None, arg(metavar="FILE.mp4")] = None
-    """Also a film of the plans, two pictures a second."""
+    """Also write a film of the plans, with two pictures a second."""
 
 
 def replay(options: ReplayOptions) -> Outcome:

@@ -44,29 +44,29 @@ class RigConfig:
     """Robot, camera and where their calibration is."""
 
     robot: RobotName = "dry_run"
-    """dry_run prints commands and moves nothing, sim moves a simulated chain; panda (panda-python,
-    server version 5), fr3 (franky, 10) and frankapy (ROS) move an arm, with --execute."""
+    """dry_run prints commands and moves nothing. sim moves a simulated chain. panda (panda-python,
+    server version 5), fr3 (franky, 10) and frankapy (ROS) move an arm if --execute is given."""
     camera: CameraName = "sim"
-    """sim sees the simulated chain, also that of `emulate --chain`; file replays --frames."""
+    """sim sees the simulated chain, also that of `emulate --chain`. file shows --frames again."""
     host: str | None = None
-    """Address of the robot, or of the emulator."""
+    """Address of the robot or of the emulator."""
     setup: SetupFlag = field(default_factory=lambda: Path("franka-setup"))
-    """Folder of the calibration, see `calibrate`; not needed with --camera sim."""
+    """Folder of the calibration, as `calibrate` writes it. Not needed with --camera sim."""
     device: str | None = None
     """Number of a video device, or serial number of a RealSense."""
     frames: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Recorded pictures for --camera file: the folder `frames` of an episode."""
+    """Folder `frames` of an episode, whose pictures --camera file shows."""
     seed: Annotated[int, SEED] = 0
-    """Of the simulated toss and goal, and of what an agent draws."""
+    """Seed of the simulated toss and goal, and of what an agent draws."""
     execute: bool = False
-    """Let a real arm move; without it, its commands are printed."""
+    """Let a real arm move. Without this flag its commands are only printed."""
     home: HomeFlag = None
-    """Joint positions of the home pose [rad]; a setup has it from its calibration, and others are
-    refused. With --camera sim, any that the arm can wait at."""
+    """Joint positions of the home pose [rad]. A setup has them from its calibration, and others are
+    refused. With --camera sim they may be any at which the arm can wait."""
     workspace: WorkspaceFlag = None
-    """Ends of the workspace along x and y [m]; as for --home."""
+    """Ends of the workspace along x and y [m], with the same rules as --home."""
     joint_speed: Annotated[float, FlagRange(1e-3, 0.2)] = 0.05
-    """Share of the joints' greatest speeds between poses, at most 0.2; begin with 0.05."""
+    """Share of the joints' greatest speeds, between poses. At most 0.2; begin with 0.05."""
 
     @property
     def moves(self) -> bool:
