@@ -92,7 +92,7 @@ def _measurement_file(
             if record.get(key) != value:
                 raise InputError(
                     f"the views in {path} are of the {key} {str(record.get(key))[:60]}, not "
-                    f"{value}; give the flags as then, or remove that file to begin anew"
+                    f"{value}; give the same flags as then, or remove that file to begin anew"
                 )
         rows = require(record, "views", list, what=f"views {path}")
         return [read(row, f"view {n} of {path}") for n, row in enumerate(rows, start=1)]

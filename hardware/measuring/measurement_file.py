@@ -62,8 +62,8 @@ class MeasurementFile(Generic[T]):
             f"1 {self.name} is" if len(self.items) == 1 else f"{len(self.items)} {self.name}s are"
         )
         return (
-            f"{count} kept in {self.path}: the same command goes on from there, and begins anew "
-            "without that file"
+            f"{count} kept in {self.path}: the same command continues from there; to begin "
+            "anew, remove that file"
         )
 
     def remove(self) -> None:

@@ -82,8 +82,8 @@ def read_points(path: Path, origin: str) -> list[TouchedPoint]:
         if line.startswith(_MARK) and line.strip() != origin:
             theirs, ours = (each.removeprefix(_MARK).strip()[:160] for each in (line, origin))
             raise InputError(
-                f"the points in {path} are of {theirs!r}, not of {ours!r}; give the flags as then, "
-                "or move that file away to begin anew"
+                f"the points in {path} are of {theirs!r}, not of {ours!r}; give the same "
+                "flags as then, or move that file away to begin anew"
             )
         words = re.split(r"\s*[,;\s]\s*", line.partition("#")[0].strip().rstrip(","))
         if words == [""]:

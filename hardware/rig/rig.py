@@ -190,7 +190,9 @@ def open_camera(config: RigConfig, intrinsics: CameraIntrinsics | None) -> Camer
         if config.frames is None or intrinsics is None:
             raise InputError("--camera file needs --frames, and a calibration in --setup")
         if config.real:
-            raise InputError("--camera file shows the past; a robot that moves needs a live one")
+            raise InputError(
+                "--camera file shows recorded pictures; a robot that moves needs a live camera"
+            )
         return FileCamera(config.frames, intrinsics)
     if config.camera == "uvc":
         from ..cameras.uvc import UVCCamera
@@ -237,8 +239,8 @@ def read_calibration(config: RigConfig) -> Calibration:
     touched = config.setup / "table.json"
     if touched.is_file() and read_table(touched) != calibration.table:
         raise InputError(
-            f"{touched} is another table than the calibration's, whose floor would be wrong; "
-            f"{again}"
+            f"{touched} and the calibration hold different tables, so the safety floor would be "
+            f"wrong; {again}"
         )
     if config.robot in REAL_ROBOTS:
         pairs = [("robot", "--robot and --host", calibration.robot_id, config.robot_id)]
@@ -250,7 +252,7 @@ def read_calibration(config: RigConfig) -> Calibration:
             if calibrated != named:
                 raise InputError(
                     f"the calibration in {config.setup} is of the {what} {calibrated!r}, not "
-                    f"{named!r}; give {flags} as then, or calibrate again"
+                    f"{named!r}; give {flags} as you did then, or calibrate again"
                 )
     return calibration
 

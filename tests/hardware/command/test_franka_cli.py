@@ -359,7 +359,7 @@ def test_the_documentation_names_every_error_and_says_what_was_not_tried() -> No
         assert f"`{name}`" in text
     begins = ("accepts no motion", "after recovery", "the arm stands beyond", "too near its limit")
     assert [words for words in (*begins, BUSY) if words not in text] == []
-    refused = ("no one point is to blame", "run the wrong way round", "the same command goes on")
+    refused = ("no one point is to blame", "run the wrong way round", "the same command continues")
     assert [words for words in refused if words not in text] == []
     pictures = re.findall(r"\(images/([\w.]+)\)", text)
     assert len(pictures) == 4

@@ -36,7 +36,9 @@ def test_a_table_touched_off_anew_needs_a_new_calibration(tmp_path: Path) -> Non
     with open_rig(config) as rig:
         assert rig.robot.limits.table == CALIBRATION.table
     write_table(tmp_path, replace(CALIBRATION.table, height_m=CALIBRATION.table.height_m + 1e-3))
-    refused = pytest.raises(InputError, match=r"table\.json is another table .* again$")
+    refused = pytest.raises(
+        InputError, match=r"table\.json and the calibration hold different tables, .* again$"
+    )
     with refused, open_rig(config):
         pass
 
