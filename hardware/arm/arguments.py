@@ -49,7 +49,7 @@ def _numbers(name: str, value: object) -> np.ndarray:
 
 
 def check_joints(q: np.ndarray | Sequence[float]) -> np.ndarray:
-    """Return joint way-points [rad] as a copy (N, 7), float64.
+    """Return joint waypoints [rad] as a copy (N, 7), float64.
 
     Raises:
         InputError: no real numbers, wrong shape, not finite, or beyond the joint limits
@@ -64,7 +64,7 @@ def check_joints(q: np.ndarray | Sequence[float]) -> np.ndarray:
         row, joint = map(int, np.argwhere(beyond)[0])
         raise InputError(
             f"q: joint {joint + 1} at {points[row, joint]:.4f} rad is beyond its limits "
-            f"{Q_MIN[joint]} to {Q_MAX[joint]}; choose another way-point"
+            f"{Q_MIN[joint]} to {Q_MAX[joint]}; choose another waypoint"
         )
     return points
 

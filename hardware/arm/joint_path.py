@@ -1,6 +1,6 @@
-"""Way-points in joint space as the vendor's time-optimal planner can take them.
+"""Waypoints in joint space as the vendor's time-optimal planner can take them.
 
-It has three traps: on a way-point that repeats the one before it searches for 30 s and gives up; it
+It has three traps: on a waypoint that repeats the one before it searches for 30 s and gives up; it
 takes a corner of half a turn at full speed, which ends in a reflex; and it rounds other corners by
 up to 0.02 rad, some 10 mm at the hand. So the arm comes to rest at sharp corners.
 
@@ -16,7 +16,7 @@ import numpy as np
 
 __all__ = ["SHARP", "corner_cuts", "path_pieces"]
 
-# Joints that differ by less than this repeat the way-point [rad].
+# Joints that differ by less than this repeat the waypoint [rad].
 STANDSTILL = 1e-3
 SHARP = 0.87
 """Cosine of the turn between two steps beyond which the arm comes to rest between them: 30 deg."""
@@ -32,7 +32,7 @@ def path_pieces(start: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray,
         points: where it is to go [rad], shape (N, 7)
 
     Returns:
-        for each piece where it begins, (7,), and its way-points, (M, 7); none where the arm is
+        for each piece where it begins, (7,), and its waypoints, (M, 7); none where the arm is
         already there
     """
     kept = [start]

@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 PATH_TOLERANCE = 1e-4
-"""How far beyond a limit a path in joint space may come between its way-points [m], [rad]."""
+"""How far beyond a limit a path in joint space may come between its waypoints [m], [rad]."""
 # Below the sum over the joints of their turns between two samples [rad]: with a hand within 1.4 m
 # of every axis it leaves the chord by at most 0.07 mm.
 _SAMPLE_TURN = 0.02
@@ -89,9 +89,9 @@ class SafetyLimits:
     max_grasp_force_N: float = 20.0
     """Greatest force of the fingers [N]: a bead chain needs 10 and is crushed by the hand's 70."""
     joint_margin: float = 0.05
-    """Share of each joint's range that way-points keep from either end."""
+    """Share of each joint's range that waypoints keep from either end."""
     max_joint_step_rad: float = 0.5
-    """Greatest change of a joint from one way-point to the next: more is a flip of the arm."""
+    """Greatest change of a joint from one waypoint to the next: more is a flip of the arm."""
     arrival_tolerance_m: float = 3e-3
     """How far from its target a motion may end."""
     arrival_tolerance_rad: float = 0.035
@@ -128,12 +128,12 @@ class SafetyLimits:
 
     @property
     def q_min(self) -> np.ndarray:
-        """Lowest joint positions of a way-point [rad], shape (7,)."""
+        """Lowest joint positions of a waypoint [rad], shape (7,)."""
         return Q_MIN + self.joint_margin * (Q_MAX - Q_MIN)
 
     @property
     def q_max(self) -> np.ndarray:
-        """Highest joint positions of a way-point [rad], shape (7,)."""
+        """Highest joint positions of a waypoint [rad], shape (7,)."""
         return Q_MAX - self.joint_margin * (Q_MAX - Q_MIN)
 
     def height(self, base_T_tcp: np.ndarray) -> np.ndarray:
@@ -184,6 +184,6 @@ def dense_path(points: np.ndarray) -> np.ndarray:
     # The number of each sample within its step, from 1.
     number = np.arange(1, len(owner) + 1) - np.repeat(np.cumsum(counts) - counts, counts)
     shares = (number / counts[owner])[:, None]
-    # Exactly the way-points at their ends, without rounding.
+    # Exactly the waypoints at their ends, without rounding.
     between = np.where(shares == 1.0, points[owner + 1], points[owner] + shares * steps[owner])
     return np.vstack([points[:1], between])

@@ -69,7 +69,7 @@ class CheckedPath:
     """A path in joint space that keeps the limits.
 
     Attributes:
-        points: way-points without repetitions [rad], (N, 7)
+        points: waypoints without repetitions [rad], (N, 7)
         speed: share of the joints' greatest speeds, at most what was commanded
     """
 
@@ -130,7 +130,7 @@ class MotionChecks:
                 f"{self.limits.q_min[joint]:.3f} to {self.limits.q_max[joint]:.3f}"
             )
         poses = self.arm.poses(q)
-        self._check_poses(poses, rounding, what="a way-point is beyond")
+        self._check_poses(poses, rounding, what="a waypoint is beyond")
         return poses
 
     def check_joint_path(
@@ -139,7 +139,7 @@ class MotionChecks:
         """Refuse a motion from `start` (7,) through `points` (N, 7) [rad]; it stops on no contact.
 
         So it has to stay above `contact_height_m`. Checked is what the backend executes: without
-        way-points that repeat the one before, and with corners that may be rounded.
+        waypoints that repeat the one before, and with corners that may be rounded.
         """
         speed = self.check_share(speed)
         self.check_way_points(points)
@@ -204,7 +204,7 @@ class MotionChecks:
                 limits.max_contact_force_N,
                 " N",
             )
-        self._check_poses(target[None], _ROUNDING, what="a way-point is beyond")
+        self._check_poses(target[None], _ROUNDING, what="a waypoint is beyond")
         height = float(limits.height(target))
         stops = stop_force_N is not None
         descends = float(limits.height(start)) - height > LEVEL
@@ -237,11 +237,11 @@ class MotionChecks:
         return CheckedLine(points[-1], speed, sinks)
 
     def _check_steps(self, path: np.ndarray) -> None:
-        """Refuse a path (N, 7) [rad] that jumps between two way-points."""
+        """Refuse a path (N, 7) [rad] that jumps between two waypoints."""
         step = float(np.abs(np.diff(path, axis=0)).max())
         if step > self.limits.max_joint_step_rad:
             raise SafetyViolation(
-                f"max_joint_step_rad: {step:.2f} rad between two way-points, "
+                f"max_joint_step_rad: {step:.2f} rad between two waypoints, "
                 f"{self.limits.max_joint_step_rad:g} allowed"
             )
 

@@ -1,7 +1,7 @@
 """How fast joints may go along a path so that the tool centre point keeps its speeds.
 
 A share of the joints' greatest speeds says nothing about the hand: that depends on the posture. All
-backends go through way-points alike: between two of them the joints move in proportion, none faster
+backends go through waypoints alike: between two of them the joints move in proportion, none faster
 than its share, and one of them at it unless the arm speeds up or slows down. A gentle corner may be
 rounded; there they move in a mixture of the proportions before and after it. So at a full share the
 hand's greatest velocity at a place is known, and it falls in proportion with the share.

@@ -2,7 +2,7 @@
 measured table.
 
 Hover, open, descend until contact, take hold, lift, carry, lower until contact, let go, retreat,
-home. Every way-point is checked before anything moves, and once more when it is its turn. What the
+home. Every waypoint is checked before anything moves, and once more when it is its turn. What the
 fingers hold is measured after the grasp and again after the lift: a cable that was missed or lost
 is an outcome, not an error.
 
@@ -228,7 +228,7 @@ class _Execution:
         return self._end(PickPlaceOutcome.PLACED)
 
     def _go(self, name: str, *, contact: bool = False) -> None:
-        """Move to a way-point; with `contact` gently, and something in the way is an error."""
+        """Move to a waypoint; with `contact` gently, and something in the way is an error."""
         config, pose = self._config, self._poses[name]
         if not contact:
             self._robot.move_linear(pose, speed=config.speed)
@@ -239,12 +239,12 @@ class _Execution:
         self._feel()
 
     def _rise(self, name: str) -> None:
-        """Move up to a way-point, from a hand that may be higher already."""
+        """Move up to a waypoint, from a hand that may be higher already."""
         if self._robot.state().base_T_tcp[2, 3] < self._poses[name][2, 3]:
             self._go(name)
 
     def _descend(self, name: str) -> bool:
-        """Go down until contact; returns whether that was near the way-point."""
+        """Go down until contact; returns whether that was near the waypoint."""
         config = self._config
         result = self._robot.move_linear(
             self._poses[name], speed=config.descent_speed, stop_force_N=config.stop_force_N

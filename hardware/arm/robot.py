@@ -148,7 +148,7 @@ class ConnectionLost(RobotError):
 class MotionError(RobotError):
     """A motion did not end where it should."""
 
-    default_advice = "see what is in the arm's way; a slower motion or nearer way-points may help"
+    default_advice = "see what is in the arm's way; a slower motion or nearer waypoints may help"
 
 
 class UnreachablePose(MotionError):
@@ -222,13 +222,13 @@ class Robot(Closing, Protocol):
         ...
 
     def move_joints(self, q: np.ndarray, *, speed: float) -> None:
-        """Move through joint way-points to the last one.
+        """Move through joint waypoints to the last one.
 
         Between two of them the joints move in proportion. The arm comes to rest where the path
         turns by more than 30 degrees; gentler corners may be rounded, by at most 0.02 rad.
 
         Args:
-            q: joint positions [rad], one way-point (7,) or several (N, 7)
+            q: joint positions [rad], one waypoint (7,) or several (N, 7)
             speed: share of the joints' greatest speeds and accelerations, above 0 and up to 1
 
         Raises:

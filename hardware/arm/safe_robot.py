@@ -3,7 +3,7 @@
 A command that breaks a limit raises `SafetyViolation`, which names the limit, and nothing has
 moved; one that is malformed raises `InputError`. Nothing is clamped but speed: where the way would
 take the hand beyond its own speeds the motion is made slower, and its result says so. Checked are
-copies of the commanded way-points and everything between them, from where the arm really stands.
+copies of the commanded waypoints and everything between them, from where the arm really stands.
 What is not checked: the elbow and the forearm (a hand that points down over a flat table keeps them
 above it), other objects, and people. Software is no safety function: keep the emergency stop in
 your hand.
@@ -138,7 +138,7 @@ class SafeRobot(Closing):
     # Moving.
 
     def move_joints(self, q: np.ndarray, *, speed: float) -> JointMoveResult:
-        """Move through joint way-points; see `Robot.move_joints`.
+        """Move through joint waypoints; see `Robot.move_joints`.
 
         It does not stop on contact, so it stays above `contact_height_m`. It is made slower than
         commanded where the TCP would exceed its speeds or turn by more than 0.5 rad/s on the way.
@@ -252,7 +252,7 @@ class SafeRobot(Closing):
             count = max(int(np.ceil(np.abs(self._home - state.q).max() / _HOME_STEP)), 1)
             points = state.q + np.arange(1, count + 1)[:, None] / count * (self._home - state.q)
             points[-1] = self._home
-            # A start within a joint's margin is allowed, way-points there are not.
+            # A start within a joint's margin is allowed, waypoints there are not.
             outside = (points < limits.q_min) | (points > limits.q_max)
             kept = points[int(np.argmin(outside.any(axis=1))) :]
             return self.move_joints(kept, speed=wanted)

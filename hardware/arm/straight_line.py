@@ -1,6 +1,6 @@
-"""Joint way-points along a straight motion of the TCP, solved on the robot's own kinematics.
+"""Joint waypoints along a straight motion of the TCP, solved on the robot's own kinematics.
 
-Damped Gauss-Newton from each way-point to the next, so the arm never changes its configuration on
+Damped Gauss-Newton from each waypoint to the next, so the arm never changes its configuration on
 the way; what freedom is left goes towards a rest posture, a little a step, so that many motions do
 not let the elbow wander.
 
@@ -20,16 +20,16 @@ from .robot import UnreachablePose
 
 __all__ = ["Kinematics", "StraightLine", "distance", "straight_line"]
 
-# Way-points this far apart keep the TCP within 0.1 mm of the line [m], [rad].
+# Waypoints this far apart keep the TCP within 0.1 mm of the line [m], [rad].
 SPACING, TURN_SPACING = 0.01, 0.05
 # Joints stay this share of their range away from its ends: the vendor's controller pushes back
 # within about 0.1 rad of them.
 MARGIN = 0.03
-MAX_JUMP = 0.5  # [rad] between way-points; more means that the arm folds over
+MAX_JUMP = 0.5  # [rad] between waypoints; more means that the arm folds over
 POSITION_TOLERANCE, TURN_TOLERANCE = 1e-5, 1e-4  # [m], [rad]
 ITERATIONS = 30
 DAMPING = 1e-8
-# Greatest motion towards the rest posture in one way-point [rad].
+# Greatest motion towards the rest posture in one waypoint [rad].
 REST_STEP = 0.02
 
 
@@ -50,7 +50,7 @@ class StraightLine:
     """A planned motion.
 
     Attributes:
-        q: joint way-points after the start [rad], shape (N, 7)
+        q: joint waypoints after the start [rad], shape (N, 7)
         speed_factor: share of the joints' greatest speeds that keeps the TCP's speed
     """
 
@@ -64,7 +64,7 @@ def straight_line(
     """Plan the straight motion from where `q` (7,) puts the TCP to `base_T_tcp` at `speed` [m/s].
 
     Raises:
-        UnreachablePose: a way-point has no joint positions within the limits near the last one
+        UnreachablePose: a waypoint has no joint positions within the limits near the last one
     """
     start = kinematics.pose(q)
     length, turn = distance(start, base_T_tcp)

@@ -88,7 +88,7 @@ class DryRunRobot(Closing):
         )
 
     def move_joints(self, q: np.ndarray, *, speed: float) -> None:
-        """Record joint way-points; see `Robot.move_joints`."""
+        """Record joint waypoints; see `Robot.move_joints`."""
         points = check_joints(q)
         check_range("speed", speed, low=0.0, high=1.0, unit="of the greatest speed")
         self._latch.check()

@@ -126,7 +126,7 @@ class FR3Robot(Closing):
         )
 
     def move_joints(self, q: np.ndarray, *, speed: float) -> None:
-        """Move through joint way-points; see `Robot.move_joints`. The arm rests at each.
+        """Move through joint waypoints; see `Robot.move_joints`. The arm rests at each.
 
         A share of the greatest speeds means those of the Panda, which has the slower joints.
 
@@ -140,7 +140,7 @@ class FR3Robot(Closing):
             joint = int(np.argwhere(beyond)[0][1])
             raise InputError(
                 f"q: joint {joint + 1} is beyond an FR3's limits {FR3_Q_MIN[joint]} to "
-                f"{FR3_Q_MAX[joint]}; choose another way-point"
+                f"{FR3_Q_MAX[joint]}; choose another waypoint"
             )
         at = self.state().q
         for point in points:

@@ -189,7 +189,7 @@ class FrankapyRobot(Closing):
         )
 
     def move_joints(self, q: np.ndarray, *, speed: float) -> None:
-        """Move through joint way-points; see `Robot.move_joints`. The arm rests at each."""
+        """Move through joint waypoints; see `Robot.move_joints`. The arm rests at each."""
         points = check_joints(q)
         check_range("speed", speed, low=0.0, high=1.0, unit="of the greatest speed")
         at = self.state().q

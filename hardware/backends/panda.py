@@ -1,6 +1,6 @@
 """The Franka Panda (FER) through panda-python: libfranka 0.9, server version 5, no ROS.
 
-Motions go through joint way-points, because the vendor's Cartesian controller stops millimetres
+Motions go through joint waypoints, because the vendor's Cartesian controller stops millimetres
 short. Straight lines are solved on the robot's own kinematic model.
 
 Never run on a physical robot by the authors: tested with the vendor's wheel against
@@ -92,7 +92,7 @@ class PandaRobot(Closing):
         )
 
     def move_joints(self, q: np.ndarray, *, speed: float) -> None:
-        """Move through joint way-points; see `Robot.move_joints`.
+        """Move through joint waypoints; see `Robot.move_joints`.
 
         The vendor's controller overshoots by up to 12 %: above a speed of about 0.85 the robot may
         stop itself with joint_velocity_violation.
@@ -220,7 +220,7 @@ class PandaRobot(Closing):
         for begin, piece in path_pieces(start, points):
             for left in reversed(range(STARTS)):
                 if self._link.latch.pressed:
-                    raise MotionError("the motion was stopped before its last way-point")
+                    raise MotionError("the motion was stopped before its last waypoint")
                 try:
                     self._link.follow(begin, piece, factor)
                     break

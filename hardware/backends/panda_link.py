@@ -229,7 +229,7 @@ class PandaLink:
             self._following = False
         if not ok:
             took = time.monotonic() - clock
-            raise MotionError(f"the motion ended after {took:.1f} s, before its last way-point")
+            raise MotionError(f"the motion ended after {took:.1f} s, before its last waypoint")
 
     def _watch(self) -> Callable[[], None]:
         """Return what raises ConnectionLost once states of a motion that has begun stay away."""

@@ -36,7 +36,7 @@ class Plan:
 
     Attributes:
         action: the action; None for the way to the home pose
-        poses: its way-points by name [m], (4, 4) each
+        poses: its waypoints by name [m], (4, 4) each
         overlay: the action drawn on the workspace; None for the way home
         number: of the action, from 1
         picture: file that shows `overlay`; None where there is none

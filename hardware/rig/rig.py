@@ -170,7 +170,7 @@ def _tell(command: RecordedCommand) -> None:
         if name == "base_T_tcp":
             value = "to ({:.3f}, {:.3f}, {:.3f})".format(*value[:3, 3])
         elif name == "q":
-            value = f"through {len(value)} way-points"
+            value = f"through {len(value)} waypoints"
         elif value is None:
             continue
         else:

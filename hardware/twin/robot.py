@@ -1,6 +1,6 @@
 """A robot in software that moves a simulated chain: to rehearse an episode without any robot.
 
-Motions follow their joint way-points exactly, begin and end at rest, and pass in simulated time, as
+Motions follow their joint waypoints exactly, begin and end at rest, and pass in simulated time, as
 fast as the computer goes. Contact stops a descent, or the arm by a reflex, as on the robot. What is
 not simulated: the arm's dynamics (for those run the vendor's client on `hardware.emulator`).
 """
@@ -87,7 +87,7 @@ class SimRobot(Closing):
         )
 
     def move_joints(self, q: np.ndarray, *, speed: float) -> None:
-        """Move through joint way-points; see `Robot.move_joints`."""
+        """Move through joint waypoints; see `Robot.move_joints`."""
         points = check_joints(q)
         check_range("speed", speed, low=0.0, high=1.0, unit="of the greatest speed")
         self._move(points, speed, None)

@@ -1,4 +1,4 @@
-"""A video of recorded episodes: simulated again, with the arm that moves through its way-points."""
+"""A video of recorded episodes: simulated again, with the arm that moves through its waypoints."""
 
 from __future__ import annotations
 

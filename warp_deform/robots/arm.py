@@ -169,13 +169,13 @@ class Robot:
         seed: np.ndarray | None = None,
         lengths: Sequence[int] | None = None,
     ) -> IKResult:
-        """Return joint way-points for tip-down way-points (N, 4) [m, rad] in order.
+        """Return joint waypoints for tip-down waypoints (N, 4) [m, rad] in order.
 
         All of them lie on one branch, so the elbow never flips, and the last joint unwraps along
         the path instead of jumping by a turn, as far as its limits allow. `seed` (dof,) is where
         the path sets out from, by default home: it chooses the turn of the last joint.
 
-        Several paths are solved in one batch when `lengths` gives the number of way-points of each;
+        Several paths are solved in one batch when `lengths` gives the number of waypoints of each;
         `seed` may then be (paths, dof).
 
         Raises:
@@ -257,7 +257,7 @@ class Robot:
     def _follow(
         self, way_points: np.ndarray, starts: np.ndarray, seed: np.ndarray | None
     ) -> IKResult:
-        """Solve paths of tip-down way-points that set out at the rows `starts`."""
+        """Solve paths of tip-down waypoints that set out at the rows `starts`."""
         if not len(way_points):
             return self._nothing()
         reference = self._seeds(self.home_q if seed is None else seed, len(starts))[:, -1]

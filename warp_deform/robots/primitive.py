@@ -1,10 +1,10 @@
-"""The pick-and-place primitive: an action becomes way-points of the tip over simulated time.
+"""The pick-and-place primitive: an action becomes waypoints of the tip over simulated time.
 
 Source: Seita et al., ICRA 2021, appendix on the action primitive. The tip goes above the pick
 point, descends until it meets something, takes it, lifts it, carries it above the place point,
 lowers it until it meets something, waits, lets go and retreats. Where the original moves joints a
 fixed angle a control tick of wall time, the tip here follows straight lines in simulated time, with
-IK way-points along them.
+IK waypoints along them.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = [
 
 
 _GENTLE_PIECES = 13
-"""Way-points of a gentle stretch."""
+"""Waypoints of a gentle stretch."""
 BEAD_FIRST = 0.006
 """A bead that a descending tip meets so little below a vertex of the shell is taken instead [m]."""
 
@@ -51,7 +51,7 @@ class Outcome(StrEnum):
     MISSED = "missed"
     """The descending tip met only the table."""
     UNREACHABLE = "unreachable"
-    """The arm cannot reach a way-point tip-down; nothing was moved."""
+    """The arm cannot reach a waypoint tip-down; nothing was moved."""
     INVALID = "invalid"
     """A guard of the solver fired: the state cannot be trusted."""
 
@@ -75,7 +75,7 @@ class PrimitiveConfig:
     tip_radius: float = 0.001
     """Radius of the suction tip [m]."""
     spacing: float = 0.10
-    """Largest distance between joint way-points along a straight line [m]."""
+    """Largest distance between joint waypoints along a straight line [m]."""
     turn_spacing: float = 0.5
     """Largest turn between them [rad]."""
 
@@ -123,7 +123,7 @@ class Grasp:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A stretch of the tip's motion: way-points (K, 4) x, y, z [m], yaw [rad] at times (K,) [s]."""
+    """A stretch of the tip's motion: waypoints (K, 4) x, y, z [m], yaw [rad] at times (K,) [s]."""
 
     times: np.ndarray
     way_points: np.ndarray
@@ -252,7 +252,7 @@ def carry(
 def solve_joints(
     robot: Robot, motions: Sequence[Motion], postures: Sequence[np.ndarray]
 ) -> list[np.ndarray | None]:
-    """Joint way-points (K, dof) of every motion, solved in one batch; None: out of reach.
+    """Joint waypoints (K, dof) of every motion, solved in one batch; None: out of reach.
 
     Args:
         postures: joint positions (dof,) [rad] from which each motion sets out
@@ -267,7 +267,7 @@ def solve_joints(
 
 
 def _straight(points: Sequence[np.ndarray], speed: float, config: PrimitiveConfig) -> Motion:
-    """Way-points along straight lines at `speed` [m/s], or slower where the turn takes longer."""
+    """Waypoints along straight lines at `speed` [m/s], or slower where the turn takes longer."""
     times, way_points = [0.0], [points[0]]
     for a, b in pairwise(points):
         distance = float(np.linalg.norm(b[:3] - a[:3]))

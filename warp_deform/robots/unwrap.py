@@ -1,4 +1,4 @@
-"""Which turn of a revolute joint each way-point of a path should use."""
+"""Which turn of a revolute joint each waypoint of a path should use."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def unwrap(
 
 def _least_motion(angles: list[float], reference: float, low: float, high: float) -> list[float]:
     """Return whole-turn equivalents within the limits with the least total motion, by Viterbi."""
-    # Cost and path of the best sequence that ends in each candidate of the latest way-point.
+    # Cost and path of the best sequence that ends in each candidate of the latest waypoint.
     best: list[tuple[float, list[float]]] = [(0.0, [reference])]
     for angle in angles:
         first, last = math.ceil((low - angle) / TURN), math.floor((high - angle) / TURN)

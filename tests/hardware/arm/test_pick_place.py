@@ -1,4 +1,4 @@
-"""The pick-and-place primitive: its way-points, its outcomes, and that it keeps the limits."""
+"""The pick-and-place primitive: its waypoints, its outcomes, and that it keeps the limits."""
 
 from __future__ import annotations
 

@@ -153,7 +153,7 @@ def test_a_straight_line_is_straight_and_within_limits(
         off, angle = distance(pose, wanted)
         assert off < 2e-5 and angle < 2e-4
     assert (plan.q > Q_MIN).all() and (plan.q < Q_MAX).all()
-    # Half-way between way-points, where joints are interpolated, too.
+    # Half-way between waypoints, where joints are interpolated, too.
     path = np.vstack([HOME, plan.q])
     for a, b in pairwise(path):
         chord = 0.5 * (ARM.pose(a) + ARM.pose(b))[:3, 3]

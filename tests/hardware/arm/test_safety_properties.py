@@ -157,7 +157,7 @@ def short_line(case: dict) -> tuple[SafetyLimits, SpyRobot]:
 def short_joint_path(
     start: int, height: float, slope: tuple[float, float], scale: float, turns: np.ndarray
 ) -> tuple[SafetyLimits, SpyRobot]:
-    """Command way-points whose steps are `turns` (n, 7) times `scale` [rad], near the table."""
+    """Command waypoints whose steps are `turns` (n, 7) times `scale` [rad], near the table."""
     try:
         limits, spy, robot = near_the_table(start, height, slope)
     except InputError:
@@ -188,7 +188,7 @@ def test_no_short_line_gets_past_the_limits(case: dict) -> None:
 def test_no_joint_path_gets_past_the_limits(
     start: int, height: float, slope: tuple[float, float], seed: int, scale: float
 ) -> None:
-    """Way-points near the limits, where many paths are refused and some are not."""
+    """Waypoints near the limits, where many paths are refused and some are not."""
     turns = np.random.default_rng(seed).uniform(-1.0, 1.0, (1 + seed % 4, 7))
     limits, spy = short_joint_path(start, height, slope, scale, turns)
     assert_within(limits, spy)

@@ -298,7 +298,7 @@ def test_a_pose_has_the_same_bits_in_any_batch(arm: Robot) -> None:
 
 
 def pick_and_place(arm: Robot, rng: np.random.Generator) -> np.ndarray:
-    """Return 10 way-points of one action: down, up, a line in five pieces, down, up."""
+    """Return 10 waypoints of one action: down, up, a line in five pieces, down, up."""
     ends = np.empty((2, 4))
     for row in ends:
         radius, turn = rng.uniform(0.30, 0.75), np.radians(rng.uniform(-60.0, 60.0))
