@@ -27,7 +27,8 @@ class Memory:
     def avoid(self, *, changed: bool) -> list[tuple[np.ndarray, float]]:
         """Points (2,) and distances [m] from them within which nothing is to be picked.
 
-        changed: whether the picture shows something else than before the last action
+        Args:
+            changed: whether the picture shows something else than before the last action
         """
         if changed:
             self._placed += [place for _, place in self._tried[-1:]]

@@ -43,12 +43,14 @@ def run(
     The fabrics are those of `bench.cloth`, with at most 16 worlds (4 of 50 rows); their figure is
     the mean over settling, one fold and lying folded, ours and the peer's.
 
-    seconds: simulated time of one measurement [s]; None: 1 s, or the whole play of a fabric or a
-    bag, which `seconds` cuts short for a peer alone
+    Args:
+        seconds: simulated time of one measurement [s]; None: 1 s, or the whole play of a fabric or
+            a bag, which `seconds` cuts short for a peer alone
 
-    Returns times in process CPU milliseconds per simulated second and world, `ratio` and
-    `ratio_lanes` (peer's time over ours, falling; `rest_ratio` at rest) and `same_bits`: whether
-    the worlds in lanes ended in the very states they end in alone.
+    Returns:
+        Times in process CPU milliseconds per simulated second and world, `ratio` and `ratio_lanes`
+        (peer's time over ours, falling; `rest_ratio` at rest) and `same_bits`: whether the worlds
+        in lanes ended in the very states they end in alone.
 
     Raises:
         InputError: no such scene or peer, or the peer is not installed.
