@@ -24,7 +24,9 @@ def seconds_by_file(report: Path) -> dict[str, float]:
     for case in ElementTree.parse(report).iter("testcase"):
         # "tests.project.test_house", with the class behind it where a test has one
         parts = str(case.get("classname")).split(".")
-        ends = next(k for k, part in enumerate(parts) if part.startswith("test_"))
+        ends = next((k for k, part in enumerate(parts) if part.startswith("test_")), None)
+        if ends is None:  # a file that could not be read at all
+            continue
         total["/".join(parts[: ends + 1]) + ".py"] += float(str(case.get("time")))
     return dict(total)
 

@@ -44,14 +44,9 @@ class Pull:
         """Positions (1, frames, beads, 3) [m]."""
         self.calls += 1
         named = dict(zip(NAMES, parameters[:, None], strict=True))
-        return self.run.forward(
-            [0],
-            TIMES[:frames],
-            paths={0: self.path},
-            parameters=named,
-            positions=self.start[None],
-            velocities=np.zeros((1, CORD.beads, 3)),
-        )
+        rest = {"positions": self.start[None], "velocities": np.zeros((1, CORD.beads, 3))}
+        times, paths = TIMES[:frames], {0: self.path}
+        return self.run.forward([0], times, paths=paths, parameters=named, **rest)
 
     def loss(self, logs: np.ndarray, seen: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
         """Pseudo-Huber loss against the frames seen, and its gradient by the logarithms."""
@@ -65,15 +60,8 @@ def fit(pull: Pull, seen: np.ndarray) -> np.ndarray:
     """Parameters by L-BFGS in their logarithms, ever more frames at a time."""
     logs = np.log(GUESS)
     for frames in range(2, len(TIMES), 2):
-        logs = minimize(
-            pull.loss,
-            logs,
-            (seen[:, :frames], 6 * NOISE),
-            "L-BFGS-B",
-            jac=True,
-            bounds=[(-4, 3)] * 4,
-            options={"maxiter": 8},
-        ).x
+        limits = {"jac": True, "bounds": [(-4, 3)] * 4, "options": {"maxiter": 8}}
+        logs = minimize(pull.loss, logs, (seen[:, :frames], 6 * NOISE), "L-BFGS-B", **limits).x
     return np.exp(minimize(pull.loss, logs, (seen, NOISE), "L-BFGS-B", jac=True).x)
 
 

@@ -41,14 +41,9 @@ class Pull:
     def simulate(self, knots: np.ndarray, damping: float = 1.0) -> np.ndarray:
         """Beads (24, 3) [m] 0.4 s after a pull with the end 3 cm above the table."""
         path = GripPath(TIMES, np.column_stack([knots, HEIGHT]), particle=23)
-        return self.run.forward(
-            [0],
-            [TIMES[-1] + 0.4],
-            paths={0: path},
-            positions=FOLDS[None],
-            velocities=np.zeros((1, 24, 3)),
-            parameters={"damping": [damping]},
-        )[0, 0]
+        rest = {"positions": FOLDS[None], "velocities": np.zeros((1, 24, 3))}
+        times, named = [TIMES[-1] + 0.4], {"damping": [damping]}
+        return self.run.forward([0], times, paths={0: path}, parameters=named, **rest)[0, 0]
 
 
 def descend(pull: Pull, guess: np.ndarray) -> np.ndarray:

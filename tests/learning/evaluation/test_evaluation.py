@@ -288,8 +288,8 @@ def test_goals_that_do_not_fit_are_told_of_in_one_line(
         EpisodeWriter(tmp_path / name).write(replace(episode, info=info))
         assert main(["eval", str(run.path), "--goals", str(tmp_path / name)]) == 2
         said = capsys.readouterr().err
-        assert said.count("\n") == 1 and ("goals of" in said or "stands for as a goal" in said)
-    with pytest.raises(InputError, match="stands for"):
+        assert said.count("\n") == 1 and ("goals of" in said or "means as a goal" in said)
+    with pytest.raises(InputError, match="means as a goal"):
         load_goals(tmp_path / "imported")
 
 

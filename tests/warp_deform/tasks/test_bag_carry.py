@@ -73,7 +73,7 @@ def test_bags_carried_across_keep_the_cube_and_others_lose_it() -> None:
     task = BagItems1()
     look = Lookahead(task, robot="ur5", precision="float32", count=SLOTS)
     chosen, others = [], []
-    for state, action in about_to_carry(3 * SLOTS):
+    for state, action in about_to_carry(2 * SLOTS):
         episode = state.episode
         chosen.append((state, action))
         across = task.across(episode.layout, episode.snapshot)
@@ -84,5 +84,5 @@ def test_bags_carried_across_keep_the_cube_and_others_lose_it() -> None:
         return sum(outlook.grade == ENCLOSED for outlook in outlooks)
 
     across_kept, near_kept = kept(look.try_each(chosen)), kept(look.try_each(others))
-    assert len(chosen) > 2 * SLOTS
+    assert len(chosen) > SLOTS
     assert across_kept >= 0.8 * len(chosen) and near_kept <= across_kept - 3

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 
-from warp_deform.tasks import demonstrators, ground_truth, metrics, shapes
+from warp_deform.tasks import demonstrators, ground_truth, metrics, target_shapes
 
 quick = settings(derandomize=True, deadline=None, max_examples=60)
 coordinate = st.floats(-1.0, 1.0, allow_subnormal=False)
@@ -21,7 +21,7 @@ masks = arrays(bool, (6, 5))
 poses = arrays(float, 3, elements=st.floats(-10.0, 10.0, allow_subnormal=False))
 
 
-@pytest.mark.parametrize("module", [metrics, shapes, ground_truth, demonstrators])
+@pytest.mark.parametrize("module", [metrics, target_shapes, ground_truth, demonstrators])
 def test_doctests(module) -> None:
     assert doctest.testmod(module, extraglobs={"np": np}).failed == 0
 
@@ -49,7 +49,7 @@ def test_hull_is_bounded_by_the_box_and_does_not_depend_on_order_or_motion(point
     area = metrics.hull_area(points)
     assert 0 <= area <= np.prod(np.ptp(points, axis=0)) + 1e-12
     assert metrics.hull_area(points[::-1]) == pytest.approx(area, abs=1e-12)
-    moved = shapes.to_world(points, np.array([0.5, -0.2, 0.7]))
+    moved = target_shapes.to_world(points, np.array([0.5, -0.2, 0.7]))
     assert metrics.hull_area(moved) == pytest.approx(area, abs=1e-9)
 
 
