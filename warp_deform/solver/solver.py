@@ -65,7 +65,9 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
         pairs_per_particle: room in the contact list; a guard fires when it does not suffice.
         bundles: folder that gets a reproducing file whenever a guard fires.
         """
-        super().__init__(
+        SolverBase.__init__(self, model)
+        FusedXPBD.__init__(
+            self,
             model,
             config,
             lanes=lanes,

@@ -52,6 +52,12 @@ def test_it_is_a_newton_solver():
     assert fallen.max() == pytest.approx(9.81 / 2 * FRAME * (FRAME + 1 / 1200), rel=0.03)
 
 
+def test_newtons_base_class_has_set_what_it_sets():
+    model = scene()
+    assert vars(SolverBase(model)).keys() <= vars(SolverFusedXPBD(model)).keys()
+    assert SolverFusedXPBD(model).collision_pipeline is None
+
+
 # the box's centre of mass is the origin of its frame: elsewhere, each hand-over rounds
 @pytest.mark.parametrize("worlds", [1, 3])
 def test_steps_and_one_run_have_the_same_bits(worlds):
