@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
 from fixtures.bag_scenes import pierced
 from fixtures.cloth_scenes import edges_of
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
 from fixtures.cloth_scenes import cloth_solver, edge_ratios, edges_of, fold_path, piercing
 
 from warp_deform.collecting.workers import single_threaded

@@ -1,6 +1,7 @@
 """Thousands of random and adversarial commands through `SafeRobot`: are all written limits kept?
 
-`tests/fixtures/safety_fuzzing.py` says what is commanded and judged; the tests give a few hundred.
+`tests/shared/fixtures/safety_fuzzing.py` says what is commanded and judged; the tests give a few
+hundred.
 
     python benchmarks/safety_fuzz.py [--commands 5000] [--seed 0] [--json FILE]
 """
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import tyro
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "shared"))
 from fixtures.safety_fuzzing import fuzz
 
 

@@ -28,7 +28,7 @@ from fixtures.franka_episodes import (
     frame_of,
     recorder,
 )
-from fixtures.places import TESTS
+from fixtures.places import ROOT, SHARED
 
 from hardware import (
     ConnectionLost,
@@ -54,7 +54,7 @@ from warp_deform.command.main import main as command
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.xpbd.guards import PhysicsError, Problem, ProblemKind
 
-POLICY = TESTS.parent / "benchmarks/results/learning/policies/cable-mask-goal-goal-split-500"
+POLICY = ROOT / "benchmarks/results/learning/policies/cable-mask-goal-goal-split-500"
 
 
 def test_an_episode_ends_at_success(tmp_path: Path) -> None:
@@ -237,8 +237,8 @@ def test_ctrl_c_stops_the_arm_and_is_recorded(tmp_path: Path) -> None:
 def test_a_killed_episode_is_scored_and_replayed(tmp_path: Path, capfd: object) -> None:
     """SIGKILL in the middle of the third action or so: what was done before is there."""
     folder = tmp_path / "a"
-    script = [sys.executable, str(TESTS / "fixtures" / "franka_episodes.py"), str(folder)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
+    script = [sys.executable, str(SHARED / "fixtures" / "franka_episodes.py"), str(folder)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(SHARED)])}
     with subprocess.Popen(script, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None
         for line in process.stdout:

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fixtures.places import TESTS
+from fixtures.places import ROOT, SHARED
 from fixtures.record_until_killed import ACTION, CONFIG, INTRINSICS, frame, mask, observe, result
 
 from hardware import RobotState
@@ -135,11 +135,11 @@ def test_an_episode_without_a_goal_shows_how_to_reach_where_it_ended(tmp_path: P
 def test_a_killed_recorder_loses_the_step_in_flight_only(tmp_path: Path, steps: int) -> None:
     folder = tmp_path / "a"
     process = subprocess.Popen(
-        [sys.executable, str(TESTS / "fixtures" / "record_until_killed.py"), str(folder)],
+        [sys.executable, str(SHARED / "fixtures" / "record_until_killed.py"), str(folder)],
         stdout=subprocess.PIPE,
         text=True,
-        cwd=TESTS.parent,
-        env={**os.environ, "PYTHONPATH": str(TESTS.parent)},
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     assert process.stdout is not None
     told = [int(process.stdout.readline()) for _ in range(steps)]

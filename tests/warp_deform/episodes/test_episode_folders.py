@@ -17,7 +17,7 @@ from fixtures.episode_samples import (
     make_episode,
     with_info,
 )
-from fixtures.places import TESTS
+from fixtures.places import ROOT, SHARED
 
 from warp_deform.episodes import (
     HEIGHT_UNIT,
@@ -98,7 +98,7 @@ def run_writer(folder: Path) -> subprocess.Popen[bytes]:
         "writer = EpisodeWriter(Path(sys.argv[1]))\n"
         "for seed in range(100_000): writer.write(make_episode(seed, size=(64, 48)))\n"
     )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(TESTS), str(TESTS.parent)))}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(SHARED), str(ROOT)))}
     return subprocess.Popen([sys.executable, "-c", code, str(folder)], env=environment)
 
 

@@ -19,7 +19,7 @@ from fixtures.episode_samples import (
     with_info,
     with_step,
 )
-from fixtures.places import TESTS
+from fixtures.places import ROOT
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -220,5 +220,5 @@ def test_provenance_is_stable_and_imports_no_torch() -> None:
         "heavy = {'torch', 'warp', 'newton', 'pyarrow', 'cv2'} & (set(sys.modules) - before)\n"
         "assert not heavy, heavy"
     )
-    environment = {**os.environ, "PYTHONPATH": str(TESTS.parent)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=60)
