@@ -27,7 +27,7 @@ from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
 from warp_deform.planning.waypoints import Bent, WayPointConfig, WayPoints
-from warp_deform.rollout.launch import GripPath
+from warp_deform.rollout.rollouts import GripPath
 from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Action, Task

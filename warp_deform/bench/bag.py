@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..objects.bag import BagConfig, add_bag, bag_shell
 from ..objects.box import BoxConfig, BoxPart, add_box
 from ..peers.soft_scene import TILT, soft_scene
-from ..rollout.launch import rollout
+from ..rollout.rollouts import rollout
 from ..solver.solver import SolverFusedXPBD
 from ..tasks.bag_physics import BAG_SOLVER
 from .timing import Played, time_worlds

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..objects.cloth import ClothConfig, add_cloth, cloth_sheet
-from ..rollout.launch import GripPath, rollout
+from ..rollout.rollouts import GripPath, rollout
 from ..solver.solver import SolverFusedXPBD
 from ..tasks.cloth_physics import CLOTH_SOLVER
 from .timing import Played, time_worlds

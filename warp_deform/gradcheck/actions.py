@@ -26,7 +26,7 @@ _PRECISION = "float32"
 class ActionSample:
     """Of one action: growth of its gradient, whether a search would use it, and the cosines of its
     derivative by place x, y with differences of the rollout that was differentiated (which may be
-    damped, see `Task.slope_damping`) and of the one that counts; None where neither moves.
+    damped, see `Task.gradient_damping`) and of the one that counts; None where neither moves.
     """
 
     growth: float

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..rollout.differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
-from ..rollout.launch import GripPath
+from ..rollout.rollouts import GripPath
 from ..support.quaternion import quat_by_rotation
 from ..worlds.worlds import Worlds
 from .branches import counted, taken

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..rollout.launch import GripPath, rollout
+from ..rollout.rollouts import GripPath, rollout
 from ..tasks.task import Action
 from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 from ..worlds.state import WorldState

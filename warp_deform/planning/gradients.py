@@ -1,7 +1,7 @@
 """Gradients of the task's loss with respect to where an action places, by the solver's adjoint.
 
 A heap of beads is chaotic: the exact derivative of where it ends is large and points nowhere. Where
-a task says so (`Task.slope_damping`), the rollout that is differentiated is damped more than the
+a task says so (`Task.gradient_damping`), the rollout that is differentiated is damped more than the
 one that counts, and its derivative agrees with what 5 mm do to the latter.
 """
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..rollout.differentiable import DifferentiableRollout, Gradients
-from ..rollout.launch import GripPath
+from ..rollout.rollouts import GripPath
 from ..tasks.task import Action, Task
 from ..worlds.episode import Carry, RunningEpisode
 from ..worlds.state import WorldState
@@ -213,7 +213,7 @@ class ActionGradients:
     ) -> _Leg | None:
         """Run actions with the tape on, those whose tip takes something; None: none does."""
         worlds = self._worlds
-        damping = worlds.task.slope_damping
+        damping = worlds.task.gradient_damping
         for slot, (state, _) in jobs.items():
             worlds.restore(slot, state)
             if damping is not None:  # instead of what an episode's own physics says

@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import InputError
 from ..rendering.pixels import BOUNDS
 from ..robots.primitive import LIFT, Motion, solve_joints
-from ..rollout.launch import GripPath, rollout
+from ..rollout.rollouts import GripPath, rollout
 from ..support.quaternion import quat_from_yaw
 from ..tasks.task import Action, Task
 from ..worlds.episode import ALOFT_EVERY, Carry, Plan

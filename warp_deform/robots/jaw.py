@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..objects.cable import Cable
 
 if TYPE_CHECKING:
-    from ..xpbd.launches import FusedXPBD
+    from ..xpbd.fused_xpbd import FusedXPBD
 
 __all__ = ["Jaw", "JawConfig", "JawContact", "between", "squeezed_width"]
 

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..rollout.launch import Frames, Rollout
+from ..rollout.rollouts import Frames, Rollout
 from ..xpbd.guards import WatchValues
 from .jaw import Jaw, JawConfig, JawContact
 from .primitive import Motion, Outcome
 
 if TYPE_CHECKING:
-    from ..xpbd.launches import FusedXPBD
+    from ..xpbd.fused_xpbd import FusedXPBD
 
 __all__ = ["JawActionConfig", "JawCommand", "hand_pose", "jaw_motion", "jaw_script", "run_scripts"]
 

@@ -22,7 +22,7 @@ from ..objects.box import Box
 from ..objects.cable import Cable
 from ..objects.cloth import Cloth
 from ..objects.scene_object import SceneObject
-from ..rollout.launch import GripPath
+from ..rollout.rollouts import GripPath
 from ..support.quaternion import quat_from_yaw, quat_inverse, quat_multiply, quat_rotate
 from .arm import Robot
 

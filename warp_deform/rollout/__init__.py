@@ -9,13 +9,13 @@ from ..support.lazy_exports import lazy_exports
 
 _HOME = {
     "DifferentiableRollout": ".differentiable",
-    "Frames": ".launch",
+    "Frames": ".rollouts",
     "Gradients": ".differentiable",
-    "GripPath": ".launch",
-    "Rollout": ".launch",
+    "GripPath": ".rollouts",
+    "Rollout": ".rollouts",
     "TensorRollout": ".autograd",
-    "prepare": ".launch",
-    "rollout": ".launch",
+    "prepare": ".rollouts",
+    "rollout": ".rollouts",
     "rollout_tensors": ".autograd",
     "substep_vjp": ".differentiable",
 }

@@ -12,10 +12,10 @@ from torch.autograd.function import once_differentiable
 
 from ..errors import InputError
 from ..objects.push import Push
+from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
-from ..xpbd.launches import FusedXPBD
 from .differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
-from .launch import GripPath
+from .rollouts import GripPath
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
 
@@ -207,9 +207,9 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: torch.Tensor | None) -> tuple[Any, ...]:
+    def backward(ctx: Any, *cotangents: torch.Tensor | None) -> tuple[Any, ...]:
         positions, velocities, bodies, body_velocities = (
-            None if slope is None else slope.detach().cpu().numpy() for slope in slopes
+            None if given is None else given.detach().cpu().numpy() for given in cotangents
         )
         gradients = ctx.run.backward(
             positions, velocities, bodies=bodies, body_velocities=body_velocities

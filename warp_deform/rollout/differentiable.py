@@ -12,11 +12,11 @@ from ..errors import InputError
 from ..objects.push import Push
 from ..support.checked import POSITIVE, check_number
 from ..support.quaternion import quat_rotate_vjp, quat_tangent
+from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
 from ..xpbd.lanes.tape import Kind
-from ..xpbd.launches import FusedXPBD
 from ..xpbd.recording.recorder import Recorder
-from .launch import GripPath, prepare
+from .rollouts import GripPath, prepare
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
 

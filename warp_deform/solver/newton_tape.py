@@ -16,9 +16,9 @@ import warp as wp
 
 from ..errors import InputError, WarpDeformError
 from ..rollout.differentiable import DifferentiableRollout
-from ..rollout.launch import GripPath
+from ..rollout.rollouts import GripPath
+from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
-from ..xpbd.launches import FusedXPBD
 
 __all__ = ["TapedStep", "recording", "refuse_lost_derivatives", "unrecorded"]
 
@@ -151,7 +151,7 @@ class TapedStep:
         """Add the derivatives by what the step read, from those by what it wrote."""
         with unrecorded():
             after = {name: array.grad.numpy() for name, array in self._written.items()}
-            if any(slopes.any() for slopes in after.values()):
+            if any(gradient.any() for gradient in after.values()):
                 for worlds, rollout, held in self._runs:
                     self._sweep(worlds, rollout, held, after)
 
@@ -167,15 +167,15 @@ class TapedStep:
             "particle": [data.particle_ids[w] for w in worlds],
             "body": [data.body_ids[w] for w in worlds] if data.has_bodies else [],
         }
-        slopes = {
+        gradients = {
             name: np.stack([after[name][ids] for ids in rows[name.split("_")[0]]])[:, None]
             for name in after
         }
         by = rollout.backward(
-            slopes.get("particle_q"),
-            slopes.get("particle_qd"),
-            bodies=slopes.get("body_q"),
-            body_velocities=slopes.get("body_qd"),
+            gradients.get("particle_q"),
+            gradients.get("particle_qd"),
+            bodies=gradients.get("body_q"),
+            body_velocities=gradients.get("body_qd"),
         )
         before = {
             "particle_q": by.positions.copy(),
@@ -192,8 +192,8 @@ class TapedStep:
         for name, array in self._read.items():
             if array.requires_grad:
                 total = np.zeros(array.grad.numpy().shape)
-                for ids, slope in zip(rows[name.split("_")[0]], before[name], strict=True):
-                    total[ids] = slope
+                for ids, gradient in zip(rows[name.split("_")[0]], before[name], strict=True):
+                    total[ids] = gradient
                 _add(array, total)
         if self._target is not None and self._target.requires_grad:
             _add(self._target, targets)
@@ -221,6 +221,6 @@ def _by_name(state: newton.State, *, gradients: bool = False) -> dict[str, wp.ar
     }
 
 
-def _add(array: wp.array, slopes: np.ndarray) -> None:
+def _add(array: wp.array, gradient: np.ndarray) -> None:
     """Add to the gradient of an array."""
-    array.grad.assign(array.grad.numpy() + slopes.astype(np.float32))
+    array.grad.assign(array.grad.numpy() + gradient.astype(np.float32))

@@ -13,8 +13,8 @@ from newton.solvers import SolverBase
 
 from ..objects.attributes import NAMESPACE, register_attributes
 from ..xpbd.config import SolverConfig
+from ..xpbd.fused_xpbd import FOREVER, FusedXPBD
 from ..xpbd.guards import WatchValues
-from ..xpbd.launches import FOREVER, FusedXPBD
 from .newton_tape import TapedStep, recording, refuse_lost_derivatives, unrecorded
 from .stepping import grip_from_control, substeps
 
@@ -184,31 +184,31 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
         """Take positions and velocities of all worlds from a Newton state."""
         data = self.data
         if data.has_particles:
-            q, qd = state.particle_q.numpy(), state.particle_qd.numpy()
+            positions, velocities = state.particle_q.numpy(), state.particle_qd.numpy()
             for w in range(data.world_count):
-                data.lane("particles.x", w)[:] = q[data.particle_ids[w]]
-                data.lane("particles.v", w)[:] = qd[data.particle_ids[w]]
+                data.lane("particles.x", w)[:] = positions[data.particle_ids[w]]
+                data.lane("particles.v", w)[:] = velocities[data.particle_ids[w]]
         if data.has_bodies:
-            q, qd = state.body_q.numpy(), state.body_qd.numpy()
+            poses, twists = state.body_q.numpy(), state.body_qd.numpy()
             for w in range(data.world_count):
-                data.set_bodies(w, q[data.body_ids[w]], qd[data.body_ids[w]])
+                data.set_bodies(w, poses[data.body_ids[w]], twists[data.body_ids[w]])
 
     def write_state(self, state: newton.State) -> None:
         """Give positions and velocities of all worlds to a Newton state."""
         refuse_lost_derivatives(state)
         data = self.data
         if data.has_particles:
-            q = np.empty((self.model.particle_count, 3), np.float32)
-            qd = np.empty_like(q)
+            positions = np.empty((self.model.particle_count, 3), np.float32)
+            velocities = np.empty_like(positions)
             for w in range(data.world_count):
-                q[data.particle_ids[w]] = data.lane("particles.x", w)
-                qd[data.particle_ids[w]] = data.lane("particles.v", w)
-            state.particle_q.assign(q)
-            state.particle_qd.assign(qd)
+                positions[data.particle_ids[w]] = data.lane("particles.x", w)
+                velocities[data.particle_ids[w]] = data.lane("particles.v", w)
+            state.particle_q.assign(positions)
+            state.particle_qd.assign(velocities)
         if data.has_bodies:
-            q = np.empty((self.model.body_count, 7), np.float32)
-            qd = np.empty((self.model.body_count, 6), np.float32)
+            poses = np.empty((self.model.body_count, 7), np.float32)
+            twists = np.empty((self.model.body_count, 6), np.float32)
             for w in range(data.world_count):
-                q[data.body_ids[w]], qd[data.body_ids[w]] = data.body_poses(w)
-            state.body_q.assign(q)
-            state.body_qd.assign(qd)
+                poses[data.body_ids[w]], twists[data.body_ids[w]] = data.body_poses(w)
+            state.body_q.assign(poses)
+            state.body_qd.assign(twists)

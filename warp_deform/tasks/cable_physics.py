@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..xpbd.config import SolverConfig
 from .task import Stage
 
-__all__ = ["CABLE_SLOPE_DAMPING", "CABLE_SOLVER", "CABLE_STAGE"]
+__all__ = ["CABLE_GRADIENT_DAMPING", "CABLE_SOLVER", "CABLE_STAGE"]
 
 CABLE_SOLVER = SolverConfig(table_friction=0.5, contact_friction=0.1)
 """Friction between beads is low: at 0.3 a pull tightens about one heap in a hundred into a knot
@@ -14,6 +14,6 @@ that holds for ever, where the original's links give way; at 0.1 none of 800 did
 CABLE_STAGE = Stage(lift=0.04, speed=0.15)
 """Low and slow, as in the original, so that the cable follows on the table."""
 
-CABLE_SLOPE_DAMPING = 100.0
+CABLE_GRADIENT_DAMPING = 100.0
 """[1/s]. Slopes of rollouts damped like this point where 5 mm lead: mean cosine 0.8 over 16 pulls,
 of which 10/s gives 0.5 and the damping of the solver 0.2."""

@@ -14,7 +14,7 @@ from ..objects.cable import Cable, RingConfig, add_cable, cable_ring
 from ..objects.push import Push
 from ..objects.zone import ring_zone
 from ..rendering.pixels import BOUNDS
-from .cable_physics import CABLE_SLOPE_DAMPING, CABLE_SOLVER, CABLE_STAGE
+from .cable_physics import CABLE_GRADIENT_DAMPING, CABLE_SOLVER, CABLE_STAGE
 from .demonstrators import best_map, met_particle, pick_place, ring_maps
 from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows
@@ -55,7 +55,7 @@ class CableRing(Task):
     name = "cable-ring"
     stages = (CABLE_STAGE,)
     solver = CABLE_SOLVER
-    slope_damping = CABLE_SLOPE_DAMPING
+    gradient_damping = CABLE_GRADIENT_DAMPING
     success_score = 0.75
     ground_truth_rows = ((Row.BEAD, 64),)
     objects = ("cable",)

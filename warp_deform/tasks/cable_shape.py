@@ -14,7 +14,7 @@ import numpy as np
 
 from ..objects.cable import Cable, CableConfig, add_cable, cable_line
 from ..objects.zone import segment_zone
-from .cable_physics import CABLE_SLOPE_DAMPING, CABLE_SOLVER, CABLE_STAGE
+from .cable_physics import CABLE_GRADIENT_DAMPING, CABLE_SOLVER, CABLE_STAGE
 from .demonstrators import met_particle, pick_place, visible_point
 from .free_space import FreeSpace
 from .ground_truth import Row, Rows, pose_rows
@@ -46,7 +46,7 @@ class CableShape(Task):
     name = "cable-shape"
     stages = (CABLE_STAGE,)
     solver = CABLE_SOLVER
-    slope_damping = CABLE_SLOPE_DAMPING
+    gradient_damping = CABLE_GRADIENT_DAMPING
     success_score = 1.0
     ground_truth_rows: ClassVar[Rows] = ((Row.POSE, 1), (Row.BEAD, 48))
     objects = ("cable",)

@@ -140,7 +140,7 @@ class Task(abc.ABC):
     """Names of what is simulated, for listings."""
     solver: ClassVar[SolverConfig] = SolverConfig()
     """Parameters of the physics."""
-    slope_damping: ClassVar[float | None] = None
+    gradient_damping: ClassVar[float | None] = None
     """Damping [1/s] of the rollouts that actions are differentiated by; None: that of `solver`."""
     primitive: ClassVar[PrimitiveConfig] = PrimitiveConfig()
     """Speeds and heights of the robot's motion."""

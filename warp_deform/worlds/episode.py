@@ -13,7 +13,7 @@ from ..objects.scene_object import SceneObject
 from ..rendering.drawables import Drawables
 from ..robots.arm import Robot
 from ..robots.primitive import Grasp, Motion, Outcome, carry, find_grasp
-from ..rollout.launch import Frames, GripPath, Rollout
+from ..rollout.rollouts import Frames, GripPath, Rollout
 from ..tasks.history import Aloft, PastAction
 from ..tasks.task import Layout, Snapshot, Task
 from ..xpbd.guards import Problem

@@ -11,9 +11,9 @@ from ..objects.cable import Cable
 from ..robots.jaw import Jaw
 from ..robots.jaw_primitive import jaw_motion, jaw_script, run_scripts
 from ..robots.primitive import Motion, Outcome
-from ..rollout.launch import rollout
+from ..rollout.rollouts import rollout
 from ..tasks.task import Task
-from ..xpbd.launches import FusedXPBD
+from ..xpbd.fused_xpbd import FusedXPBD
 from .episode import Plan, episode_rng
 
 __all__ = ["jaw_step"]

@@ -22,7 +22,7 @@ from ..rendering.pixels import BOUNDS
 from ..rendering.topdown import TopDown
 from ..robots import robot as find_robot
 from ..robots.primitive import Motion, Outcome, approach, solve_joints
-from ..rollout.launch import rollout
+from ..rollout.rollouts import rollout
 from ..solver.solver import SolverFusedXPBD
 from ..support.checked import real_array
 from ..tasks.free_space import FreeSpace

@@ -188,7 +188,7 @@ def test_slopes_are_those_of_the_damped_rollout(started):
     (first,), (again,) = gradients.of([job]), gradients.of([job])
     assert first.loss == again.loss and np.array_equal(first.by_place, again.by_place)
     undamped = task(LINE)
-    undamped.slope_damping = None
+    undamped.gradient_damping = None
     (wild,) = ActionGradients(undamped, robot="ur5", precision="float32").of([job])
     assert first.growth < 1e4 and wild.growth > 10 * first.growth
 

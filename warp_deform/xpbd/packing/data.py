@@ -285,15 +285,15 @@ class SolverData(PackedWorlds):
         """Everything as the model starts, nothing gripped."""
         views = self.views
         if self.has_particles:
-            q, qd = self.model.particle_q.numpy(), self.model.particle_qd.numpy()
+            positions, velocities = self.model.particle_q.numpy(), self.model.particle_qd.numpy()
             for w in range(self.world_count):
-                self.lane("particles.x", w)[:] = q[self.particle_ids[w]]
-                self.lane("particles.v", w)[:] = qd[self.particle_ids[w]]
+                self.lane("particles.x", w)[:] = positions[self.particle_ids[w]]
+                self.lane("particles.v", w)[:] = velocities[self.particle_ids[w]]
         views["particles.w"][:] = views["particles.w0"]
         if self.has_bodies:
-            q, qd = self.model.body_q.numpy(), self.model.body_qd.numpy()
+            poses, twists = self.model.body_q.numpy(), self.model.body_qd.numpy()
             for w in range(self.world_count):
-                self.set_bodies(w, q[self.body_ids[w]], qd[self.body_ids[w]])
+                self.set_bodies(w, poses[self.body_ids[w]], twists[self.body_ids[w]])
         views["bodies.w"][:] = views["bodies.w0"]
         self.clear_grips()
 

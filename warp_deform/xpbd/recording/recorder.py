@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ...errors import InputError
-from ...xpbd.launches import FusedXPBD
+from ...xpbd.fused_xpbd import FusedXPBD
 from ..bodies.body_contact import PASSES, VISIT
 from ..guards import WatchValues
 from ..kernels.adjoint import adjoint_kernel

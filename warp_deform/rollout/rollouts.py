@@ -15,7 +15,7 @@ from ..support.quaternion import quat_same_side
 from ..xpbd.guards import WatchValues
 
 if TYPE_CHECKING:
-    from ..xpbd.launches import FusedXPBD
+    from ..xpbd.fused_xpbd import FusedXPBD
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
 
