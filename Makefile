@@ -7,6 +7,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 
+# Where Python may not keep what it has compiled, each of the processes that the tests start compiles
+# torch and Newton again, for longer than most tests take.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help venv demo test check lint format bench docs clean
 
 help:
