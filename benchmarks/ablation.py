@@ -147,8 +147,8 @@ def judge(name: str, options: argparse.Namespace) -> dict[str, Any]:
     row |= held_out(run, Demonstrations(data["validation"], task=options.task))
     if options.episodes:
         protocol = Protocol(split="validation", episodes=options.episodes, retry=False)
-        found = evaluate_snapshot(run, plan.steps, protocol).summary
-        row |= {key: found[key] for key in ("mean_score", "standard_error", "pc_success")}
+        summary = evaluate_snapshot(run, plan.steps, protocol).summary
+        row |= {key: summary[key] for key in ("mean_score", "standard_error", "pc_success")}
     options.out.parent.mkdir(parents=True, exist_ok=True)
     with options.out.open("a") as file:
         file.write(json.dumps(row) + "\n")

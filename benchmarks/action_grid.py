@@ -109,8 +109,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--out", type=Path, default=None)
     options = parser.parse_args()
-    kept = options.out.read_text().splitlines() if options.out and options.out.exists() else []
-    rows = {key(row): row for row in (Row(**json.loads(line)) for line in kept)}
+    lines = options.out.read_text().splitlines() if options.out and options.out.exists() else []
+    rows = {key(row): row for row in (Row(**json.loads(line)) for line in lines)}
     quiet_warp()
     with single_threaded():
         for wanted in itertools.product(options.tasks, GRIDS, (options.seeds,)):

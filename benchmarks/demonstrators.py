@@ -207,17 +207,17 @@ def measure(
         if by in REFINED:
             assert search is not None
             solved, actions, scores, cpu = refined(task, search, first, count)
-            kept: list[bool | None] = [None]
+            enclosed: list[bool | None] = [None]
         else:
             act = demonstrator(by) if search is None else planner(search)
             worlds, seeds = worlds_for(task, "ur5"), range(first, first + count)
             list(play(worlds, [WARM_UP], act=act, look=observe))
-            runs, kept = [], []
+            runs, enclosed = [], []
             began = time.process_time()
             for slot, run in play(worlds, seeds, act=act, look=watch.look):
                 runs.append(run)
                 inside = worlds.enclosed(slot) if run.rows else None
-                kept.append(None if inside is None else inside and run.ended == SOLVED)
+                enclosed.append(None if inside is None else inside and run.ended == SOLVED)
                 print(f"\r{task} {by} {len(runs)}/{count}", end="", file=sys.stderr)
             cpu = time.process_time() - began - watch.cpu
             print(file=sys.stderr)
@@ -244,7 +244,7 @@ def measure(
         states=watch.states,
         still_moving=watch.still_moving,
         pierced=watch.shares(),
-        enclosed=None if all(each is None for each in kept) else sum(map(bool, kept)),
+        enclosed=None if all(each is None for each in enclosed) else sum(map(bool, enclosed)),
     )
 
 
@@ -300,8 +300,8 @@ def pooled(rows: list[Row]) -> list[Pooled]:
     together: dict[tuple[str, str], list[Row]] = {}
     for row in sorted(rows, key=lambda row: row.first_seed):
         together.setdefault((row.task, row.by), []).append(row)
-    found = [_pool(parts) for parts in together.values()]
-    return sorted(found, key=lambda each: (list(TASKS).index(each.task), ORDER.index(each.by)))
+    pools = [_pool(parts) for parts in together.values()]
+    return sorted(pools, key=lambda each: (list(TASKS).index(each.task), ORDER.index(each.by)))
 
 
 def _pool(parts: list[Row]) -> Pooled:
@@ -309,14 +309,14 @@ def _pool(parts: list[Row]) -> Pooled:
         if a.first_seed + a.attempts != b.first_seed:
             raise SystemExit(f"{a.task} {a.by}: seeds are missing, or twice, before {b.first_seed}")
     attempts, solved = sum(r.attempts for r in parts), sum(r.successes for r in parts)
-    kept = [row.enclosed for row in parts if row.enclosed is not None]
+    enclosed = [row.enclosed for row in parts if row.enclosed is not None]
     of_solved = sum(r.mean_actions_solved * r.successes for r in parts if r.successes)
     return Pooled(
         task=parts[0].task,
         by=parts[0].by,
         attempts=attempts,
         successes=solved,
-        enclosed=sum(kept) if kept else None,
+        enclosed=sum(enclosed) if enclosed else None,
         mean_actions=sum(r.mean_actions * r.attempts for r in parts) / attempts,
         mean_actions_solved=of_solved / solved if solved else np.nan,
         cpu_s_per_attempt=sum(r.cpu_s_per_attempt * r.attempts for r in parts) / attempts,
@@ -334,10 +334,10 @@ def hardness(rows: list[Row]) -> str:
         row = mine[task]
         rate = 100 * row.successes / row.attempts
         theirs, ratio = ("-", "-") if success is None else (f"{success} %", f"{rate / success:.2f}")
-        kept = "-" if row.enclosed is None else f"{100 * row.enclosed / row.attempts:.1f} %"
+        enclosed = "-" if row.enclosed is None else f"{100 * row.enclosed / row.attempts:.1f} %"
         ours = row.mean_actions_solved
         lines.append(
-            f"| {task} | {row.attempts} | {rate:.1f} % | {theirs} | {ratio} | {kept} "
+            f"| {task} | {row.attempts} | {rate:.1f} % | {theirs} | {ratio} | {enclosed} "
             f"| {ours:.2f} | {actions:.2f} | {ours / actions:.2f} |"
         )
     return "\n".join(lines)
@@ -353,10 +353,10 @@ def bags(rows: list[Row]) -> str:
         if row.task.startswith("bag-"):
             n, solved = row.attempts, row.successes
             interval = binomtest(solved, n).proportion_ci(method="wilson")
-            kept = "-" if row.enclosed is None else str(row.enclosed)
+            enclosed = "-" if row.enclosed is None else str(row.enclosed)
             lines.append(
                 f"| {row.task} | `{row.by}` | {solved} / {n} | {100 * interval.low:.0f} to "
-                f"{100 * interval.high:.0f} % | {kept} | {row.mean_actions:.2f} "
+                f"{100 * interval.high:.0f} % | {enclosed} | {row.mean_actions:.2f} "
                 f"| {row.cpu_s_per_attempt:.1f} |"
             )
     return "\n".join(lines)

@@ -117,10 +117,10 @@ def demonstrate(task: str, *, episodes: int, workers: int) -> Run:
 def find_command() -> str:
     """The `warp-deform` of this interpreter's environment, else the first on PATH."""
     beside = Path(sys.executable).with_name("warp-deform")
-    found = str(beside) if beside.exists() else shutil.which("warp-deform")
-    if found is None:
+    command = str(beside) if beside.exists() else shutil.which("warp-deform")
+    if command is None:
         sys.exit("the command warp-deform is not installed; run: pip install -e .")
-    return found
+    return command
 
 
 def adopt_orphans() -> None:

@@ -108,11 +108,11 @@ def examine(page: str, text: str) -> tuple[list[Figure], list[str]]:
     figures: list[Figure] = []
     wrong: list[str] = []
     for block in _blocks(page, text, wrong):
-        found = (_of_table if block.table else _of_text)(page, block, wrong)
+        of_block = (_of_table if block.table else _of_text)(page, block, wrong)
         for kind, needed in (("test", "tests/"), ("command", "")):
             if needed not in block.named or not block.named:
-                wrong += [f"{each}: no {kind} is named" for each in found if each.kind == kind]
-        figures += found
+                wrong += [f"{each}: no {kind} is named" for each in of_block if each.kind == kind]
+        figures += of_block
     return figures, list(dict.fromkeys(wrong))
 
 
@@ -165,12 +165,13 @@ def _blocks(page: str, text: str, wrong: list[str]) -> Iterator[_Block]:
 
 
 def _of_text(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
-    found = numbers_in(block.text)
-    printed = [_offsets(match[0], block.start + match.start()) for match in found]
+    matches = numbers_in(block.text)
+    printed = [_offsets(match[0], block.start + match.start()) for match in matches]
     unsaid = _unsaid(block.named, block.text)
     if not block.comments:
         return [
-            Figure(page, m[0], tuple(n), unsaid, True) for m, n in zip(found, printed, strict=True)
+            Figure(page, m[0], tuple(n), unsaid, True)
+            for m, n in zip(matches, printed, strict=True)
         ]
     tokens = " ".join(block.comments).split()
     wanted = _wanted(tokens)
@@ -184,7 +185,7 @@ def _of_text(page: str, block: _Block, wrong: list[str]) -> list[Figure]:
     )
     return [
         _figure(page, m[0], numbers, [next(results) for _ in numbers], True)
-        for m, numbers in zip(found, printed, strict=True)
+        for m, numbers in zip(matches, printed, strict=True)
     ]
 
 
@@ -242,13 +243,13 @@ _Wanted = tuple[str, str]
 
 
 def _wanted(tokens: list[str], source: str = "") -> list[_Wanted]:
-    found = []
+    wanted = []
     for token in tokens:
         if is_source(token):
             source = token
         else:
-            found.append(("", token[1:]) if token[1:].rstrip("*") in WHY else (source, token))
-    return found
+            wanted.append(("", token[1:]) if token[1:].rstrip("*") in WHY else (source, token))
+    return wanted
 
 
 def _columns(words: str) -> tuple[str, dict[int, list[list[_Wanted]]]]:
@@ -375,8 +376,8 @@ def main() -> None:
     cells = sum(len(f.numbers) for f in every if f.kind == "compared" and not f.unit)
     print(f"{cells} further numbers of tables: compared with a file")
     others = Counter({path.name: _unmapped(path.read_text()) for path in pages()})
-    told = ", ".join(f"{page} {count}" for page, count in others.most_common() if count)
-    print(f"cells with a number and neither unit nor comment: {told}")
+    counts = ", ".join(f"{page} {count}" for page, count in others.most_common() if count)
+    print(f"cells with a number and neither unit nor comment: {counts}")
     if options.write:
         bare = sorted({str(figure) for figure in every if figure.kind == "bare"})
         ALLOWED.write_text("".join(f"{line}\n" for line in bare))

@@ -69,19 +69,19 @@ def chosen(source: str, cells: Sequence[str] = ()) -> list[Row]:
     """Rows of a source; none where a condition on a cell of the page does not hold."""
     match = _SOURCE.fullmatch(source)
     assert match is not None
-    found = rows(ROOT / match["file"])
+    kept = rows(ROOT / match["file"])
     if match["other"]:
         of_task = {row["task"]: row for row in rows(ROOT / match["other"])}
-        found = [{**of_task[row["task"]], **row} for row in found if row["task"] in of_task]
+        kept = [{**of_task[row["task"]], **row} for row in kept if row["task"] in of_task]
     for condition in (match["chosen"] or "").split(",") if match["chosen"] else []:
         left, relation, right = re.split(r"([=~])", condition, maxsplit=1)
         wanted = [name(_filled(each, cells)) for each in right.split("|")]
         holds = _equal if relation == "=" else _part
         if left.startswith("$"):
-            found = found if holds(name(_filled(left, cells)), wanted) else []
+            kept = kept if holds(name(_filled(left, cells)), wanted) else []
         else:
-            found = [row for row in found if left in row and holds(name(row[left]), wanted)]
-    return found
+            kept = [row for row in kept if left in row and holds(name(row[left]), wanted)]
+    return kept
 
 
 def _equal(value: str, wanted: list[str]) -> bool:

@@ -47,13 +47,13 @@ def cpu() -> tuple[float, float]:
 
 def timed(job: Callable[[], object], repeats: int) -> tuple[float, float]:
     """CPU time of `job`, and its children's share [s]: those of the quickest of `repeats`."""
-    found = []
+    costs = []
     for _ in range(repeats):
         own, children = cpu()
         job()
         ends = cpu()
-        found.append((ends[0] - own + ends[1] - children, ends[1] - children))
-    return min(found)
+        costs.append((ends[0] - own + ends[1] - children, ends[1] - children))
+    return min(costs)
 
 
 def measure(task: str, *, repeats: int, whole: bool, folder: Path) -> dict[str, Any]:

@@ -61,17 +61,17 @@ def main() -> None:
     options = parser.parse_args()
     quiet_warp()
     with single_threaded():
-        found = [
+        results = [
             row
             for rows, sheets in (((10, 2),) if options.quick else SHEETS.items())
             for edge_contact in (0.0, 0.2)
             for row in folded(rows, sheets, edge_contact)
         ]
     if options.json:
-        print(json.dumps({"rows": [asdict(row) for row in found]}))
+        print(json.dumps({"rows": [asdict(row) for row in results]}))
         return
     print("| rows | edge contact | fold | pierced | of | shortest | CPU ms |\n" + "|---" * 7 + "|")
-    for row in found:
+    for row in results:
         print(
             f"| {row.rows} | {row.edge_contact} | {row.fold} | {row.pierced_least} to "
             f"{row.pierced_most} | {row.edges} | {row.shortest:.2f} "
@@ -85,7 +85,7 @@ def folded(rows: int, sheets: int, edge_contact: float) -> list[Row]:
     solver, cloth = cloth_solver(config, worlds=sheets, lanes=8)
     flat = _positions(solver, 0)
     rim = np.flatnonzero((np.abs(flat[:, :2] - [0.5, 0.0]).max(axis=1)) > 0.099)
-    found, rng = [], np.random.default_rng(0)
+    measured, rng = [], np.random.default_rng(0)
     # compiled, and the kernels' caches filled, before anything is timed
     rollout(solver, range(sheets), most=0.05)
     for fold, choices in enumerate((rim, np.arange(len(flat))), 1):
@@ -100,7 +100,7 @@ def folded(rows: int, sheets: int, edge_contact: float) -> list[Row]:
         cpu = time.process_time() - began
         ends = [_positions(solver, w) for w in range(sheets)]
         pierced = [piercing(x, cloth.faces) for x in ends]
-        found.append(
+        measured.append(
             Row(
                 rows=rows,
                 edge_contact=edge_contact,
@@ -116,7 +116,7 @@ def folded(rows: int, sheets: int, edge_contact: float) -> list[Row]:
                 cpu_ms_per_second=1e3 * cpu / sum(results[w].seconds for w in range(sheets)),
             )
         )
-    return found
+    return measured
 
 
 def _positions(solver: object, world: int) -> np.ndarray:

@@ -61,14 +61,14 @@ def main() -> None:
     options = parser.parse_args()
     quiet_warp()
     with single_threaded():
-        found = identify(quick=options.quick)
+        fits = identify(quick=options.quick)
         pulls = straighten(options.seeds, options.cost, quick=options.quick)
     if options.json:
-        both = {"identify": found, "straighten": pulls}
+        both = {"identify": fits, "straighten": pulls}
         print(json.dumps({name: [asdict(row) for row in rows] for name, rows in both.items()}))
         return
     print("| fit | " + " | ".join(identify_cable.NAMES) + " | rollouts |\n" + "|---" * 6 + "|")
-    for row in found:
+    for row in fits:
         cells = " | ".join(f"{100 * error:+.1f} %" for error in row.errors.values())
         print(f"| {row.method} | {cells} | {row.rollouts} |")
     print("\n| pull | off the line | fastest | rollouts |\n|---|---|---|---|")
@@ -86,8 +86,8 @@ def identify(*, quick: bool) -> list[Identified]:
     rows = []
     for name, fit in {"slopes": identify_cable.fit, **_WITHOUT}.items():
         pull.calls = 0
-        found = np.full(4, np.nan) if quick and name != "slopes" else fit(pull, seen)
-        errors = dict(zip(identify_cable.NAMES, found / identify_cable.TRUE - 1, strict=True))
+        fitted = np.full(4, np.nan) if quick and name != "slopes" else fit(pull, seen)
+        errors = dict(zip(identify_cable.NAMES, fitted / identify_cable.TRUE - 1, strict=True))
         rows.append(Identified(name, {n: float(e) for n, e in errors.items()}, pull.calls))
     return rows
 
@@ -137,8 +137,8 @@ def straighten(seeds: int, cost: float, *, quick: bool) -> list[Straightened]:
         return rows
     rows.append(row("Adam, slopes", s.descend(pull, s.DETOUR), budget))
     for seed in range(seeds):
-        found = _drawn(pull, int(budget), np.random.default_rng(seed))
-        rows.append(row(f"cross-entropy, seed {seed}", found, budget))
+        pulled = _drawn(pull, int(budget), np.random.default_rng(seed))
+        rows.append(row(f"cross-entropy, seed {seed}", pulled, budget))
     return rows
 
 

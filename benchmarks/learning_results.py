@@ -29,10 +29,10 @@ def main() -> None:
     parser.add_argument("--share", nargs="+", type=Path, default=[], help="runs to hand on")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/learning"))
     options = parser.parse_args()
-    found, notes = read_runs(options.runs)
+    runs, notes = read_runs(options.runs)
     for note in notes:
         print(note)
-    for run in found:
+    for run in runs:
         name = f"{run.task}-{run.agent}-{run.demos}-{run.seed}"
         if run.settings["preset"] != "fast":
             name += f"-{run.settings['preset']}"

@@ -97,8 +97,8 @@ def tensorflow_steps(python: str, agent: str, steps: int) -> list[float]:
     """CPU times of steps of the original [s], measured now."""
     command = [python, str(PEER), "--agent", agent, "--steps", str(steps)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    found: list[float] = json.loads(done.stdout.splitlines()[-1])["step_s"]
-    return found
+    seconds: list[float] = json.loads(done.stdout.splitlines()[-1])["step_s"]
+    return seconds
 
 
 def main() -> None:
@@ -119,11 +119,11 @@ def main() -> None:
         python, peer = arguments.tensorflow, []
         if python:
             peer += tensorflow_steps(python, agent, arguments.repeats)
-        found = {}
+        of_agent = {}
         for name in arguments.configurations:
             config = configurations()[name]
             repeats = arguments.repeats * (5 if config.scale > 1 else 1)
-            row = found[name] = rows[f"{agent}, {name}"] = measure(agent, config, repeats)
+            row = of_agent[name] = rows[f"{agent}, {name}"] = measure(agent, config, repeats)
             print(
                 f"{agent:12} {name:24} step {row['step_s']:6.3f} s   act {row['act_s']:6.3f} s   "
                 f"20,000 steps {row['steps_20000_h']:5.1f} h",
@@ -135,7 +135,7 @@ def main() -> None:
                 f"{agent:12} {'TensorFlow':24} step {np.median(peer):6.3f} s, "
                 f"{min(peer):.3f} to {max(peer):.3f}"
             )
-        for name, row in found.items():
+        for name, row in of_agent.items():
             row["tensorflow_step_s"] = float(np.median(peer)) if peer else TENSORFLOW_STEP
             row["tensorflow_ratio"] = row["tensorflow_step_s"] / row["step_s"]
             print(f"{agent:12} {name:24} TensorFlow / this {row['tensorflow_ratio']:5.1f}")

@@ -257,13 +257,17 @@ def _cell(value: float | None, form: str = ".2f") -> str:
 
 def machine() -> dict[str, str]:
     """What the figures depend on: processor, cores, Python and the engines' versions."""
-    found = {"cpu": _processor(), "cores": str(os.cpu_count()), "python": platform.python_version()}
+    described = {
+        "cpu": _processor(),
+        "cores": str(os.cpu_count()),
+        "python": platform.python_version(),
+    }
     for name in ("warp-deform", "warp-lang", "newton", "pybullet"):
         try:
-            found[name] = version(name)
+            described[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            described[name] = "not installed"
+    return described
 
 
 def _processor() -> str:

@@ -61,16 +61,16 @@ def views() -> np.ndarray:
         R = rotation(*tilt, 0.1)
         rgb = _spoil(photograph(rng, transform(R, np.array(place) - R @ middle)), spoilt)
         try:
-            found = find_corners(rgb, BOARD).pixels
+            corners = find_corners(rgb, BOARD).pixels
         except InputError:
-            found = np.zeros((0, 2))
+            corners = np.zeros((0, 2))
         scale = TILE[0] / rgb.shape[1]
         tile = np.asarray(cv2.resize(rgb, TILE, interpolation=cv2.INTER_AREA))
-        for column, row in np.rint(found * scale).astype(int):
+        for column, row in np.rint(corners * scale).astype(int):
             cv2.circle(tile, (int(column), int(row)), 3, GOOD, -1, cv2.LINE_AA)
         total = len(BOARD.corners_m)
         tile[0], tile[:, 0] = 255, 255
-        _label(tile, f"{name}: {len(found)} of {total}", GOOD if len(found) == total else BAD)
+        _label(tile, f"{name}: {len(corners)} of {total}", GOOD if len(corners) == total else BAD)
         tiles.append(tile)
     return np.vstack([np.hstack(tiles[:3]), np.hstack(tiles[3:])])
 

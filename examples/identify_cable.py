@@ -73,8 +73,8 @@ def record(pull: Pull) -> np.ndarray:
 if __name__ == "__main__":
     quiet_warp()
     pull = Pull()
-    found = fit(pull, record(pull))
-    for name, guess, value, true in zip(NAMES, GUESS, found, TRUE, strict=True):
+    fitted = fit(pull, record(pull))
+    for name, guess, value, true in zip(NAMES, GUESS, fitted, TRUE, strict=True):
         print(f"{name:>16}: guess {guess:.3f}, found {value:.4f}, true {true:.3f}")
     print(f"{pull.calls - 1} rollouts")
-    assert (abs(found / TRUE - 1) < 0.02).all()
+    assert (abs(fitted / TRUE - 1) < 0.02).all()

@@ -265,10 +265,10 @@ def _collect(config: SweepConfig, task: str, *, workers: int | None, ray: str | 
     """
     folder, wanted = config.data(task), config.demonstrations
     count = wanted.count or max(config.demos)
-    there = 0
+    collected = 0
     if wanted.folder is not None and any(folder.glob("*.parquet")):
-        there = len(EpisodeReader(folder))
-    if there < count:
+        collected = len(EpisodeReader(folder))
+    if collected < count:
         collect(
             CollectConfig(
                 task=task,

@@ -101,11 +101,11 @@ def goals_for(run: RunFolder, task: str, protocol: Protocol) -> Path | None:
     seed = _goal_seed(protocol)
     folder = run.path / "goals" / f"{protocol.goals}-{seed}-{protocol.robot}"
     count = min(protocol.n_goals, protocol.episodes)
-    there = sum(1 for _ in folder.glob("episode_*.parquet"))
+    present = sum(1 for _ in folder.glob("episode_*.parquet"))
     made = make_goals(
         task,
         folder,
-        count=max(count, there),
+        count=max(count, present),
         seed=seed,
         kind=protocol.goals,
         robot=protocol.robot,

@@ -122,8 +122,8 @@ _NAMES = {
     ("numpy", "ndarray"): _NDARRAY,
     ("numpy", "dtype"): _Name(_Dtype),
     # NumPy 1 and 2
-    **{("numpy.core.multiarray", name): found for name, found in _FUNCTIONS.items()},
-    **{("numpy._core.multiarray", name): found for name, found in _FUNCTIONS.items()},
+    **{("numpy.core.multiarray", name): stand_in for name, stand_in in _FUNCTIONS.items()},
+    **{("numpy._core.multiarray", name): stand_in for name, stand_in in _FUNCTIONS.items()},
 }
 
 
@@ -131,11 +131,11 @@ class _Unpickler(pickle.Unpickler):
     """Knows the names above and no other: it imports nothing."""
 
     def find_class(self, module: str, name: str) -> Any:
-        found = _NAMES.get((module, name))
-        if found is None:
+        known = _NAMES.get((module, name))
+        if known is None:
             asked = _shown(f"{module}.{name}")
             raise Refused(f"asks for {asked}; only NumPy's plain arrays and numbers are read")
-        return found
+        return known
 
     def persistent_load(self, pid: Any) -> Any:
         raise Refused("refers to objects outside of itself")
@@ -224,7 +224,7 @@ def _read(file: BinaryIO, most_bytes: int, guard: _Guard) -> tuple[Any, list[_Ar
         if file.read(1):
             raise Refused("holds more than one value")
         tree = _Tree()
-        found = tree.of(value)
+        json_tree = tree.of(value)
     except MemoryError:
         raise Refused("asks for more memory than such data needs") from None
     except RecursionError:
@@ -237,7 +237,7 @@ def _read(file: BinaryIO, most_bytes: int, guard: _Guard) -> tuple[Any, list[_Ar
         guard.on = False
     if sum(len(array.data) for array in tree.arrays) > most_bytes:
         raise Refused(f"holds more than {most_bytes} bytes")
-    return found, tree.arrays
+    return json_tree, tree.arrays
 
 
 def _main(most_bytes: int, paths: list[str]) -> None:

@@ -108,11 +108,11 @@ def import_deformable_ravens(
     count = worker_count(workers, len(recordings))
     description = {"source": str(source.resolve()), "task": name, "version": __version__}
     with new_folder(target, description=description, resume=True) as folder:
-        there = set(EpisodeReader(folder).seeds) if any(folder.glob("*.parquet")) else set()
-        missing = [(seed, steps) for seed, steps in recordings if seed not in there]
+        imported = set(EpisodeReader(folder).seeds) if any(folder.glob("*.parquet")) else set()
+        missing = [(seed, steps) for seed, steps in recordings if seed not in imported]
         chunks = [_Chunk(source.resolve(), folder, name, (one,)) for one in missing]
         with (
-            progress_bar(name, len(recordings), done=len(there)) as advance,
+            progress_bar(name, len(recordings), done=len(imported)) as advance,
             Workers(count) as crew,
         ):
             for _ in crew.run(_import_chunk, chunks):

@@ -235,8 +235,8 @@ class _Dataset:
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
-        for name, found in statistics.items():
-            row |= {f"stats/{name}/{key}": value for key, value in found.as_lists().items()}
+        for name, statistic in statistics.items():
+            row |= {f"stats/{name}/{key}": value for key, value in statistic.as_lists().items()}
         self._rows.append(row)
         self._extra.append(
             {
@@ -281,7 +281,7 @@ class _Dataset:
             "video_path": None,
             "features": features,
         }
-        statistics = {name: found.as_lists() for name, found in self._statistics.items()}
+        statistics = {name: statistic.as_lists() for name, statistic in self._statistics.items()}
         meta = self._folder / "meta"
         meta.joinpath("info.json").write_text(json.dumps(info, indent=4) + "\n")
         meta.joinpath("stats.json").write_text(json.dumps(statistics, indent=4) + "\n")

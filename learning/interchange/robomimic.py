@@ -71,7 +71,7 @@ def export_robomimic(source: Path, target: Path) -> ConversionReport:
                     )
                 group = data.create_group(f"demo_{number}")
                 _write_demonstration(group, episode)
-                layout = {key: found.shape[1:] for key, found in group["obs"].items()}
+                layout = {key: array.shape[1:] for key, array in group["obs"].items()}
                 first = first or layout
                 if layout != first:
                     raise InputError(

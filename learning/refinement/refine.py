@@ -252,8 +252,8 @@ class _Searcher:
             _check_start(self._original, run)
         if t >= self._original.info.actions:
             return None
-        there = worlds.hash(slot) == steps[t].state_hash
-        recorded = steps[t].action if there else None
+        as_recorded = worlds.hash(slot) == steps[t].state_hash
+        recorded = steps[t].action if as_recorded else None
         lookahead = lookahead_for(worlds.task, worlds.robot.name, worlds.precision, _TRIED_AT_ONCE)
         outlooks = search(
             lookahead,

@@ -264,6 +264,6 @@ def _curve(snapshots: Sequence[Mapping[str, Mapping[str, Any]]], task: str) -> t
     steps = sorted({int(step) for each in snapshots for step in each})
     points = []
     for step in steps:
-        there = [_value(each[str(step)], task) for each in snapshots if str(step) in each]
-        points.append(Point(step, *_together(there)))
+        values = [_value(each[str(step)], task) for each in snapshots if str(step) in each]
+        points.append(Point(step, *_together(values)))
     return tuple(points)

@@ -36,10 +36,10 @@ def origin(run: RunResult) -> dict[str, Any]:
     }
 
 
-def origins(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+def origins(origins_of_runs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """The rows of a table, its head first, of what `origin` says."""
     rows = [_HEAD]
-    for each in found:
+    for each in origins_of_runs:
         seconds, trained, evaluated = (
             each[key] for key in ("training_cpu_seconds", "trained_by", "evaluated_by")
         )

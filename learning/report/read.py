@@ -58,7 +58,7 @@ def _other_seeds(folder: Path, info: Mapping[str, Any]) -> list[str]:
 def _inside(path: Path) -> Iterable[Path]:
     if not path.is_dir():
         raise InputError(f"there is no folder {path}")
-    return (found.parent for found in path.rglob("run.json"))
+    return (settings.parent for settings in path.rglob("run.json"))
 
 
 def _read(run: RunFolder) -> RunResult:

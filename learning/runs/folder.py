@@ -235,7 +235,7 @@ def read_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def check_fields(found: Mapping[str, Any], fields: Fields, *, what: str) -> None:
+def check_fields(record: Mapping[str, Any], fields: Fields, *, what: str) -> None:
     """Refuse an object of a JSON file in which a field is missing or of another type.
 
     `float` takes whole numbers too; `int` takes no booleans, which are numbers in Python alone.
@@ -244,11 +244,11 @@ def check_fields(found: Mapping[str, Any], fields: Fields, *, what: str) -> None
         InputError: it begins with `what`.
     """
     for name, kinds in fields.items():
-        if name not in found:
+        if name not in record:
             raise InputError(f"{what}: {name!r} is missing")
         kinds = kinds if isinstance(kinds, tuple) else (kinds,)
         allowed = (*kinds, int) if float in kinds else kinds
-        if type(found[name]) not in allowed:
+        if type(record[name]) not in allowed:
             names = " or ".join(_KINDS[kind] for kind in kinds)
             raise InputError(f"{what}: {name!r} must be {names}")
 

@@ -189,14 +189,14 @@ def _compare(run: RunFolder, wanted: Mapping[str, Any], stored: Mapping[str, Any
             f"{run.path} is a shared policy, not trained further; choose another --out"
         )
     for name, value in wanted.items():
-        there = stored.get(name)
-        if there == value:
+        before = stored.get(name)
+        if before == value:
             continue
-        if name == "versions" and isinstance(there, dict):
+        if name == "versions" and isinstance(before, dict):
             for package in value:
-                if there.get(package) != value[package]:
+                if before.get(package) != value[package]:
                     raise InputError(
-                        f"{run.path} was begun with {package} {there.get(package)}, and "
+                        f"{run.path} was begun with {package} {before.get(package)}, and "
                         f"{value[package]} is installed: bits would differ; install the former "
                         "again or choose another --out"
                     )

@@ -124,7 +124,7 @@ def train(config: TrainConfig) -> TrainReport:
         first = trained.restore()
         stopped = validation.play([k for k in run.steps() if 0 < k <= first])
         network: nn.Module = DistributedDataParallel(agent) if world > 1 else agent
-        kept, store = set(plan.snapshot_steps()), state_steps(plan)
+        due_steps, store = set(plan.snapshot_steps()), state_steps(plan)
 
         bar = progress_bar(
             f"train {config.task}",
@@ -152,7 +152,7 @@ def train(config: TrainConfig) -> TrainReport:
                 log.add(step, {"loss": loss, **losses._asdict()}, lr=lr)
 
                 # Snapshots, and what an interrupted run goes on from
-                due, last = step in kept, step == plan.steps
+                due, last = step in due_steps, step == plan.steps
                 if due or last or step % store == 0:
                     log.check(step)
                     trained.check(step)

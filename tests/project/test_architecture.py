@@ -27,8 +27,8 @@ def floors() -> dict[str, list[str]]:
         for target in node.targets
         if isinstance(target, ast.Name)
     }
-    found: dict[str, list[str]] = ast.literal_eval(values["FLOORS"])
-    return found
+    floors_of: dict[str, list[str]] = ast.literal_eval(values["FLOORS"])
+    return floors_of
 
 
 def box(rows: list[str], width: int, *, arrow: bool) -> list[str]:

@@ -59,13 +59,13 @@ def outside_of_sections(docstring: str, names: set[str]) -> Iterator[str]:
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_entries_stand_in_sections(path: Path) -> None:
-    found = [
+    outside = [
         f"{path.name}:{node.lineno} {node.name}: {line}"
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_")
         for line in outside_of_sections(ast.get_docstring(node) or "", names_of(node))
     ]
-    assert found == []
+    assert outside == []
 
 
 def test_an_entry_outside_is_found() -> None:

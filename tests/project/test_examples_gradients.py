@@ -47,8 +47,8 @@ def test_slopes_of_the_recording_are_those_of_differences(cord: identify_cable.P
 
 def test_a_recording_tells_friction_damping_and_stiffness(cord: identify_cable.Pull) -> None:
     before = cord.calls
-    found = identify_cable.fit(cord, identify_cable.record(cord))
-    assert (abs(found / identify_cable.TRUE - 1) < [0.02, 0.05, 0.05, 0.05]).all()
+    fitted = identify_cable.fit(cord, identify_cable.record(cord))
+    assert (abs(fitted / identify_cable.TRUE - 1) < [0.02, 0.05, 0.05, 0.05]).all()
     assert cord.calls - before < 400
 
 
@@ -56,16 +56,16 @@ def test_wrong_slopes_do_not_tell(
     cord: identify_cable.Pull, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spoil(monkeypatch, table_friction=-1.0)
-    found = identify_cable.fit(cord, identify_cable.record(cord))
-    assert abs(found[0] / identify_cable.TRUE[0] - 1) > 0.1
+    fitted = identify_cable.fit(cord, identify_cable.record(cord))
+    assert abs(fitted[0] / identify_cable.TRUE[0] - 1) > 0.1
 
 
 def test_a_pull_straightens_and_needs_the_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
     pull, guess = straighten_cable.Pull(), straighten_cable.DETOUR
     before = straighten_cable.off(pull.simulate(guess))
     monkeypatch.setattr(straighten_cable, "STEPS", 30)
-    found = straighten_cable.off(pull.simulate(straighten_cable.descend(pull, guess)))
-    assert found < 0.4 * before
+    after = straighten_cable.off(pull.simulate(straighten_cable.descend(pull, guess)))
+    assert after < 0.4 * before
 
     right = DifferentiableRollout.backward
 
@@ -75,4 +75,4 @@ def test_a_pull_straightens_and_needs_the_slopes(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(DifferentiableRollout, "backward", reversed_path)
     lost = straighten_cable.off(pull.simulate(straighten_cable.descend(pull, guess)))
-    assert lost > 2 * found
+    assert lost > 2 * after

@@ -113,17 +113,17 @@ def imports(source: str, module: str, *, is_package: bool) -> list[Import]:
 
 def violations(source: str, module: str, *, is_package: bool = False) -> list[str]:
     own = module.split(".")[0]
-    found = []
+    wrong = []
     for item in imports(source, module, is_package=is_package):
         top = item.module.split(".")[0]
         excused = (
             item.lazy and own == LAZY_EXCEPTION[0] and item.module.startswith(LAZY_EXCEPTION[1])
         )
         if top in OURS - MAY_IMPORT[own] and not excused:
-            found.append(f"{module}:{item.line} imports {item.module}")
+            wrong.append(f"{module}:{item.line} imports {item.module}")
         if top in OPTIONAL and not item.lazy:
-            found.append(f"{module}:{item.line} imports optional {item.module} at the top")
-    return found
+            wrong.append(f"{module}:{item.line} imports optional {item.module} at the top")
+    return wrong
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
@@ -159,20 +159,20 @@ def test_imports_for_annotations_alone_stand_last_in_one_block(path: Path) -> No
 
 def modules(package: str) -> dict[str, set[str]]:
     """By dotted name, the modules of `package` that each of them imports, lazily or not."""
-    found = {}
+    paths = {}
     for path in FILES:
         parts = path.relative_to(ROOT).with_suffix("").parts
         if parts[0] == package:
-            found[".".join(parts).removesuffix(".__init__")] = path
+            paths[".".join(parts).removesuffix(".__init__")] = path
     arrows: dict[str, set[str]] = {}
-    for name, path in found.items():
+    for name, path in paths.items():
         every = imports(path.read_text(), name, is_package=path.name == "__init__.py")
         # `from .b import c` names the module a.b.c where there is one, else a.b
         named = {
-            item.module if item.module in found else item.module.rpartition(".")[0]
+            item.module if item.module in paths else item.module.rpartition(".")[0]
             for item in every
         }
-        arrows[name] = named & found.keys()
+        arrows[name] = named & paths.keys()
     return arrows
 
 

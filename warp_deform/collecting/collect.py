@@ -106,11 +106,11 @@ def collect(config: CollectConfig) -> CollectReport:
     with Collection(config.out, _description(config)).owned() as collection:
         with workers:
             _attempt_all(config, collection.attempts, workers)
-        kept, attempts = _kept(config, collection.attempts)
-        collection.keep(set(kept))
-    report = _report(config, kept, attempts, time.perf_counter() - began)
-    if config.video is not None and kept:
-        film(config.out, config.video, seeds=kept[:FILMED])
+        successes, attempts = _kept(config, collection.attempts)
+        collection.keep(set(successes))
+    report = _report(config, successes, attempts, time.perf_counter() - began)
+    if config.video is not None and successes:
+        film(config.out, config.video, seeds=successes[:FILMED])
     return report
 
 
@@ -152,14 +152,14 @@ def _plan(config: CollectConfig, attempts: Mapping[int, Attempt]) -> list[int]:
 
 def _kept(config: CollectConfig, attempts: Mapping[int, Attempt]) -> tuple[list[int], int]:
     """Seeds of the first successes, and how many seeds it took to get them."""
-    kept: list[int] = []
+    successes: list[int] = []
     for tried in range(most_attempts(config.episodes)):
-        if len(kept) == config.episodes:
-            return kept, tried
+        if len(successes) == config.episodes:
+            return successes, tried
         attempt = attempts[config.seed + tried]
         if attempt.success:
-            kept.append(attempt.seed)
-    return kept, most_attempts(config.episodes)
+            successes.append(attempt.seed)
+    return successes, most_attempts(config.episodes)
 
 
 def _split(seeds: Sequence[int], count: int) -> list[tuple[int, ...]]:
@@ -212,9 +212,9 @@ def _description(config: CollectConfig) -> dict[str, object]:
 
 
 def _report(
-    config: CollectConfig, kept: Sequence[int], attempts: int, seconds: float
+    config: CollectConfig, successes: Sequence[int], attempts: int, seconds: float
 ) -> CollectReport:
-    infos = EpisodeReader(config.out).infos() if kept else []
+    infos = EpisodeReader(config.out).infos() if successes else []
     if infos:
         rebuild_index(config.out)
     n = max(len(infos), 1)

@@ -159,12 +159,12 @@ class Collection:
             partial.replace(path)
             return
         try:
-            found = json.loads(path.read_bytes())
+            stored = json.loads(path.read_bytes())
         except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{path} is damaged; choose another folder") from error
-        if found != wanted:
+        if stored != wanted:
             raise InputError(
-                f"{self.folder} is a collection of another kind: {_difference(found, wanted)}; "
+                f"{self.folder} is a collection of another kind: {_difference(stored, wanted)}; "
                 "choose another folder"
             )
 
@@ -181,13 +181,13 @@ def _parse(line: bytes) -> Attempt | None:
     return attempt if whole else None
 
 
-def _difference(found: Any, wanted: Mapping[str, Any], path: str = "") -> str:
+def _difference(stored: Any, wanted: Mapping[str, Any], path: str = "") -> str:
     """The first thing in which two descriptions differ; of all, what they are of."""
-    if not isinstance(found, dict):
-        return f"{path.rstrip('.')} is {str(found)[:60]} there"
-    keys = sorted({*found, *wanted}, key=lambda key: (key != "task", key))
+    if not isinstance(stored, dict):
+        return f"{path.rstrip('.')} is {str(stored)[:60]} there"
+    keys = sorted({*stored, *wanted}, key=lambda key: (key != "task", key))
     for key in keys:
-        ours, theirs = wanted.get(key), found.get(key)
+        ours, theirs = wanted.get(key), stored.get(key)
         if ours != theirs:
             if isinstance(ours, dict):
                 return _difference(theirs, ours, f"{path}{key}.")

@@ -46,7 +46,7 @@ def verify(
         raise InputError(f"tolerance is {tolerance}; it must be a distance in metres, 0 or more")
     reader = EpisodeReader(folder)
     groups: dict[tuple[str, str, bool], list[int]] = {}
-    here = cpu_fingerprint(), versions()
+    own = cpu_fingerprint(), versions()
     same_cpu = same_versions = True
     for seed in reader.seeds:
         info = reader.info(seed)
@@ -54,8 +54,8 @@ def verify(
         groups.setdefault((info.task, info.robot, info.demonstrator == CONSTRUCTED), []).append(
             seed
         )
-        same_cpu &= info.cpu == here[0]
-        same_versions &= info.versions == here[1]
+        same_cpu &= info.cpu == own[0]
+        same_versions &= info.versions == own[1]
     count = worker_count(workers, len(reader))
     size = min(_CHUNK, math.ceil(len(reader) / count))
     chunks = [
@@ -63,16 +63,16 @@ def verify(
         for kind, seeds in groups.items()
         for i in range(0, len(seeds), size)
     ]
-    found = []
+    comparisons = []
     with Workers(count) as crew, progress_bar("replay", len(reader)) as advance:
         for compared in crew.run(_compare_chunk, chunks):
-            found.append(compared)
+            comparisons.append(compared)
             advance()
     return {
-        "episodes": len(found),
-        "steps": sum(rows for rows, _, _ in found),
-        "mismatches": sum(wrong for _, wrong, _ in found),
-        "max_error": max(error for _, _, error in found),
+        "episodes": len(comparisons),
+        "steps": sum(rows for rows, _, _ in comparisons),
+        "mismatches": sum(wrong for _, wrong, _ in comparisons),
+        "max_error": max(error for _, _, error in comparisons),
         "cpu": "same" if same_cpu else "other",
         "versions": "same" if same_versions else "other",
     }

@@ -99,33 +99,33 @@ def report() -> dict[str, Any]:
     }
 
 
-def render(found: dict[str, Any]) -> str:
+def render(report: dict[str, Any]) -> str:
     """A report as text."""
-    device = ", ".join(found["devices"]) or "none"
-    cuda = "CUDA present" if found["cuda"] else "no CUDA device; not needed"
-    cache = found["kernel_cache"]
+    device = ", ".join(report["devices"]) or "none"
+    cuda = "CUDA present" if report["cuda"] else "no CUDA device; not needed"
+    cache = report["kernel_cache"]
     lines = [
-        f"Python     {found['python']} on {found['platform']}",
-        f"CPU        {found['cpu']}, {found['cores']} cores, {found['memory_gb']:.1f} GB",
+        f"Python     {report['python']} on {report['platform']}",
+        f"CPU        {report['cpu']}, {report['cores']} cores, {report['memory_gb']:.1f} GB",
         f"devices    {device} ({cuda})",
         f"kernels    {cache['path']} ({cache['size_mb']:.1f} MB)",
-        f"compiler   {found['c_compiler']}",
-        f"ffmpeg     {found['ffmpeg'] or 'missing'}",
-        f"package    {found['location']}",
+        f"compiler   {report['c_compiler']}",
+        f"ffmpeg     {report['ffmpeg'] or 'missing'}",
+        f"package    {report['location']}",
         "",
-        *(f"  {name:<24}{version or 'missing'}" for name, version in found["versions"].items()),
+        *(f"  {name:<24}{version or 'missing'}" for name, version in report["versions"].items()),
         "",
         "optional",
         *(
             f"  {name:<14}{part['version'] or '-':<12}{part['purpose']}"
             + ("" if part["version"] else f"  ({part['install']})")
-            for name, part in found["optional"].items()
+            for name, part in report["optional"].items()
         ),
         "",
-        *(f"warning: {line}" for line in found["warnings"]),
-        *(f"problem: {entry['problem']}; {entry['advice']}" for entry in found["problems"]),
+        *(f"warning: {line}" for line in report["warnings"]),
+        *(f"problem: {entry['problem']}; {entry['advice']}" for entry in report["problems"]),
     ]
-    return "\n".join([*lines, *(["healthy"] if found["healthy"] else [])])
+    return "\n".join([*lines, *(["healthy"] if report["healthy"] else [])])
 
 
 def _version(distribution: str) -> str | None:
@@ -171,17 +171,17 @@ def _shadowed() -> Iterator[dict[str, str]]:
 
 def _hiding() -> Iterator[str]:
     """What would hide our packages from a script or `python -m` started in this folder."""
-    here = Path.cwd().resolve()
-    if here == _ROOT:
+    folder = Path.cwd().resolve()
+    if folder == _ROOT:
         return
     for name in ("learning", "hardware", "warp_deform"):
-        if (here / name / "__init__.py").is_file() or (here / f"{name}.py").is_file():
-            yield f"{here / name} would hide ours from `python -m` and notebooks started here"
+        if (folder / name / "__init__.py").is_file() or (folder / f"{name}.py").is_file():
+            yield f"{folder / name} would hide ours from `python -m` and notebooks started here"
 
 
 def _warp() -> tuple[dict[str, Any], list[dict[str, str]]]:
     """Warp's devices and kernel cache."""
-    found: dict[str, Any] = {
+    described: dict[str, Any] = {
         "devices": [],
         "cuda": False,
         "kernel_cache": {"path": None, "size_mb": 0.0},
@@ -191,14 +191,14 @@ def _warp() -> tuple[dict[str, Any], list[dict[str, str]]]:
 
         warp.init()
     except (ImportError, OSError, RuntimeError) as error:
-        return found, [
+        return described, [
             _problem(f"Warp does not start: {error}", "pip install --force-reinstall warp-lang")
         ]
-    found["devices"] = [f"{device.alias} ({device.name})" for device in warp.get_devices()]
-    found["cuda"] = warp.is_cuda_available()
+    described["devices"] = [f"{device.alias} ({device.name})" for device in warp.get_devices()]
+    described["cuda"] = warp.is_cuda_available()
     cache = Path(warp.config.kernel_cache_dir)
     size = sum(file.stat().st_size for file in cache.rglob("*") if file.is_file())
-    found["kernel_cache"] = {"path": str(cache), "size_mb": size / 1e6}
+    described["kernel_cache"] = {"path": str(cache), "size_mb": size / 1e6}
     problems = []
     if not warp.is_cpu_available():
         problems.append(
@@ -210,7 +210,7 @@ def _warp() -> tuple[dict[str, Any], list[dict[str, str]]]:
                 f"Warp cannot write kernels to {cache}", "set WARP_CACHE_PATH to a folder of yours"
             )
         )
-    return found, problems
+    return described, problems
 
 
 def _ffmpeg() -> tuple[str | None, list[dict[str, str]]]:

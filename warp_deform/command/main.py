@@ -161,10 +161,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except WarpDeformError as error:
         return _complain(error, code=1)
     except KeyboardInterrupt as error:
-        kept = VERBS[arguments[0]].kept if arguments and arguments[0] in VERBS else ""
+        left = VERBS[arguments[0]].kept if arguments and arguments[0] in VERBS else ""
         if isinstance(error, Interrupted):
-            kept = str(error)
-        return _complain("; ".join(filter(None, ["interrupted", kept])), code=130)
+            left = str(error)
+        return _complain("; ".join(filter(None, ["interrupted", left])), code=130)
     except BrokenPipeError:
         _discard_stdout()  # the reader went away (`| head`)
         return 1

@@ -259,18 +259,18 @@ def gradcheck(options: GradcheckOptions) -> Outcome:
 
     quiet_warp()
     rows, notes = check(options.task, options)
-    found = [asdict(row) for row in (summarise(rows) if options.summary else rows)]
-    head = tuple(key.replace("_", " ") for key in found[0]) if found else ()
+    table = [asdict(row) for row in (summarise(rows) if options.summary else rows)]
+    head = tuple(key.replace("_", " ") for key in table[0]) if table else ()
     cells = [
         tuple(
             "-" if v is None else ", ".join(v) or "-" if isinstance(v, tuple) else _number(v)
             for v in row.values()
         )
-        for row in found
+        for row in table
     ]
     failure = None if rows else "nothing was checked, see the notes"
     return Outcome(
-        data={"summary" if options.summary else "rows": found, "notes": notes},
+        data={"summary" if options.summary else "rows": table, "notes": notes},
         text="\n".join([*([_table([head, *cells])] if rows else []), *notes]),
         failure=failure,
     )
@@ -286,10 +286,12 @@ def doctor(options: DoctorOptions) -> Outcome:
     from .doctor import render, report
 
     quiet_warp()
-    found = report()
-    count = len(found["problems"])
-    failure = None if found["healthy"] else f"{count} problem{'s' * (count > 1)} found, see above"
-    return Outcome(data=found, text=render(found), failure=failure)
+    described = report()
+    count = len(described["problems"])
+    failure = (
+        None if described["healthy"] else f"{count} problem{'s' * (count > 1)} found, see above"
+    )
+    return Outcome(data=described, text=render(described), failure=failure)
 
 
 def _check_folder(folder: Path) -> None:

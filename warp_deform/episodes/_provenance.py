@@ -96,13 +96,13 @@ def cpu_fingerprint() -> str:
 @functools.cache
 def _versions() -> tuple[tuple[str, str], ...]:
     # The code that runs says its own version: it may be a checkout that was never installed.
-    found = [("python", platform.python_version()), ("warp-deform", __version__)]
+    versions = [("python", platform.python_version()), ("warp-deform", __version__)]
     for package in _PACKAGES:
         try:
-            found.append((package, importlib.metadata.version(package)))
+            versions.append((package, importlib.metadata.version(package)))
         except importlib.metadata.PackageNotFoundError:
-            found.append((package, "not installed"))
-    return tuple(found)
+            versions.append((package, "not installed"))
+    return tuple(versions)
 
 
 def versions() -> dict[str, str]:

@@ -181,8 +181,8 @@ def _check_images(
 def _check_array(array: np.ndarray, shape: tuple[int, ...], dtype: type, *, what: str) -> None:
     """Check dtype and shape; -1 stands for any length. No cast: it could lose bits silently."""
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
-        found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
-        raise InputError(f"{what} is {found}, expected an array of {np.dtype(dtype)}")
+        actual = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+        raise InputError(f"{what} is {actual}, expected an array of {np.dtype(dtype)}")
     fits = array.ndim == len(shape) and all(
         wanted in (-1, length) for wanted, length in zip(shape, array.shape, strict=True)
     )

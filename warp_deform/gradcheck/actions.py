@@ -51,9 +51,9 @@ def compare_actions(task: Task, count: int, *, seed: int) -> list[ActionSample]:
                 moved.append(start.action.copy())
                 moved[-1][at] += sign * STEP
         ours, *same = gradients.of([(start.before, action) for action in moved])
-        kept = worlds.state(0)
+        before = worlds.state(0)
         real = _losses(worlds, start.before, moved[1:])
-        worlds.restore(0, kept)
+        worlds.restore(0, before)
         by_place = ours.by_place[:2]
         samples.append(
             ActionSample(

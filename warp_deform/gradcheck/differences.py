@@ -208,9 +208,9 @@ def _compare_some(
             moved[name][2 * k + 1] = _moved(name, base[name], step * direction)
             moved[name][2 * k + 2] = _moved(name, base[name], -step * direction)
         ends = _roll(run, worlds, draw, substeps, moved)
-        found = loss.backward(run, count)
-        gradients = gradients or found
-        words, counts = taken(run), counted(found.fired)
+        of_moved = loss.backward(run, count)
+        gradients = gradients or of_moved
+        words, counts = taken(run), counted(of_moved.fired)
         middle = middle or (words[0], counts[0])
         for k in range(len(names)):
             pair = (2 * k + 1, 2 * k + 2)

@@ -86,7 +86,7 @@ def draw_states(
     each = min(worlds.count, MOST_EACH, each)
     for start in actions_of_episodes(worlds, seed):
         times = [_time(start.path, rng, worlds.solver.config.dt) for _ in range(each)]
-        kept = worlds.state(0)
+        before = worlds.state(0)
         for slot in range(each):
             worlds.restore(slot, start.taken)
         rollout(
@@ -100,7 +100,7 @@ def draw_states(
         met = [touching_of(worlds, slot).copy() for slot in range(each)]
         for state, time, touching in zip(states, times, met, strict=True):
             yield Draw(state, _rest_of(start.path, time, state), touching)
-        worlds.restore(0, kept)
+        worlds.restore(0, before)
 
 
 def touching_of(worlds: Worlds, slot: int) -> np.ndarray:

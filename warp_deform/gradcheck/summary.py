@@ -41,10 +41,10 @@ class Summary:
 
 def summarise(rows: Sequence[Row]) -> list[Summary]:
     """In the order of the rows."""
-    found: dict[tuple[str, str], list[Row]] = {}
+    by_level: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
-        found.setdefault((row.task, row.level), []).append(row)
-    return [_summary(part) for part in found.values()]
+        by_level.setdefault((row.task, row.level), []).append(row)
+    return [_summary(part) for part in by_level.values()]
 
 
 def _summary(rows: Sequence[Row]) -> Summary:

@@ -156,8 +156,8 @@ class PyBulletSoftWorld:
         bullet, steps = self._bullet, HZ // FRAME_RATE
         for k in range(steps):
             if target is not None and self._tip is not None:
-                here = bullet.getBasePositionAndOrientation(self._tip, **self._client)[0]
-                velocity = (target - here) * HZ / (steps - k)
+                tip = bullet.getBasePositionAndOrientation(self._tip, **self._client)[0]
+                velocity = (target - tip) * HZ / (steps - k)
                 velocity[2] += _GRAVITY / HZ  # what the step takes away
                 bullet.resetBaseVelocity(self._tip, tuple(velocity), (0, 0, 0), **self._client)
             bullet.stepSimulation(**self._client)

@@ -64,9 +64,9 @@ def move_both(
         for i, (action, follow, pair) in enumerate(moving):
             if stuck[i]:
                 continue
-            there = places.moved(action, changes[i, :4], pair[0].action)
+            moved = places.moved(action, changes[i, :4], pair[0].action)
             like = places.moved(follow.like, changes[i, 4:], pair[1].action)
-            moving[i] = there, replace(follow, like=like), pair
+            moving[i] = moved, replace(follow, like=like), pair
             tries.append(moving[i][:2])
     firsts = lookahead.try_each([(state, action) for action, _ in tries], keep=True)
     led = [(f, o) for (_, f), o in zip(tries, firsts, strict=True) if o.after and o.goes_on]

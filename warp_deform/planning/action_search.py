@@ -185,17 +185,17 @@ class _Around:
 
     def _closer(self, tried: Sequence[Outlook], budget: int) -> list[Outlook]:
         """Draws of the cross-entropy method."""
-        found, rounds = list(tried), self._config.rounds
+        outlooks, rounds = list(tried), self._config.rounds
         for k in range(rounds):
-            if self._done(found):
+            if self._done(outlooks):
                 break
             count = budget // (rounds - k)
             budget -= count
-            elites = sorted(found, key=lambda o: o.rank, reverse=True)[: self._config.elites]
+            elites = sorted(outlooks, key=lambda o: o.rank, reverse=True)[: self._config.elites]
             around = [elites[i % len(elites)].action for i in range(count)]
             drawn = [self.places.drawn(action, self._rng, 0.5**k) for action in around]
-            found += self._try(self._fresh(drawn, count), "drawn")
-        return found[len(tried) :]
+            outlooks += self._try(self._fresh(drawn, count), "drawn")
+        return outlooks[len(tried) :]
 
     def _downhill(self, tried: Sequence[Outlook], budget: int) -> list[Outlook]:
         """Move the best of `tried` downhill, and try where they get; spends up to `budget`."""

@@ -103,8 +103,8 @@ def planner(config: SearchConfig) -> Act[Any]:
         chosen: dict[int, Action | None] = {}
         for slot, run in runs.items():
             state = worlds.state(slot)
-            found = search(_lookahead(worlds), worlds.task, state, run.rng, config)
-            chosen[slot] = found[0].action if found else None
+            outlooks = search(_lookahead(worlds), worlds.task, state, run.rng, config)
+            chosen[slot] = outlooks[0].action if outlooks else None
         return chosen
 
     return act

@@ -172,9 +172,10 @@ class ActionGradients:
         for slot, state in between.items():
             worlds.restore(slot, state)  # which looks at where the first ended
         follows = {slot: jobs[slot][2] for slot in leg.slots}
-        there = {slot: worlds.episodes[slot].snapshot for slot in leg.slots}
+        snapshots = {slot: worlds.episodes[slot].snapshot for slot in leg.slots}
         seconds = {
-            slot: (between[slot], follow.action(there[slot])) for slot, follow in follows.items()
+            slot: (between[slot], follow.action(snapshots[slot]))
+            for slot, follow in follows.items()
         }
         second = self._leg(seconds)
         if second is None:
@@ -192,7 +193,7 @@ class ActionGradients:
             particles[at], bodies[at] = after.positions[k], after.body_poses[k]
             pick = _chained(second, slot, after, range(2))
             follows[slot].add(
-                pick, _by_turn(second, slot, after), there[slot], particles[at], bodies[at]
+                pick, _by_turn(second, slot, after), snapshots[slot], particles[at], bodies[at]
             )
         again = self._leg(firsts)  # the tape holds one rollout, and that was the second
         assert again is not None and again.slots == leg.slots

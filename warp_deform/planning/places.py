@@ -68,9 +68,9 @@ class Places:
 
     def moved(self, action: Action, change: np.ndarray, like: Action) -> Action:
         """`action` with its place (4,) changed."""
-        there = action.copy()
-        there[PLACE] += change
-        return self.limited(there, like)
+        moved = action.copy()
+        moved[PLACE] += change
+        return self.limited(moved, like)
 
     def _lifts(self, lift: float) -> tuple[float, float]:
         """Least and greatest lift of the stage that `lift` belongs to [m]."""

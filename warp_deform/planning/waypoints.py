@@ -156,7 +156,7 @@ class WayPoints:
         values = np.array([bends[slot].start for slot in slots]).reshape(len(slots), -1)
         descent = Descent(values.shape, np.full(values.shape[1], config.rate))
         rngs = [np.random.default_rng(0) for _ in slots]  # of each its own: neighbours do not count
-        found = values.copy()
+        best_values = values.copy()
         used, growth = dict.fromkeys(slots, 0), dict.fromkeys(slots, 0.0)
         for _ in range(config.steps if slots else 0):
             paths = {slot: bends[slot].path(values[k]) for k, slot in enumerate(slots)}
@@ -172,13 +172,13 @@ class WayPoints:
                 by_value[k] = bends[slot].chained(values[k], gradient.by_points, gradient.by_times)
             change = descent.step(by_value)
             for k, slot in enumerate(slots):
-                near = found[k] + rngs[k].normal(0.0, config.rate, values.shape[1])
+                near = best_values[k] + rngs[k].normal(0.0, config.rate, values.shape[1])
                 values[k] = bends[slot].limited(near if k in drawn else values[k] + change[k])
             tries = {slot: bends[slot].path(values[k]) for k, slot in enumerate(slots)}
             for slot, ran in self.run({slot: led[slot] for slot in slots}, tries).items():
                 if ran.loss < best[slot][0].loss:
                     best[slot] = ran, tries[slot]
-                    found[slots.index(slot)] = values[slots.index(slot)]
+                    best_values[slots.index(slot)] = values[slots.index(slot)]
         return [
             Bent(best[s][1], before[s], best[s][0], used[s], growth[s])
             if s in best

@@ -197,11 +197,11 @@ class Mesh:
         _, names = np.unique(self.vertices, axis=0, return_inverse=True)
         corners = names.reshape(-1)[self.faces]
         edges = np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)])
-        there = np.unique(edges, axis=0, return_counts=True)
+        forth = np.unique(edges, axis=0, return_counts=True)
         back = np.unique(edges[:, ::-1], axis=0, return_counts=True)
         a, b, c = np.moveaxis(np.asarray(self.vertices, float)[self.faces], 1, 0)
         volume = np.einsum("ij,ij", a, np.cross(b, c))
-        return all(map(np.array_equal, there, back)) and bool(volume > 0)
+        return all(map(np.array_equal, forth, back)) and bool(volume > 0)
 
 
 def box_mesh(size: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:

@@ -112,12 +112,12 @@ def spread_peaks(
 ):
     """One thread a tile: the nearest thing around each of its cells, where it may have changed."""
     i, j = wp.tid()
-    found = bool(False)
+    may_differ = bool(False)
     for m in range(wp.max(i - 1, 0), wp.min(i + 2, tiles.shape[0])):
         for n in range(wp.max(j - 1, 0), wp.min(j + 2, tiles.shape[1])):
             if tiles[m, n] != 0:
-                found = True
-    if not found:
+                may_differ = True
+    if not may_differ:
         return
     for m in range(i * TILE / CELL, (i + 1) * TILE / CELL):
         for n in range(j * TILE / CELL, (j + 1) * TILE / CELL):

@@ -73,12 +73,12 @@ def looks_changed(
     last_column = looks[patch, slot + 3]
     if last_row < row:
         return False
-    found = bool(False)
+    may_differ = bool(False)
     for i in range(row * CELL / TILE, last_row * CELL / TILE + 1):
         for j in range(column * CELL / TILE, last_column * CELL / TILE + 1):
             if changed[i, j] != 0:
-                found = True
-    if not found:
+                may_differ = True
+    if not may_differ:
         return False
     limit = wp.cast(looks[patch, slot + 4], float)
     last_limit = wp.cast(looks[patch, slot + 5], float)

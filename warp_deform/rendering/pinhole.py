@@ -131,17 +131,17 @@ def narrowed(slope: float, root: float, span: wp.vec2):
 @wp.func
 def touches(window: wp.vec4i, side: int, tiles: wp.array2d(dtype=int)):
     """Whether a window has a sample in a marked tile."""
-    found = bool(False)
+    touched = bool(False)
     if window[0] <= window[1] and window[2] <= window[3]:
         i = window[0] / side
         # `while`, as a `for` of unknown bounds is slow
-        while i <= window[1] / side and not found:
+        while i <= window[1] / side and not touched:
             j = window[2] / side
-            while j <= window[3] / side and not found:
-                found = tiles[i, j] != 0
+            while j <= window[3] / side and not touched:
+                touched = tiles[i, j] != 0
                 j += 1
             i += 1
-    return found
+    return touched
 
 
 @wp.func

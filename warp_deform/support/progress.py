@@ -79,13 +79,13 @@ class PlainLines(Advance):
 
         The rate is that since the beginning of this run: what was done before it took no time.
         """
-        seconds, here = self._clock() - self._began, self._done - self._before
+        seconds, done = self._clock() - self._began, self._done - self._before
         parts = [f"{self._what}: {self._done} of {self._total} {self._unit}"]
         if self.note:
             parts.append(self.note)
         parts.append(f"{duration(seconds)} so far")
-        if here > 0 and seconds > 0:
-            rate = here / seconds
+        if done > 0 and seconds > 0:
+            rate = done / seconds
             parts.append(f"{rate:.3g} a second" if rate >= 1 else f"{60 * rate:.3g} a minute")
             left = (self._total - self._done) / rate
             parts.append(f"{duration(left)} left" if left > 0 else "done")

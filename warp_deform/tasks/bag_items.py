@@ -352,9 +352,9 @@ class BagItems2(BagItems1):
         if inserted == 0:
             return self.clear_opening(layout, snapshot, first[:2], _ROOM)
         hull = self.hull_mask(layout, snapshot)
-        there = range(inserted) if item is None else [n for n in range(2) if n != item]
+        wanted = range(inserted) if item is None else [n for n in range(2) if n != item]
         free = hull.copy()
-        for n in there:
+        for n in wanted:
             free[self.item_mask(layout, snapshot, n)] = 0
         less = self.erode(free, first[:2], _ROOM_SECOND)
         return less if less.any() else self.erode(hull, first[:2], _ROOM_SECOND)

@@ -224,10 +224,10 @@ class BagTask(Task):
     def pull_bead(self, layout: Layout, snapshot: Snapshot, bead: int, overshoot: float) -> Action:
         """Pull one bead to its target and `overshoot` [m] beyond."""
         positions, targets, target_of = self._mapped(layout, snapshot)
-        here, target = positions[bead, :2], targets[target_of[bead], :2]
-        way = target - here
+        start, target = positions[bead, :2], targets[target_of[bead], :2]
+        way = target - start
         beyond = target + way * (overshoot / max(float(np.hypot(*way)), 1e-9))
-        return pick_place(here, beyond, stage=OPEN)
+        return pick_place(start, beyond, stage=OPEN)
 
     def map_distance(self, layout: Layout, snapshot: Snapshot) -> float:
         """Mean distance of the beads from their targets, over the opening's radius."""

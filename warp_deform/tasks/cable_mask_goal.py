@@ -132,8 +132,8 @@ class CableMaskGoal(Task):
     def pick_yaw(self, color: np.ndarray, xy: np.ndarray) -> float:
         """The chain's tangent [rad] in the mask near `xy`; 0 where there is no chain."""
         row, column = self.grid.to_pixel(xy)
-        found = find_grasp(color[..., 0] > 127, (int(row), int(column)))
-        return 0.0 if found is None else map_direction(found.tangent, np.eye(2))
+        grasp = find_grasp(color[..., 0] > 127, (int(row), int(column)))
+        return 0.0 if grasp is None else map_direction(grasp.tangent, np.eye(2))
 
     def score(self, layout: Layout, snapshot: Snapshot) -> float:
         """Intersection over union of the chain's true mask and the goal's."""

@@ -95,8 +95,8 @@ def check_task(task: object) -> type[Task]:
     for attribute, needed in _ATTRIBUTES.items():
         value = getattr(task, attribute, None)
         if not needed.fits(value):
-            found = repr(value)[:60] if hasattr(task, attribute) else "missing"
-            raise InputError(f"{where}: {attribute} is {found}; it must be {needed.words}")
+            shown = repr(value)[:60] if hasattr(task, attribute) else "missing"
+            raise InputError(f"{where}: {attribute} is {shown}; it must be {needed.words}")
     rows = row_count(task.ground_truth_rows)
     if rows and task.ground_truth_size != 3 * rows:
         raise InputError(

@@ -25,11 +25,11 @@ _GROUP = "warp_deform.tasks"
 
 def offered() -> dict[str, tuple[EntryPoint, ...]]:
     """Entry points of installed distributions by the name of the task; more than one is a clash."""
-    found: dict[str, tuple[EntryPoint, ...]] = {}
+    points: dict[str, tuple[EntryPoint, ...]] = {}
     for point in entry_points(group=_GROUP):
         name, _ = _parts(point)
-        found[name] = (*found.get(name, ()), point)
-    return dict(sorted(found.items()))
+        points[name] = (*points.get(name, ()), point)
+    return dict(sorted(points.items()))
 
 
 def offered_version(name: str) -> int:
@@ -59,11 +59,11 @@ def load_offered(name: str) -> type[Task] | None:
     (point,) = points
     where = f"the task {name!r} of the distribution {_distribution(point)} ({point.value})"
     try:
-        found = point.load()
+        loaded = point.load()
     except (Exception, SystemExit) as error:  # whatever code from elsewhere may raise
         raise InputError(f"{where} cannot be imported: {_said(error)}") from error
     try:
-        task = check_task(found)
+        task = check_task(loaded)
     except InputError as error:
         raise InputError(f"{where} cannot be used: {error}") from error
     if task.name != name:
@@ -92,10 +92,10 @@ def import_tasks(module: str) -> None:
     if (added := str(folder.resolve())) not in sys.path:
         sys.path.append(added)
     try:
-        found = importlib.import_module(name)
+        imported = importlib.import_module(name)
     except (Exception, SystemExit) as error:  # whatever the user's code may raise
         raise InputError(f"{module} cannot be imported: {_said(error)}") from error
-    file = getattr(found, "__file__", None)
+    file = getattr(imported, "__file__", None)
     if path.suffix == ".py" and (file is None or not path.samefile(file)):
         raise InputError(f"{module} is hidden by another module {name!r}, {file}; rename it")
 

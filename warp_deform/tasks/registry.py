@@ -98,17 +98,17 @@ def all_tasks() -> tuple[dict[str, type[Task]], list[str]]:
 
     Imports what installed distributions offer. One that cannot be used is a line of the list.
     """
-    found, wrong = dict(_REGISTERED), []
+    further, wrong = dict(_REGISTERED), []
     for name, points in offered().items():
         if name in _OURS:
             whose = ", ".join(point.dist.name if point.dist else "unknown" for point in points)
             wrong.append(f"the distribution {whose} offers a task {name!r}, as the package does")
             continue
         try:
-            found[name] = type(task(name))
+            further[name] = type(task(name))
         except WarpDeformError as error:
             wrong.append(str(error))
-    return _OURS | dict(sorted(found.items())), wrong
+    return _OURS | dict(sorted(further.items())), wrong
 
 
 def task(name: str, *, recorded: str | None = None) -> Task:

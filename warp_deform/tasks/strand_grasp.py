@@ -108,12 +108,12 @@ def find_grasp(
         return None
     at = int(nearest[0]), int(nearest[1])
     typical = _typical_width(mask, pixels, config.radius_px)
-    found = _measure(mask, at, config.radius_px, typical, config.max_width_ratio, config)
-    if found.crossing:
+    grasp = _measure(mask, at, config.radius_px, typical, config.max_width_ratio, config)
+    if grasp.crossing:
         limit = config.small_max_width_ratio
         closer = _measure(mask, at, config.small_radius_px, typical, limit, config)
-        found = found if closer.crossing else closer
-    return found
+        grasp = grasp if closer.crossing else closer
+    return grasp
 
 
 def map_direction(tangent: float, jacobian: np.ndarray) -> float:

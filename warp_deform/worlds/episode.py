@@ -197,11 +197,11 @@ def aloft(path: GripPath, frames: Frames | None) -> Aloft | None:
 def _join_frames(frames: Sequence[Frames | None], seconds: Sequence[float]) -> Frames | None:
     """Frames of consecutive rollouts as one recording."""
     begins = np.concatenate([[0.0], np.cumsum(seconds)])
-    there = [(f, b) for f, b in zip(frames, begins, strict=False) if f is not None]
-    if not there:
+    recorded = [(f, b) for f, b in zip(frames, begins, strict=False) if f is not None]
+    if not recorded:
         return None
     return Frames(
-        np.concatenate([f.times + b for f, b in there]),
-        np.concatenate([f.particle_q for f, _ in there]),
-        np.concatenate([f.body_q for f, _ in there]),
+        np.concatenate([f.times + b for f, b in recorded]),
+        np.concatenate([f.particle_q for f, _ in recorded]),
+        np.concatenate([f.body_q for f, _ in recorded]),
     )

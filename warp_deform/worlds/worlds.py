@@ -410,8 +410,8 @@ class Worlds:
     def enclosed(self, slot: int) -> bool | None:
         """Whether a slot's items are in a bag, never on an untrusted state; None without either."""
         episode = self.episodes[slot]
-        kept = self.task.enclosed(episode.layout, episode.snapshot)
-        return None if kept is None else kept and episode.physics_ok
+        enclosed = self.task.enclosed(episode.layout, episode.snapshot)
+        return None if enclosed is None else enclosed and episode.physics_ok
 
     def hash(self, slot: int) -> str:
         """Hash of a slot's positions and velocities."""

@@ -90,8 +90,8 @@ def test_a_mirror_image_moves_pictures_actions_and_states_alike(
     assert np.argwhere(seen).mean(axis=0) == pytest.approx([row, column], abs=1.0)
     # A body that turns with the place: its mirror image turns the other way.
     heading = np.array([math.cos(ACTION[5]), math.sin(ACTION[5])])
-    here = np.stack([ACTION[3:5], ACTION[3:5] + 0.1 * heading])
-    ahead = move_points(here[None], [moved])[0]
+    places = np.stack([ACTION[3:5], ACTION[3:5] + 0.1 * heading])
+    ahead = move_points(places[None], [moved])[0]
     action = move_actions(ACTION[None], [moved])[0]
     assert action[3:5] == pytest.approx(ahead[0]) and action[5] == -ACTION[5]
     state = np.zeros(6, np.float32)

@@ -15,8 +15,8 @@ GOALS = [goal for goal in range(10) for _ in range(10)]
 
 @pytest.mark.parametrize("solved", range(11))
 def test_one_episode_a_cluster_is_wilsons_interval(solved: int) -> None:
-    found = clustered_rate([i < solved for i in range(10)], range(10))
-    assert found == pytest.approx(wilson(solved, 10), abs=1e-9)
+    interval = clustered_rate([i < solved for i in range(10)], range(10))
+    assert interval == pytest.approx(wilson(solved, 10), abs=1e-9)
 
 
 def test_one_value_a_cluster_is_students_interval() -> None:

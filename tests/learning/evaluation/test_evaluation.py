@@ -113,11 +113,11 @@ def test_the_best_snapshot_counts_what_the_task_counts() -> None:
         episodes = tuple(played(scores, successes))
         return Evaluation(step, episodes, summarise(episodes, task=TASK))
 
-    found = [made(1, [0.9, 0.9], 0), made(2, [1.0, 0.1], 1), made(3, [0.9, 0.9], 0)]
-    assert best(found, task=TASK).step == 3, "of equals the latest"
-    assert best(found, task="cable-ring").step == 2
-    hasty = replace(found[0], summary={**found[0].summary, "mean_actions": 1.0})
-    assert best([hasty, *found[1:]], task=TASK).step == 1, "of equals that with fewer actions"
+    evaluations = [made(1, [0.9, 0.9], 0), made(2, [1.0, 0.1], 1), made(3, [0.9, 0.9], 0)]
+    assert best(evaluations, task=TASK).step == 3, "of equals the latest"
+    assert best(evaluations, task="cable-ring").step == 2
+    hasty = replace(evaluations[0], summary={**evaluations[0].summary, "mean_actions": 1.0})
+    assert best([hasty, *evaluations[1:]], task=TASK).step == 1, "of equals that with fewer actions"
 
 
 def test_splits_do_not_overlap_with_training_or_each_other() -> None:
@@ -263,9 +263,9 @@ def test_the_untrained_network_is_played_and_never_chosen(tmp_path: Path) -> Non
 def test_a_folder_of_goals(run: RunFolder, tmp_path: Path) -> None:
     make_goals("block-notarget", tmp_path / "goals", count=2, kind="constructed", seed=100_007)
     protocol = Protocol(split="test", episodes=3, goal_folder=tmp_path / "goals")
-    found = evaluate_snapshot(run, 1, protocol)
+    given = evaluate_snapshot(run, 1, protocol)
     own = evaluate_snapshot(run, 1, replace(protocol, goal_folder=None))
-    distances = [each.goal_l2 for each in found.episodes]
+    distances = [each.goal_l2 for each in given.episodes]
     assert all(each and len(each) == 3 for each in distances), "a start and two actions"
     assert distances[0] != own.episodes[0].goal_l2
     copy = tmp_path / "copy"
@@ -392,10 +392,10 @@ def test_failures_without_a_bag() -> None:
 
 
 def test_failures_are_counted(run: RunFolder) -> None:
-    found = evaluate_snapshot(run, 1, Protocol(split="validation", episodes=3))
-    failed = [each for each in found.episodes if not each.success]
+    result = evaluate_snapshot(run, 1, Protocol(split="validation", episodes=3))
+    failed = [each for each in result.episodes if not each.success]
     assert all(each.failure in FAILURES for each in failed)
-    assert sum(found.summary["failures"].values()) == len(failed) > 0
-    assert found.summary["goal_l2"] == pytest.approx(
-        np.mean([each.goal_l2[-1] for each in found.episodes if each.goal_l2])
+    assert sum(result.summary["failures"].values()) == len(failed) > 0
+    assert result.summary["goal_l2"] == pytest.approx(
+        np.mean([each.goal_l2[-1] for each in result.episodes if each.goal_l2])
     )

@@ -135,8 +135,8 @@ def test_a_run_that_is_half_trained_is_refused(
     run: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settle(run, schedule=plan(run, 8))
-    found = said(capsys, "eval", str(run.path), *SHORT)
-    assert "2 of 8 steps" in found and "`warp-deform train` to its end" in found
+    error = said(capsys, "eval", str(run.path), *SHORT)
+    assert "2 of 8 steps" in error and "`warp-deform train` to its end" in error
     with pytest.raises(InputError, match="to its end"):
         share_run(run.path, run.path.parent / "shared")
     settle(run, rounded="bfloat16")  # of a run that was handed on, one snapshot is left
@@ -149,20 +149,20 @@ def test_a_run_that_stopped_early_is_finished(run: RunFolder) -> None:
     settle(run, schedule=plan(run, 8), patience=1, validate=2)
     assert not stopped_early(run), "nothing was validated"
     validation = Protocol(split="validation", episodes=2)
-    kept = {step: evaluation._Kept(run, step, validation) for step in (1, 2)}
+    records = {step: evaluation._Kept(run, step, validation) for step in (1, 2)}
     for step, score in ((1, 0.5), (2, 0.5)):
         for seed in validation.seeds:
-            kept[step].add(Played(seed, score == 1.0, score, 1, ""))
+            records[step].add(Played(seed, score == 1.0, score, 1, ""))
     assert stopped_early(run) and trained_steps(run) == 2
     settle(run, patience=2)
     assert not stopped_early(run)
     settle(run, patience=1)
     first, second = validation.seeds
-    kept[2].add(Played(first, True, 1.0, 1, ""))
+    records[2].add(Played(first, True, 1.0, 1, ""))
     assert not stopped_early(run), "it was getting better"
-    kept[2].add(Played(second, True, 1.0, 1, ""))
+    records[2].add(Played(second, True, 1.0, 1, ""))
     assert stopped_early(run), "it cannot get better"
-    kept[2].add(Played(second, False, 0.5, 1, ""))
+    records[2].add(Played(second, False, 0.5, 1, ""))
     with pytest.raises(InputError, match="to its end"):
         evaluate_run(run.path, episodes=1, progress=False)
 
@@ -175,8 +175,8 @@ def test_stopping_is_judged_by_the_versions_that_trained(
     with monkeypatch.context() as patch:
         patch.setattr(evaluation, "versions", lambda: older)
         for step in (1, 2):
-            kept = evaluation._Kept(run, step, Protocol(split="validation", episodes=1))
-            kept.add(Played(50_000, False, 0.0, 1, ""))
+            record = evaluation._Kept(run, step, Protocol(split="validation", episodes=1))
+            record.add(Played(50_000, False, 0.0, 1, ""))
     assert stopped_early(run)
 
 
@@ -192,13 +192,13 @@ def test_the_steps_are_reported(run: RunFolder) -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "told"), [(50_000, "validation seeds"), (10_000, "test seeds"), (100_000, "goal")]
+    ("seed", "expected"), [(50_000, "validation seeds"), (10_000, "test seeds"), (100_000, "goal")]
 )
 def test_what_was_trained_on_is_not_played(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], seed: int, told: str
+    run: RunFolder, capsys: pytest.CaptureFixture[str], seed: int, expected: str
 ) -> None:
     settle(run, demonstrations={"0": "a", str(seed): "b"})
-    assert told in said(capsys, "eval", str(run.path), *SHORT)
+    assert expected in said(capsys, "eval", str(run.path), *SHORT)
     assert not run.evaluations.exists() and not (run.path / "goals").exists()
 
 
@@ -228,8 +228,8 @@ def test_goals_that_were_trained_on_are_refused(
 def test_too_many_processes_are_taken_for_a_mistake(
     run: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = said(capsys, "eval", str(run.path), "--workers", "100000")
-    assert "workers is 100000" in found
+    error = said(capsys, "eval", str(run.path), "--workers", "100000")
+    assert "workers is 100000" in error
 
 
 def test_the_papers_rule_chooses_the_lift_where_there_are_several(

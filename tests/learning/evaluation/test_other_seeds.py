@@ -32,12 +32,12 @@ def test_other_seeds_are_kept_apart(run: RunFolder, capsys: pytest.CaptureFixtur
     usual = evaluate_run(run.path, episodes=2, **ONE)
     command = ["eval", str(run.path), *SHORT, "--first-seed", "20000", "--json"]
     assert main(command) == 0
-    found = json.loads(capsys.readouterr().out.splitlines()[-1])
-    played = found.pop("played")
-    assert {key: found[key] for key in usual if key != "other_seeds"} == {
+    answer = json.loads(capsys.readouterr().out.splitlines()[-1])
+    played = answer.pop("played")
+    assert {key: answer[key] for key in usual if key != "other_seeds"} == {
         key: usual[key] for key in usual if key != "other_seeds"
     }
-    assert found == read_json(run.report) and found["other_seeds"] == {"20000": played}
+    assert answer == read_json(run.report) and answer["other_seeds"] == {"20000": played}
     assert played["first_seed"] == 20_000 and played["test"]["n_episodes"] == 1
     files = [read_json(path) for path in run.evaluations.iterdir()]
     seeds = {each["seed"] for file in files for each in file["episodes"]}
@@ -89,12 +89,12 @@ def test_an_evaluation_tells_of_every_episode(
 
 
 def test_the_usual_first_seed_is_the_usual_evaluation(run: RunFolder) -> None:
-    found = evaluate_run(run.path, episodes=1, first_seed=10_000, **ONE)
-    assert found["test"]["n_episodes"] == 1 and found["other_seeds"] == {}
+    report = evaluate_run(run.path, episodes=1, first_seed=10_000, **ONE)
+    assert report["test"]["n_episodes"] == 1 and report["other_seeds"] == {}
 
 
 @pytest.mark.parametrize(
-    ("first", "told"),
+    ("first", "expected"),
     [
         (0, "seed 0 is one of training and of the test seeds 0 to 199"),
         (49_990, "seed 50000 is one of validation and of test"),
@@ -103,9 +103,9 @@ def test_the_usual_first_seed_is_the_usual_evaluation(run: RunFolder) -> None:
     ],
 )
 def test_seeds_that_overlap_are_refused(
-    run: RunFolder, capsys: pytest.CaptureFixture[str], first: int, told: str
+    run: RunFolder, capsys: pytest.CaptureFixture[str], first: int, expected: str
 ) -> None:
-    assert told in said(capsys, "eval", str(run.path), "--first-seed", str(first))
+    assert expected in said(capsys, "eval", str(run.path), "--first-seed", str(first))
     assert not run.evaluations.exists() and not run.report.exists()
 
 
@@ -166,15 +166,15 @@ def test_the_papers_protocol_asks_for_motions_that_succeed(
 
 
 def test_a_run_says_who_made_it_and_a_report_shows_it(run: RunFolder) -> None:
-    (here,) = read_json(run.settings)["revisions"]
-    assert here.keys() == {"version", "commit", "dirty"} and here["version"] == __version__
-    found = evaluate_run(run.path, episodes=1, **ONE)
-    assert found["revision"] == here
+    (revision,) = read_json(run.settings)["revisions"]
+    assert revision.keys() == {"version", "commit", "dirty"} and revision["version"] == __version__
+    evaluated = evaluate_run(run.path, episodes=1, **ONE)
+    assert evaluated["revision"] == revision
     older = {"version": "0.0.9", "commit": "a" * 40, "dirty": True}
-    settle(run, revisions=[older, here])
+    settle(run, revisions=[older, revision])
     report = write_report([run.path], None)
     (origin,) = report.data["origins"]
-    assert origin["trained_by"] == [older, here] and origin["evaluated_by"] == here
+    assert origin["trained_by"] == [older, revision] and origin["evaluated_by"] == revision
     assert "0.0.9 at aaaaaaaaaaaa, edited; " in report.text
     settings = {k: v for k, v in read_json(run.settings).items() if k != "revisions"}
     run.settings.write_text(json.dumps(settings))

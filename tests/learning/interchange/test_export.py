@@ -152,10 +152,10 @@ def test_lerobot_statistics_are_those_of_the_data(dataset: Path, episodes: list[
         ("action", actions, 0, (7,)),
     ):
         for name in ("min", "max", "mean", "std"):
-            found = np.array(statistics[key][name])
-            assert found.shape == shape
+            statistic = np.array(statistics[key][name])
+            assert statistic.shape == shape
             expected = getattr(values, name)(axis=axes).reshape(shape)
-            np.testing.assert_allclose(found, expected, atol=1e-6)
+            np.testing.assert_allclose(statistic, expected, atol=1e-6)
         assert statistics[key]["count"] == [len(steps)]
     row = pq.read_table(dataset / "meta/episodes/chunk-000/file-000.parquet").to_pylist()[2]
     own = np.stack([step.action for step in episodes[2].steps[:-1] if step.action is not None])
@@ -169,11 +169,14 @@ def test_running_statistics_do_not_depend_on_the_batches(cuts: tuple[int, ...]) 
     running = RunningStatistics((2,))
     for part in np.split(rows, cuts):
         running.add(part, frames=len(part))
-    found = running.as_lists()
-    np.testing.assert_allclose(found["mean"], rows.mean(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(found["std"], rows.std(axis=0), rtol=1e-9)
-    assert (found["min"], found["max"]) == (rows.min(axis=0).tolist(), rows.max(axis=0).tolist())
-    assert found["count"] == [10]
+    statistics = running.as_lists()
+    np.testing.assert_allclose(statistics["mean"], rows.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(statistics["std"], rows.std(axis=0), rtol=1e-9)
+    assert (statistics["min"], statistics["max"]) == (
+        rows.min(axis=0).tolist(),
+        rows.max(axis=0).tolist(),
+    )
+    assert statistics["count"] == [10]
 
 
 def test_lerobot_begins_new_files(
@@ -354,8 +357,10 @@ def test_a_destination_has_one_writer_and_no_foreign_files(tmp_path: Path) -> No
         pass
 
 
-@pytest.mark.parametrize(("resume", "same", "kept"), [(True, True, True), (True, False, False)])
-def test_what_an_interrupted_run_left(tmp_path: Path, resume: bool, same: bool, kept: bool) -> None:
+@pytest.mark.parametrize(("resume", "same", "reused"), [(True, True, True), (True, False, False)])
+def test_what_an_interrupted_run_left(
+    tmp_path: Path, resume: bool, same: bool, reused: bool
+) -> None:
     with (
         pytest.raises(KeyboardInterrupt),
         new_folder(tmp_path / "out", description={"a": 1}, resume=resume) as folder,
@@ -366,5 +371,5 @@ def test_what_an_interrupted_run_left(tmp_path: Path, resume: bool, same: bool, 
     assert not (tmp_path / "out").exists()
     description = {"a": 1 if same else 2}
     with new_folder(tmp_path / "out", description=description, resume=resume) as folder:
-        assert (folder / "inner" / "file").exists() == kept
+        assert (folder / "inner" / "file").exists() == reused
     assert os.listdir(tmp_path) == ["out"]

@@ -55,8 +55,10 @@ def maps(original: Path) -> dict[str, np.ndarray]:
 
 
 def test_the_maps_are_the_originals_own(original: Path, maps: dict[str, np.ndarray]) -> None:
-    found = read_recording(original / "insertion-goal", number=0, steps=1, task="block-notarget")
-    for step, color, height in zip(found.steps, maps["color"], maps["height"], strict=True):
+    recording = read_recording(
+        original / "insertion-goal", number=0, steps=1, task="block-notarget"
+    )
+    for step, color, height in zip(recording.steps, maps["color"], maps["height"], strict=True):
         np.testing.assert_array_equal(step.color, color)
         np.testing.assert_array_equal(step.height, height)
 
@@ -118,12 +120,10 @@ def test_recordings_of_either_numpy(tmp_path: Path, multiarray: str) -> None:
     assert episode.goal is None
     for step, action in zip(episode.steps, recording(2)["action"], strict=False):
         assert step.action is not None
-        for pose, found in zip(
-            ("pose0", "pose1"), (step.action[:3], step.action[3:6]), strict=True
-        ):
+        for pose, read in zip(("pose0", "pose1"), (step.action[:3], step.action[3:6]), strict=True):
             position, quat_xyzw = action["params"][pose]
             expected = [*position[:2], 2 * np.arctan2(quat_xyzw[2], quat_xyzw[3])]
-            np.testing.assert_allclose(found, expected, atol=1e-12)
+            np.testing.assert_allclose(read, expected, atol=1e-12)
     assert (np.array([step.height.max() for step in episode.steps]) > 0.1).all()
 
 
@@ -303,12 +303,12 @@ def test_an_import_goes_on_where_it_stopped(tmp_path: Path) -> None:
     damaged.write_bytes(whole[:-100])
     with pytest.raises(InputError, match=r"000002-1\.pkl is damaged"):
         import_deformable_ravens(source, out)
-    kept = {path.name: path.stat() for path in (tmp_path / ".out.partial").glob("*.parquet")}
-    assert len(kept) == 2 and not out.exists()
+    partial = {path.name: path.stat() for path in (tmp_path / ".out.partial").glob("*.parquet")}
+    assert len(partial) == 2 and not out.exists()
     damaged.write_bytes(whole)
     assert import_deformable_ravens(source, out).episodes == 3
     assert EpisodeReader(out).seeds == (0, 1, 2)
-    for name_, status in kept.items():
+    for name_, status in partial.items():
         assert (out / name_).stat().st_ino == status.st_ino
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cable-ring", "out"]
     # the same bytes as without the interruption

@@ -43,18 +43,20 @@ def written(folder: Path, data: bytes) -> Path:
     return path
 
 
-def same(found: object, expected: object) -> bool:
+def same(actual: object, expected: object) -> bool:
     """Equal, where lists stand for tuples and Python's numbers for NumPy's."""
     if isinstance(expected, np.ndarray):
-        assert isinstance(found, np.ndarray)
-        return found.dtype == expected.dtype and np.array_equal(found, expected)
+        assert isinstance(actual, np.ndarray)
+        return actual.dtype == expected.dtype and np.array_equal(actual, expected)
     if isinstance(expected, dict):
-        assert isinstance(found, dict)
-        return found.keys() == expected.keys() and all(same(found[k], expected[k]) for k in found)
+        assert isinstance(actual, dict)
+        return actual.keys() == expected.keys() and all(
+            same(actual[k], expected[k]) for k in actual
+        )
     if isinstance(expected, list | tuple):
-        assert isinstance(found, list)
-        return all(same(a, b) for a, b in zip(found, expected, strict=True))
-    return bool(found == expected)
+        assert isinstance(actual, list)
+        return all(same(a, b) for a, b in zip(actual, expected, strict=True))
+    return bool(actual == expected)
 
 
 @pytest.mark.parametrize("multiarray", [NUMPY_1, NUMPY_2])
@@ -67,9 +69,9 @@ def test_data_is_read(tmp_path: Path, multiarray: str) -> None:
 
 def test_an_array_that_occurs_often_is_sent_once(tmp_path: Path) -> None:
     value = opcodes(np.arange(10**6)) + b"q\x00" + b"h\x00" * 999
-    (found,) = read_pickles([written(tmp_path, b"\x80\x03(" + value + b"l.")])
-    assert len(found) == 1000
-    assert all(item is found[0] for item in found)
+    (items,) = read_pickles([written(tmp_path, b"\x80\x03(" + value + b"l.")])
+    assert len(items) == 1000
+    assert all(item is items[0] for item in items)
 
 
 def call(module: str, function: str, *arguments: object) -> bytes:

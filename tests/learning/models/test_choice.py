@@ -47,9 +47,9 @@ class Places:
 def test_a_pick_that_is_sure_of_its_place_wins() -> None:
     seen = heat(r3c4=0.5, r20c10=0.4)
     places = Places({(20, 10): peak(2, 7, 5, rotations=3)})
-    found = choose(seen, places, picks=2)
-    assert found.pick.tolist() == [20, 10]
-    assert (found.rotation, found.place.tolist()) == (2, [7, 5])
+    choice = choose(seen, places, picks=2)
+    assert choice.pick.tolist() == [20, 10]
+    assert (choice.rotation, choice.place.tolist()) == (2, [7, 5])
     assert choose(seen, places, picks=1).pick.tolist() == [3, 4]
 
 
@@ -92,8 +92,8 @@ def test_nothing_better_is_passed_over(seed: int) -> None:
         near = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(1, 2))
         worth[row, column] = float(left[row, column].exp()) * near.sum(axis=(-2, -1)).max()
         left[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = -math.inf
-    found = choose(seen, lambda pick: maps[tuple(pick.tolist())], picks=4)
+    choice = choose(seen, lambda pick: maps[tuple(pick.tolist())], picks=4)
     best = max(worth, key=worth.__getitem__)
-    assert tuple(found.pick.tolist()) == best
+    assert tuple(choice.pick.tolist()) == best
     rotation, place = divmod(int(maps[best].argmax()), ROWS * COLUMNS)
-    assert (found.rotation, found.place.tolist()) == (rotation, list(divmod(place, COLUMNS)))
+    assert (choice.rotation, choice.place.tolist()) == (rotation, list(divmod(place, COLUMNS)))

@@ -41,10 +41,10 @@ def inside(shift: tuple[int, int], margin: int) -> tuple[slice, slice]:
     )
 
 
-def gap(found: Tensor, expected: Tensor) -> float:
+def gap(actual: Tensor, expected: Tensor) -> float:
     """Greatest difference, relative to how much the expected values vary."""
     assert expected.numel() > 200
-    return float((found - expected).abs().max() / expected.std())
+    return float((actual - expected).abs().max() / expected.std())
 
 
 @pytest.mark.parametrize("pictures", [1, 2])

@@ -48,8 +48,8 @@ def test_turned_maps_give_turned_maps(reads: Field, gives: Field, size: int, qua
     torch.nn.init.uniform_(convolution.bias, generator=generator(1))
     x = torch.randn(2, 8, 10, 7, generator=generator(2))
     expected = turned_field(convolution(x), quarters, gives)
-    found = convolution(turned_field(x, quarters, reads))
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+    actual = convolution(turned_field(x, quarters, reads))
+    torch.testing.assert_close(actual, expected, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("pictures", "subpixels"), [(1, 1), (2, 2), (None, 1)])
@@ -132,8 +132,8 @@ def test_networks_turn_with_every_pixel_of_the_picture(subpixels: int) -> None:
     with torch.no_grad():
         still = network(channels(fine), mark)
         for quarters in (1, 2, 3):
-            found = network(channels(turn(fine, quarters)), turn(mark, quarters))
-            torch.testing.assert_close(found, turn(still, quarters), atol=2e-5, rtol=1e-4)
+            actual = network(channels(turn(fine, quarters)), turn(mark, quarters))
+            torch.testing.assert_close(actual, turn(still, quarters), atol=2e-5, rtol=1e-4)
     assert not torch.allclose(still, turn(still, 2), atol=1e-3)
 
 

@@ -22,10 +22,10 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def assert_sums_close(found: Tensor, expected: Tensor) -> None:
+def assert_sums_close(actual: Tensor, expected: Tensor) -> None:
     """Sums of many products that nearly cancel are as exact as their greatest."""
     bound = 1e-6 * float(expected.abs().max())
-    torch.testing.assert_close(found, expected, atol=bound, rtol=1e-4)
+    torch.testing.assert_close(actual, expected, atol=bound, rtol=1e-4)
 
 
 @pytest.mark.parametrize("equivariant", [False, True])
@@ -86,8 +86,8 @@ def test_a_mark_tells_key_and_goal_how_far_the_pick_is(pad_features: bool) -> No
             for channel, reach in enumerate((2, 8, 32)):
                 for row, column in ((9, 21), (12, 25), (0, 0)):
                     far = math.hypot(row - 9, column - 21)
-                    found = float(mark[0, channel, row + frame, column + frame])
-                    assert found == pytest.approx(math.exp(-far / reach), rel=1e-5)
+                    value = float(mark[0, channel, row + frame, column + frame])
+                    assert value == pytest.approx(math.exp(-far / reach), rel=1e-5)
             network.mark.weight.zero_()
         assert torch.equal(marked(image, pick), plain(image, pick))
 
@@ -138,15 +138,15 @@ def test_features_may_be_framed_in_place_of_the_picture(pick: list[int], n_rotat
                 functional.pad(network(x) * by, framed) for network in (module.key, module.query)
             )
             crops = rotated_crops(query, where + 8, size=16, n_rotations=n_rotations)
-            found = module(seen, where, n_rotations=n_rotations)
-            assert_sums_close(found, correlate_direct(key, crops))
+            scores = module(seen, where, n_rotations=n_rotations)
+            assert_sums_close(scores, correlate_direct(key, crops))
         single.crop_before_query = True  # crops reach beyond the picture still
         edge = normalise(functional.pad(image[:, :4], framed))
         crops = rotated_crops(edge, where + 8, size=16, n_rotations=n_rotations)
         kernels = single.query(crops[0])[None]
         key = functional.pad(single.key(x), framed)
-        found = single(image[:, :4], where, n_rotations=n_rotations)
-        assert_sums_close(found, correlate_direct(key, kernels))
+        scores = single(image[:, :4], where, n_rotations=n_rotations)
+        assert_sums_close(scores, correlate_direct(key, kernels))
 
 
 def test_focus_adds_a_mean_close_to_the_pick() -> None:

@@ -62,15 +62,15 @@ Avoided = list[list[tuple[np.ndarray, float]]]
 @pytest.fixture
 def avoided(monkeypatch: pytest.MonkeyPatch) -> Avoided:
     """What every later proposal was told not to pick."""
-    told: Avoided = []
+    proposals: Avoided = []
     act = ImagePolicy.act
 
     def spied(*args: Any, avoid: list[tuple[np.ndarray, float]]) -> np.ndarray:
-        told.append(list(avoid))
+        proposals.append(list(avoid))
         return act(*args, avoid=avoid)
 
     monkeypatch.setattr(ImagePolicy, "act", spied)
-    return told
+    return proposals
 
 
 def chosen(
@@ -115,11 +115,11 @@ def test_a_pull_along_the_chain_counts_and_noise_does_not(
     edges = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3))) > 0
     noisy = mask ^ (edges & (np.random.default_rng(0).random(mask.shape) < 0.3))
     pulled = TASK.mask(np.add(lying, (0.0, 0.01, 0.0)))
-    view, told = np.zeros((*mask.shape, 3), np.uint8), []
+    view, reaches = np.zeros((*mask.shape, 3), np.uint8), []
     for each in (mask, noisy, pulled):
         chooser.choose(Observation(0, view, each, GOAL, PickPlaceOutcome.PLACED))
-        told.append([reach for _, reach in avoided[-1]])
-    assert told == [[], [MISSED], [PUT_DOWN]]
+        reaches.append([reach for _, reach in avoided[-1]])
+    assert reaches == [[], [MISSED], [PUT_DOWN]]
 
 
 def test_a_pick_without_finger_room_is_passed_over_unless_there_is_no_other(

@@ -244,10 +244,12 @@ def test_the_rules_of_what_is_better(
 def test_no_refined_episode_loses_an_item_that_the_bag_had_kept() -> None:
     info = replace(make_episode().info, success=True, score=0.6, actions=4)
     fewer = _played(0.9, 2)
-    for kept, enclosed, expected in (
+    for enclosed_before, enclosed, expected in (
         (True, False, False), (True, True, True), (False, False, True), (None, None, True),
     ):  # fmt: skip
-        before = replace(info, extra={} if kept is None else {"enclosed": kept})
+        before = replace(
+            info, extra={} if enclosed_before is None else {"enclosed": enclosed_before}
+        )
         for accept in ("score", "solved"):
             assert refinement._better(fewer, before, accept, enclosed=enclosed) is expected
 

@@ -76,7 +76,7 @@ def write_run(
     } | (trained or {})
     (path / "run.json").write_text(json.dumps(settings))
     snapshots = {"0": [0.0] * 4, "2000": [0.5] * 4, "4000": [1.0, 1.0, 0.5, 0.5]}
-    found = {
+    report = {
         "task": task,
         "agent": agent,
         "preset": "fast",
@@ -92,7 +92,7 @@ def write_run(
         "test": result(task, list(scores)),
         "paper": None,
     }
-    (path / "eval_info.json").write_text(json.dumps(found | info))
+    (path / "eval_info.json").write_text(json.dumps(report | info))
     return path
 
 
@@ -158,15 +158,15 @@ def test_what_differs_stays_apart(tmp_path: Path) -> None:
     write_run(tmp_path / "c", schedule={**SCHEDULE, "steps": 100}, trained_steps=100)
     write_run(tmp_path / "d", retry=False, goals="given, 0123")
     write_run(tmp_path / "e", robot="panda", demos=30)
-    found = cells(tmp_path)
-    assert {(cell.variant, cell.demos) for cell in found} == {
+    pooled = cells(tmp_path)
+    assert {(cell.variant, cell.demos) for cell in pooled} == {
         ("fast", 10),
         ("fast, privileged lift", 10),
         ("fast, 100 steps", 10),
         ("fast, no retries, goals given, 0123", 10),
         ("fast, panda", 30),
     }
-    tables = compared(found, read_paper())
+    tables = compared(pooled, read_paper())
     assert tables["fast, panda"][0][3:] == ["1", "10", "30", "100", "1000"]
     rows = {row[1]: row[3:] for row in tables["fast"]}
     assert rows["goal-stack"] == ["- (91.0)", "75.0 (99.7)", "- (100.0)", "- (100.0)"]
@@ -230,7 +230,7 @@ def test_steps_are_told_where_they_are_not_the_presets(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("trained", "info", "told"),
+    ("trained", "info", "difference"),
     [
         ({"device": "cuda"}, {}, "device"),
         ({"augment": False}, {}, "augment"),
@@ -240,12 +240,12 @@ def test_steps_are_told_where_they_are_not_the_presets(tmp_path: Path) -> None:
     ],
 )
 def test_runs_of_a_cell_are_alike(
-    tmp_path: Path, trained: dict[str, Any], info: dict[str, Any], told: str
+    tmp_path: Path, trained: dict[str, Any], info: dict[str, Any], difference: str
 ) -> None:
     paper = {"paper": {**PLAYED_TOO, "stage_rule": "action"}}
     write_run(tmp_path / "a", **(paper if "paper" in info else {}))
     write_run(tmp_path / "b", seed=1, trained=trained, **info)
-    with pytest.raises(InputError, match=f"differ in {told}"):
+    with pytest.raises(InputError, match=f"differ in {difference}"):
         cells(tmp_path)
 
 
@@ -256,16 +256,16 @@ def test_other_versions_are_noted(tmp_path: Path) -> None:
     write_run(tmp_path / "c", demos=100, trained={"versions": newer})
     (note,) = version_notes(read_runs([tmp_path])[0])
     assert "torch, 2.13.0, 9.9.9" in note and "10 demonstrations" in note
-    found = write_report([tmp_path], None)
-    assert found.data["notes"] == [note] and note in found.text
+    report = write_report([tmp_path], None)
+    assert report.data["notes"] == [note] and note in report.text
 
 
 def test_a_privileged_lift_is_labelled(tmp_path: Path) -> None:
     snapshots = {"4000": result(LINE, [1.0, 0.0])}
     write_run(tmp_path / "a", paper={"snapshots": snapshots, "stage_rule": "privileged"})
-    found = write_report([tmp_path / "a"], tmp_path / "out")
-    assert found.data["cells"][0]["paper_protocol_stage_rule"] == "privileged"
-    assert "50.0 (privileged lift)" in found.text
+    report = write_report([tmp_path / "a"], tmp_path / "out")
+    assert report.data["cells"][0]["paper_protocol_stage_rule"] == "privileged"
+    assert "50.0 (privileged lift)" in report.text
     (row,) = csv.DictReader((tmp_path / "out" / "report.csv").read_text().splitlines())
     assert row["paper_protocol_stage_rule"] == "privileged"
 
@@ -308,9 +308,9 @@ def test_the_command_writes_tables_and_curves(
     write_run(tmp_path / "runs/ring", task=RING, agent="gt-mlp")
     out = tmp_path / "out"
     assert main(["report", str(tmp_path / "runs"), "--out", str(out), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["runs"] == 5 and len(found["cells"]) == 3
-    assert sorted(Path(name).name for name in found["files"]) == sorted(
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["runs"] == 5 and len(answer["cells"]) == 3
+    assert sorted(Path(name).name for name in answer["files"]) == sorted(
         path.name for path in out.iterdir()
     )
     text = (out / "report.md").read_text()

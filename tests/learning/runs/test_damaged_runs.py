@@ -108,12 +108,12 @@ def test_damaged_results_are_one_line(
 def test_a_damaged_report_is_not_taken_for_none(run: RunFolder) -> None:
     evaluate_run(run.path, episodes=1, validation_episodes=1, workers=1, progress=False)
     whole = read_json(run.report)
-    for changes, told in (
+    for changes, expected in (
         ({"selected": None}, "selected"),
         ({"selected": 7}, "step 7, of which there is no snapshot"),
     ):
         write_json(run.report, {**whole, **changes})
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=expected):
             load_policy(run.path)
 
 

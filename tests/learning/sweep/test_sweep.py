@@ -55,14 +55,14 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_a_grid_is_run_once(grid: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sweep", str(grid), "--workers", "1", "--json"]) == 0
     said = capsys.readouterr()
-    found = json.loads(said.out)
-    assert (found["runs"], found["skipped"], found["failed"]) == (4, 0, [])
+    answer = json.loads(said.out)
+    assert (answer["runs"], answer["skipped"], answer["failed"]) == (4, 0, [])
     assert said.err.count("of 1 solved") == 4
     out = grid.parent / "out"
     names = sorted(path.name for path in (out / "runs").iterdir())
     assert names == [f"{TASK}-gt-mlp-{n}-s{seed}" for n in (1, 2) for seed in (0, 1)]
     assert RunFolder(out / "runs" / names[0]).steps() == [0, 2]
-    report = Path(found["report"]).read_text()
+    report = Path(answer["report"]).read_text()
     assert "| 0 1 | 0/2 |" in report and "demonstrations_block-notarget.png" in report
     before = files(out)
 
@@ -89,8 +89,8 @@ def test_an_interrupted_sweep_goes_on(grid: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(sweep, "evaluate_run", interrupted)
     assert main(["sweep", str(grid), "--workers", "1"]) == 130
     weights = files(grid.parent / "out")
-    found = run_sweep(read_sweep(grid), workers=1)
-    assert found["skipped"] == 1 and not found["failed"]
+    report = run_sweep(read_sweep(grid), workers=1)
+    assert report["skipped"] == 1 and not report["failed"]
     assert played[1] == played[2] and len(set(played)) == 4
     after = files(grid.parent / "out")
     assert weights == {name: after[name] for name in weights}
@@ -109,10 +109,10 @@ def test_a_run_that_fails_stops_no_other(
     monkeypatch.setattr(sweep, "train", diverging)
     assert main(["sweep", str(grid), "--workers", "1", "--json"]) == 1
     said = capsys.readouterr()
-    found = json.loads(said.out)
-    assert [each["error"] for each in found["failed"]] == ["the loss is nan"] * 2
+    answer = json.loads(said.out)
+    assert [each["error"] for each in answer["failed"]] == ["the loss is nan"] * 2
     assert "2 of 4 runs failed" in said.err.splitlines()[-1]
-    assert "| 0 | 0/1 |" in Path(found["report"]).read_text()
+    assert "| 0 | 0/1 |" in Path(answer["report"]).read_text()
 
 
 def test_a_run_that_breaks_stops_no_other(grid: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,8 +125,8 @@ def test_a_run_that_breaks_stops_no_other(grid: Path, monkeypatch: pytest.Monkey
         return train(config)
 
     monkeypatch.setattr(sweep, "train", broken)
-    found = run_sweep(read_sweep(grid), workers=1)
-    said = [each["error"] for each in found["failed"]]
+    report = run_sweep(read_sweep(grid), workers=1)
+    said = [each["error"] for each in report["failed"]]
     assert said == ["RuntimeError: out of memory: tried to allocate 2 GiB"] * 2
 
 
@@ -150,8 +150,8 @@ def test_what_files_are_there_does_not_tell_that_a_collection_is_done(
     writer = EpisodeWriter(config.data(TASK), overwrite=True)
     for seed in 1, 2:
         writer.write(block_episode(seed, task=TASK))
-    found = run_sweep(config, workers=1)
-    assert asked == [2] and not found["failed"]
+    report = run_sweep(config, workers=1)
+    assert asked == [2] and not report["failed"]
     settings = RunFolder(config.cells()[0].out).read_settings()
     assert set(settings["demonstrations"]) == {"0", "1"}
 
@@ -181,8 +181,8 @@ def test_demonstrations_are_collected_where_they_are_missing(
     text = GRID.format(root=tmp_path, more="").replace("demos = [1, 2]", "demos = [1]")
     more = '[demonstrations]\ncount = 3\ndemonstrator = "mpc"\n'
     path.write_text(text.replace("seeds = [0, 1]", "").replace("[demonstrations]\n", more))
-    found = run_sweep(read_sweep(path), workers=1)
-    assert asked == [(TASK, 3, "mpc")] and not found["failed"]
+    report = run_sweep(read_sweep(path), workers=1)
+    assert asked == [(TASK, 3, "mpc")] and not report["failed"]
 
 
 def test_two_sweeps_do_not_share_a_folder(grid: Path) -> None:

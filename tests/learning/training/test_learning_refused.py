@@ -125,8 +125,8 @@ def test_seeds_of_validation_are_not_trained_on(
     run = str(tmp_path / "run")
     command = ["train", TASK, "--agent", "gt-mlp", "--data", str(tmp_path / "demos"),
                "--preset", "fast", "--steps", "20", "--out", run]  # fmt: skip
-    found = said(capsys, *command)
-    assert "seed 50003 is one of training and of the validation seeds 50000 to 50019" in found
+    error = said(capsys, *command)
+    assert "seed 50003 is one of training and of the validation seeds 50000 to 50019" in error
     assert not Path(run).exists()
 
 

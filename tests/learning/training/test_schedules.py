@@ -37,15 +37,15 @@ def test_presets_are_the_papers_and_ours() -> None:
 def test_bags_by_color_train_for_longer(
     task: str, demos: int, preset: str, sees_state: bool, steps: int
 ) -> None:
-    found = preset_schedule(preset, task=task, demos=demos, sees_state=sees_state)
-    assert found.steps == steps
+    schedule = preset_schedule(preset, task=task, demos=demos, sees_state=sees_state)
+    assert schedule.steps == steps
     agent = "gt-mlp" if sees_state else "goal-split" if "goal" in task else "transporter"
     config = TrainConfig(
         task=task, agent=agent, data=Path("none"), out=Path("none"), demos=demos, preset=preset
     )
-    assert config.plan(demos) == found
+    assert config.plan(demos) == schedule
     if sees_state:
-        assert found == STATE_SCHEDULES[preset]
+        assert schedule == STATE_SCHEDULES[preset]
 
 
 def test_changes_to_the_preset_come_on_top(tmp_path: Path) -> None:
@@ -62,18 +62,20 @@ def test_changes_to_the_preset_come_on_top(tmp_path: Path) -> None:
 @given(st.integers(1, 400).flatmap(lambda n: st.tuples(st.just(n), st.integers(n, 5000))))
 def test_snapshots_are_as_many_as_asked_for_and_evenly_spread(numbers: tuple[int, int]) -> None:
     n, steps = numbers
-    found = Schedule(steps=steps, batch=1, lr=1.0, snapshots=n).snapshot_steps()
-    assert len(set(found)) == n and found[-1] == steps and found[0] >= 1
-    assert all(abs(step - k * steps / n) <= 0.5 for k, step in enumerate(found, start=1))
+    snapshots = Schedule(steps=steps, batch=1, lr=1.0, snapshots=n).snapshot_steps()
+    assert len(set(snapshots)) == n and snapshots[-1] == steps and snapshots[0] >= 1
+    assert all(abs(step - k * steps / n) <= 0.5 for k, step in enumerate(snapshots, start=1))
 
 
 @settings(derandomize=True, deadline=None, max_examples=200)
 @given(st.integers(1, 12), st.integers(1, 5000))
 def test_doubling_snapshots_come_after_twice_the_steps(n: int, steps: int) -> None:
-    found = Schedule(steps=steps, batch=1, lr=1.0, snapshots=n, doubling=True).snapshot_steps()
-    assert found[-1] == steps and found[0] >= 1 and list(found) == sorted(set(found))
-    assert len(found) <= n and (len(found) == n or steps < 2**n)
-    assert all(abs(2 * a - b) <= 1 for a, b in pairwise(found))
+    snapshots = Schedule(steps=steps, batch=1, lr=1.0, snapshots=n, doubling=True).snapshot_steps()
+    assert (
+        snapshots[-1] == steps and snapshots[0] >= 1 and list(snapshots) == sorted(set(snapshots))
+    )
+    assert len(snapshots) <= n and (len(snapshots) == n or steps < 2**n)
+    assert all(abs(2 * a - b) <= 1 for a, b in pairwise(snapshots))
 
 
 def test_validation_is_the_presets_unless_nothing_can_be_played(tmp_path: Path) -> None:

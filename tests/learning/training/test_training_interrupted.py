@@ -55,9 +55,9 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> list[int
 
 
 def lines(run: Path) -> list[dict[str, float]]:
-    found = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    records = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     return [
-        {name: value for name, value in line.items() if "seconds" not in name} for line in found
+        {name: value for name, value in line.items() if "seconds" not in name} for line in records
     ]
 
 
@@ -259,7 +259,7 @@ def test_a_state_of_another_run_is_refused(folder: Path, tmp_path: Path) -> None
         train(config(folder, tmp_path / name, seed=k)) and RunFolder(tmp_path / name)
         for k, name in enumerate(("one", "other"))
     )
-    kept = one.state.read_bytes()
+    state = one.state.read_bytes()
     one.state.write_bytes(other.state.read_bytes())
     with pytest.raises(InputError, match=r"state\.safetensors is another run's"):
         train(config(folder, one.path))
@@ -268,7 +268,7 @@ def test_a_state_of_another_run_is_refused(folder: Path, tmp_path: Path) -> None
         one.write_state(spoilt, step, key=key)
         with pytest.raises(InputError, match="is another run's"):
             train(config(folder, one.path))
-    one.state.write_bytes(kept)
+    one.state.write_bytes(state)
     one.settings.unlink()
     with pytest.raises(InputError, match=r"holds parts of a run and no run\.json"):
         train(config(folder, one.path))
@@ -277,7 +277,7 @@ def test_a_state_of_another_run_is_refused(folder: Path, tmp_path: Path) -> None
 def test_another_release_of_a_package_is_named(folder: Path, tmp_path: Path) -> None:
     train(config(folder, tmp_path))
     run = RunFolder(tmp_path)
-    found = read_json(run.settings)
-    write_json(run.settings, {**found, "versions": {**found["versions"], "torch": "1.0"}})
+    settings = read_json(run.settings)
+    write_json(run.settings, {**settings, "versions": {**settings["versions"], "torch": "1.0"}})
     with pytest.raises(InputError, match=r"begun with torch 1\.0, and 2\..* is installed"):
         train(config(folder, tmp_path))

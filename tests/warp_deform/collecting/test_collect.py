@@ -92,9 +92,9 @@ def test_slots_and_order_do_not_change_an_episode(collected: tuple[Path, Collect
     seeds = reversed(reader.seeds)
     act = demonstrator("scripted")
     runs = play(worlds, seeds, act=act, look=lambda worlds, slot: worlds.hash(slot))
-    found = {run.seed: run for _, run in runs}
-    assert sorted(found) == list(reader.seeds)
-    for seed, run in found.items():
+    by_seed = {run.seed: run for _, run in runs}
+    assert sorted(by_seed) == list(reader.seeds)
+    for seed, run in by_seed.items():
         assert run.ended == SOLVED
         assert run.rows == [step.state_hash for step in reader.read(seed).steps]
 

@@ -58,8 +58,8 @@ def contains(sheet: np.ndarray, picture: np.ndarray) -> bool:
     """Whether the picture stands in the sheet, pixel by pixel."""
     match = cv2.matchTemplate(sheet, picture, cv2.TM_SQDIFF)
     row, column = np.unravel_index(np.argmin(match), match.shape)
-    found = sheet[row : row + picture.shape[0], column : column + picture.shape[1]]
-    return bool((found == picture).all())
+    part = sheet[row : row + picture.shape[0], column : column + picture.shape[1]]
+    return bool((part == picture).all())
 
 
 def test_contact_sheet_of_small_flat_and_unusual_episodes(tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("name", cli.VERBS)
 def test_every_verb_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    left, told = [name], 0
+    left, explained = [name], 0
     while left:
         words = left.pop()
         assert main([*words.split(), "--help"]) == 0
@@ -118,9 +118,9 @@ def test_every_verb_explains_itself(name: str, capsys: pytest.CaptureFixture[str
         if inner:
             left += [f"{words} {part}" for part in inner[1].split(",")]
         else:
-            told += 1
+            explained += 1
             assert "--json" in said and "--no-json" not in said, words
-    assert told == (14 if name == "franka" else 1)
+    assert explained == (14 if name == "franka" else 1)
 
 
 @pytest.mark.parametrize(
@@ -244,10 +244,10 @@ def test_inspect_writes_statistics_and_sheets(
     for seed in (4, 2, 7):
         writer.write(make_episode(seed))
     assert main(["inspect", str(tmp_path), "--sheets", "2", "--json"]) == 0
-    found = json.loads(capfd.readouterr().out)
-    assert found["episodes"] == 3
-    assert [Path(path).stem[-1] for path in found["sheets"]] == ["2", "4"]
-    assert all(Path(path).stat().st_size > 0 for path in found["sheets"])
+    answer = json.loads(capfd.readouterr().out)
+    assert answer["episodes"] == 3
+    assert [Path(path).stem[-1] for path in answer["sheets"]] == ["2", "4"]
+    assert all(Path(path).stat().st_size > 0 for path in answer["sheets"])
     assert main(["inspect", str(tmp_path), "--sheets", "0"]) == 0
     assert "0 of 3 episodes" in capfd.readouterr().out
     (tmp_path / "file").write_text("")
@@ -265,16 +265,16 @@ def test_inspect_of_an_empty_folder_is_bad_input(
 def test_doctor_keeps_its_contract(capfd: pytest.CaptureFixture[str]) -> None:
     code = main(["doctor", "--json"])
     said = capfd.readouterr()
-    found = json.loads(said.out)
-    assert found["healthy"] is (found["problems"] == [])
-    assert code == (0 if found["healthy"] else 1), found["problems"]
-    assert set(found["versions"]) == {"warp-deform", *doctor.DEPENDENCIES}
-    assert any(device.startswith("cpu") for device in found["devices"])
-    assert found["cuda"] is any(device.startswith("cuda") for device in found["devices"])
-    assert found["cores"] >= 1
-    assert found["memory_gb"] > 0.5
-    assert Path(found["kernel_cache"]["path"]).is_dir()
-    assert found["ffmpeg"]
+    answer = json.loads(said.out)
+    assert answer["healthy"] is (answer["problems"] == [])
+    assert code == (0 if answer["healthy"] else 1), answer["problems"]
+    assert set(answer["versions"]) == {"warp-deform", *doctor.DEPENDENCIES}
+    assert any(device.startswith("cpu") for device in answer["devices"])
+    assert answer["cuda"] is any(device.startswith("cuda") for device in answer["devices"])
+    assert answer["cores"] >= 1
+    assert answer["memory_gb"] > 0.5
+    assert Path(answer["kernel_cache"]["path"]).is_dir()
+    assert answer["ffmpeg"]
     assert "Warp 1" not in said.err
 
 
@@ -292,10 +292,10 @@ def test_doctor_finds_a_package_that_hides_ours(
     (tmp_path / "hardware" / "__init__.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "hardware", raising=False)
-    found = doctor.report()
-    assert not found["healthy"]
-    assert [entry for entry in found["problems"] if "hides" in entry["problem"]]
-    assert str(tmp_path) in doctor.render(found)
+    report = doctor.report()
+    assert not report["healthy"]
+    assert [entry for entry in report["problems"] if "hides" in entry["problem"]]
+    assert str(tmp_path) in doctor.render(report)
 
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)

@@ -63,10 +63,10 @@ def alternatives(hint: Any) -> tuple[Any, ...]:
 
 def kinds(hint: Any) -> set[type]:
     """The scalar types in an annotation."""
-    found: set[type] = set()
+    scalars: set[type] = set()
     for kind in alternatives(hint):
-        found |= set(typing.get_args(kind)) if typing.get_origin(kind) is tuple else {kind}
-    return found
+        scalars |= set(typing.get_args(kind)) if typing.get_origin(kind) is tuple else {kind}
+    return scalars
 
 
 def printed(name: str, hint: Any) -> str:

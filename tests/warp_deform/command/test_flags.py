@@ -20,17 +20,17 @@ def options() -> Iterator[tuple[str, type]]:
         called = getattr(importlib.import_module(module), function)
         hints = typing.get_type_hints(called, include_extras=True)
         wanted = next(hint for name, hint in hints.items() if name != "return")
-        found: list[type] = []
+        classes: list[type] = []
         queue = [wanted]
         while queue:
             hint = queue.pop()
             if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-                found.append(hint)
+                classes.append(hint)
                 queue += typing.get_type_hints(hint, include_extras=True).values()
             else:
                 queue += typing.get_args(hint)
-        assert found and all(dataclasses.is_dataclass(each) for each in found)
-        yield from ((name, each) for each in found)
+        assert classes and all(dataclasses.is_dataclass(each) for each in classes)
+        yield from ((name, each) for each in classes)
 
 
 OPTIONS = list(options())

@@ -144,11 +144,11 @@ def test_resets_without_a_seed_follow_from_the_last_one(block: PickPlaceEnv) -> 
 
 def test_callers_may_change_what_they_get(block: PickPlaceEnv) -> None:
     seen, info = block.reset(seed=2)
-    kept = {name: array.copy() for name, array in seen.items()}
+    copies = {name: array.copy() for name, array in seen.items()}
     for array in (*seen.values(), info["segmentation"], info["ground_truth"]):
         array[:] = 0
     again, _ = block.reset(seed=2)
-    assert all(np.array_equal(kept[name], again[name]) for name in kept)
+    assert all(np.array_equal(copies[name], again[name]) for name in copies)
     assert block.demonstrate() is not None
 
 

@@ -151,12 +151,12 @@ def test_privileged_rule_takes_the_lift_from_the_stage(monkeypatch: pytest.Monke
     _, info = env.reset(seed=3)
     assert info["stage_rule"] == "privileged"
     seen = lifts(env.unwrapped, monkeypatch)
-    away, there = MIDDLE[:6].copy(), env.unwrapped.demonstrate()[:6]
+    away, on_object = MIDDLE[:6].copy(), env.unwrapped.demonstrate()[:6]
     away[:2] = SPACE.low[:2]
     env.step(away)
-    *_, info = env.step(there)
+    *_, info = env.step(on_object)
     env.reset(seed=3)
-    env.step(there)
+    env.step(on_object)
     assert seen == [[0.1], [0.3], [0.3]] and info["stage_rule"] == "privileged"
     with pytest.raises(InputError, match=r"shape \(6,\)"):
         env.step(MIDDLE)

@@ -89,10 +89,10 @@ def test_truncated_and_extended_files_are_noticed(
     sealed: tuple[Path, bytes, Episode], data: st.DataObject
 ) -> None:
     folder, whole, _ = sealed
-    kept = whole[: data.draw(st.integers(0, len(whole)))]
+    part = whole[: data.draw(st.integers(0, len(whole)))]
     garbage = data.draw(st.binary(max_size=60))
     tail = data.draw(st.sampled_from([b"", whole[-8:], whole[-len(whole) // 2 :]]))
-    spoiled = kept + garbage + tail
+    spoiled = part + garbage + tail
     if spoiled != whole:
         with pytest.raises(InputError, match=episode_name(0)):
             read_bytes(folder, spoiled)
@@ -112,11 +112,11 @@ def test_forged_footers_raise_nothing_else(
         return bytes(spoiled)
 
     try:
-        found = read_bytes(folder, forge(whole, change))
+        actual = read_bytes(folder, forge(whole, change))
     except InputError as error:
         assert episode_name(0) in str(error) and "\n" not in str(error)
     else:  # statistics or names that nothing reads, or a changed word of the metadata
-        for a, b in zip(found.steps, expected.steps, strict=True):
+        for a, b in zip(actual.steps, expected.steps, strict=True):
             assert_same_record(a, b, tolerance=0.0)
 
 

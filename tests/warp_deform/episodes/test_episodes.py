@@ -49,19 +49,19 @@ def read_back(folder: Path, episode: Episode) -> Episode:
 @pytest.mark.parametrize("size", [(320, 160), (1, 7)])
 def test_round_trip_is_exact(tmp_path: Path, size: tuple[int, int], goal: bool) -> None:
     episode = make_episode(seed=41, size=size, goal=goal)
-    found = read_back(tmp_path, episode)
-    assert_same_episode(found, episode, tolerance=HEIGHT_TOLERANCE)
+    actual = read_back(tmp_path, episode)
+    assert_same_episode(actual, episode, tolerance=HEIGHT_TOLERANCE)
     reader = EpisodeReader(tmp_path)
-    for t, step in enumerate(found.steps):
+    for t, step in enumerate(actual.steps):
         assert_same_record(reader.read_step(41, t), step, tolerance=0.0)
     if goal:
-        assert_same_record(reader.read_goal(41), found.goal, tolerance=0.0)
-        assert found.info.goal is not None and found.info.goal["kind"] == "constructed"
+        assert_same_record(reader.read_goal(41), actual.goal, tolerance=0.0)
+        assert actual.info.goal is not None and actual.info.goal["kind"] == "constructed"
     else:
-        assert reader.read_goal(41) is None and found.info.goal is None
+        assert reader.read_goal(41) is None and actual.info.goal is None
     # What was read is stored without any further loss, to the same bytes.
     first = reader.path(41).read_bytes()
-    assert EpisodeWriter(tmp_path, overwrite=True).write(found).read_bytes() == first
+    assert EpisodeWriter(tmp_path, overwrite=True).write(actual).read_bytes() == first
 
 
 @settings(derandomize=True, deadline=None, max_examples=40)
@@ -70,17 +70,17 @@ def test_round_trip_of_any_episode(
     tmp_path_factory: pytest.TempPathFactory, seed: int, actions: int, particles: int
 ) -> None:
     episode = make_episode(seed, actions=actions, particles=particles, goal=bool(seed % 2))
-    found = read_back(tmp_path_factory.mktemp("any"), episode)
-    assert_same_episode(found, episode, tolerance=HEIGHT_TOLERANCE)
+    actual = read_back(tmp_path_factory.mktemp("any"), episode)
+    assert_same_episode(actual, episode, tolerance=HEIGHT_TOLERANCE)
 
 
 def test_every_float_survives_bit_by_bit(tmp_path: Path) -> None:
     bits = np.array([0, 2**31, 1, 0x7F800000, 0xFF800000, 0x7FC00001], np.uint32)
     odd = bits.view(np.float32).reshape(2, 3)
     episode = with_step(make_episode(), 1, particle_q=odd, score=-0.0)
-    found = read_back(tmp_path, episode)
-    assert found.steps[1].particle_q.tobytes() == odd.tobytes()
-    assert np.signbit(found.steps[1].score)
+    actual = read_back(tmp_path, episode)
+    assert actual.steps[1].particle_q.tobytes() == odd.tobytes()
+    assert np.signbit(actual.steps[1].score)
 
 
 @pytest.mark.parametrize("targets", [np.zeros((0, 3)), np.array(-0.1), np.ones((2, 1, 3)) / 3])
@@ -88,18 +88,18 @@ def test_goal_targets_of_any_shape(tmp_path: Path, targets: np.ndarray) -> None:
     episode = make_episode(goal=True)
     assert episode.goal is not None
     goal = dataclasses.replace(episode.goal, targets=targets)
-    found = read_back(tmp_path, dataclasses.replace(episode, goal=goal))
-    assert found.goal is not None
-    assert found.goal.targets.shape == targets.shape
-    assert found.goal.targets.tobytes() == targets.tobytes()
+    actual = read_back(tmp_path, dataclasses.replace(episode, goal=goal))
+    assert actual.goal is not None
+    assert actual.goal.targets.shape == targets.shape
+    assert actual.goal.targets.tobytes() == targets.tobytes()
 
 
 def test_numpy_scalars_and_tuples_become_plain_metadata(tmp_path: Path) -> None:
     config = {"lift": np.float32(0.25), "pairs": ((0.1, 2),), "n": np.arange(2)}
     episode = with_info(make_episode(), config=config, success=np.bool_(True))
-    found = read_back(tmp_path, episode).info
-    assert found.config == {"lift": 0.25, "pairs": [[0.1, 2]], "n": [0, 1]}
-    assert found.success is True
+    info = read_back(tmp_path, episode).info
+    assert info.config == {"lift": 0.25, "pairs": [[0.1, 2]], "n": [0, 1]}
+    assert info.success is True
 
 
 def test_any_parquet_reader_opens_a_file(tmp_path: Path) -> None:
@@ -177,9 +177,9 @@ def test_writer_refuses_bad_metadata(tmp_path: Path, changes: dict[str, object])
 def test_heights_at_the_ends_of_the_range(tmp_path: Path) -> None:
     height = np.linspace(0.0, 0.65535, 16 * 12, dtype=np.float32).reshape(16, 12)
     height[0, 0] = -4e-6  # within half a unit of 0
-    found = read_back(tmp_path, with_step(make_episode(), 0, height=height)).steps[0].height
-    assert np.abs(found.astype(float) - height).max() <= HEIGHT_TOLERANCE
-    assert found.min() == 0.0
+    actual = read_back(tmp_path, with_step(make_episode(), 0, height=height)).steps[0].height
+    assert np.abs(actual.astype(float) - height).max() <= HEIGHT_TOLERANCE
+    assert actual.min() == 0.0
 
 
 @settings(derandomize=True, deadline=None, max_examples=60)

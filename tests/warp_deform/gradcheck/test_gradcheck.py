@@ -41,13 +41,13 @@ def overall(rows: list[Row]) -> dict[str, Row]:
 @pytest.mark.parametrize("task", PARAMETERS)
 def test_substeps_of_real_episodes_agree(task: str) -> None:
     rows, _ = check(task, FEW)
-    found = overall(rows)
-    assert set(found) == PARAMETERS[task] | {"all"}
+    of_all = overall(rows)
+    assert set(of_all) == PARAMETERS[task] | {"all"}
     for row in rows:
         assert row.task == task and row.level == "substep" and row.dtype == "float64"
         assert row.relative_error is None or row.relative_error < 1e-6, row
-    assert found["all"].share >= 0.5 and found["all"].within == 1.0
-    assert found["stiffness"].n == found["all"].states >= 4
+    assert of_all["all"].share >= 0.5 and of_all["all"].within == 1.0
+    assert of_all["stiffness"].n == of_all["all"].states >= 4
     least = {"body_table", "grip"} if task == "block-notarget" else {"stretch", "grip", "table"}
     assert least <= {row.constraint for row in rows}
 
@@ -60,20 +60,20 @@ def test_a_wrong_derivative_shows(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(gradients, velocities=1.01 * gradients.velocities)
 
     monkeypatch.setattr(DifferentiableRollout, "backward", wrong)
-    found = overall(check(LINE, FEW)[0])
-    error = found["velocities"].relative_error
+    of_all = overall(check(LINE, FEW)[0])
+    error = of_all["velocities"].relative_error
     assert error is not None and error > 1e-3
-    assert found["velocities"].within < 0.5
-    assert found["positions"].relative_error < 1e-6
+    assert of_all["velocities"].within < 0.5
+    assert of_all["positions"].relative_error < 1e-6
 
 
 def test_windows() -> None:
     rows, _ = check(LINE, GradcheckConfig(levels=("window",), windows=2))
-    found = overall(rows)
-    assert set(found) == PARAMETERS[LINE] | {"all"} and len(rows) == len(found)
+    of_all = overall(rows)
+    assert set(of_all) == PARAMETERS[LINE] | {"all"} and len(rows) == len(of_all)
     assert all(0.0 <= row.share <= 1.0 for row in rows)
-    assert found["velocities"].growth is None and found["positions"].growth > 0
-    assert found["all"].states == 2
+    assert of_all["velocities"].growth is None and of_all["positions"].growth > 0
+    assert of_all["all"].states == 2
 
 
 STEPS = 1e-2 / RATIO ** np.arange(5)
@@ -191,15 +191,15 @@ def test_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     few = ["--levels", "substep", "--states", "2", "--json"]
     assert main(["gradcheck", LINE, *few]) == 0
     said = capsys.readouterr()
-    found = json.loads(said.out)
-    assert any("fewer than 20" in note for note in found["notes"])
+    answer = json.loads(said.out)
+    assert any("fewer than 20" in note for note in answer["notes"])
     keys = ["task", "level", "constraint", "parameter", "relative_error", "cosine", "share"]
-    assert list(found["rows"][0]) == [
+    assert list(answer["rows"][0]) == [
         *keys, "growth", "dtype", "n", "states", "within", "doubtful"
     ]  # fmt: skip
     assert main(["gradcheck", LINE, *few, "--summary"]) == 0
     (line,) = json.loads(capsys.readouterr().out)["summary"]
-    named = [r for r in found["rows"] if r["constraint"] == line["constraint"]]
+    named = [r for r in answer["rows"] if r["constraint"] == line["constraint"]]
     assert line["worst"] in [r["relative_error"] for r in named]
     assert line["states"] >= 2 and "grip" in line["seldom"]
     assert main(["gradcheck", "cable-lin", *few]) == 2

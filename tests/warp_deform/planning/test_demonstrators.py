@@ -165,9 +165,9 @@ def test_mpc_leaves_what_it_looks_ahead_from_untouched() -> None:
 def test_mpc_needs_fewer_actions_than_the_script(name: str) -> None:
     seeds, needed = list(range(200, 212)), {}
     for who in ("scripted", "mpc"):
-        found = played(worlds(name, 8), seeds, who)
-        assert all(run.ended == SOLVED for run in found.values())
-        needed[who] = sum(len(run.actions) for run in found.values())
+        runs = played(worlds(name, 8), seeds, who)
+        assert all(run.ended == SOLVED for run in runs.values())
+        needed[who] = sum(len(run.actions) for run in runs.values())
     assert needed["mpc"] < needed["scripted"]
 
 
@@ -205,9 +205,9 @@ def test_candidates_are_different_allowed_and_at_most_eight(
     inside = np.array([0.5, 0.0, 0, 0.5, 0.2, 0, 0.04])
     outside = inside * [1, 1, 1, 2, 1, 1, 1]
     many = [np.add(inside, [0, 0.01 * i, 0, 0, 0, 0, 0]) for i in range(20)]
-    for proposed, kept in (([inside, outside, inside.copy()], 1), (many, CANDIDATES), ([], 0)):
+    for proposed, expected in (([inside, outside, inside.copy()], 1), (many, CANDIDATES), ([], 0)):
         monkeypatch.setattr(side.task, "candidates", lambda *_, p=proposed: p, raising=False)
-        assert len(demonstrating._candidates(side, 0, runs[0], CANDIDATES)) == kept
+        assert len(demonstrating._candidates(side, 0, runs[0], CANDIDATES)) == expected
     assert demonstrator("mpc")(side, runs) == {0: None}
 
 

@@ -90,13 +90,13 @@ def test_an_action_that_is_not_allowed_moves_nothing(started):
 def test_a_search_keeps_to_its_budget_and_repeats_itself(started, method, depth):
     worlds, lookahead = started
     config = SearchConfig(method=method, depth=depth, budget=24, candidates=8)
-    found = []
+    searches = []
     for _ in range(2):
         spent = lookahead.rollouts
         rng = np.random.default_rng(5)
-        found.append(search(lookahead, worlds.task, worlds.state(0), rng, config))
+        searches.append(search(lookahead, worlds.task, worlds.state(0), rng, config))
         assert 0 < lookahead.rollouts - spent <= 24
-    first, second = found
+    first, second = searches
     assert [o.rank for o in first] == [o.rank for o in second]
     if depth == 1:
         assert [o.rank for o in first] == sorted((o.rank for o in first), reverse=True)
@@ -137,10 +137,10 @@ def test_given_actions_are_tried_first_and_drawn_ones_say_so(started):
     given = _moves(worlds, 0, 3)[2] + np.array([0, 0, 0, 0.001, 0, 0, 0])
     config = SearchConfig(method="random", depth=1, budget=3, candidates=1)
     rng = np.random.default_rng(2)
-    found = search(lookahead, worlds.task, state, rng, config, also=[given, given])
-    assert sum(np.array_equal(o.action, given) for o in found) == 1
-    if not any(o.solved for o in found):
-        assert sorted(o.origin for o in found) == ["candidate", "candidate", "drawn"]
+    outlooks = search(lookahead, worlds.task, state, rng, config, also=[given, given])
+    assert sum(np.array_equal(o.action, given) for o in outlooks) == 1
+    if not any(o.solved for o in outlooks):
+        assert sorted(o.origin for o in outlooks) == ["candidate", "candidate", "drawn"]
     only = SearchConfig(method="enumerate", depth=1, budget=1, candidates=8)
     (one,) = search(lookahead, worlds.task, state, rng, only, also=[given])
     assert np.array_equal(one.action, given)
@@ -150,7 +150,7 @@ def test_what_an_action_that_solves_the_task_leaves_of_a_budget_goes_into_better
     worlds, lookahead = started
     easy = SearchConfig(method="cem", budget=48, candidates=8)
     state, rng = worlds.state(0), np.random.default_rng
-    found = {}
+    ranks = {}
     solved, worlds.task.success_score = worlds.task.success_score, 0.05
     try:
         for polish in (False, True):
@@ -158,13 +158,13 @@ def test_what_an_action_that_solves_the_task_leaves_of_a_budget_goes_into_better
                 config, spent = replace(easy, polish=polish, depth=depth), lookahead.rollouts
                 tried = search(lookahead, worlds.task, state, rng(0), config)
                 assert tried[0].solved
-                found[polish, depth] = tried[0].rank, lookahead.rollouts - spent
+                ranks[polish, depth] = tried[0].rank, lookahead.rollouts - spent
     finally:
         worlds.task.success_score = solved
     for depth in (1, 2):
-        (rank, spent), (polished, all_spent) = found[False, depth], found[True, depth]
+        (rank, spent), (polished, all_spent) = ranks[False, depth], ranks[True, depth]
         assert polished >= rank and spent < all_spent <= 48
-    assert any(found[True, depth][0] > found[False, depth][0] for depth in (1, 2))
+    assert any(ranks[True, depth][0] > ranks[False, depth][0] for depth in (1, 2))
 
 
 def test_a_slope_that_is_too_chaotic_is_not_used_and_the_origin_says_so(started, monkeypatch):
@@ -229,9 +229,9 @@ def test_a_body_is_put_right_by_its_slope(block):
     rng, state = np.random.default_rng(0), worlds.state(0)
     around = _Around(lookahead, worlds.task, state, rng, config, keep=False)
     before = lookahead.try_each([(state, _near_miss(worlds))])
-    found = around.improved(before, 60)
-    assert [o.origin for o in found] == ["gradient"] * 12
-    assert any(o.solved for o in found) and not before[0].solved
+    improved = around.improved(before, 60)
+    assert [o.origin for o in improved] == ["gradient"] * 12
+    assert any(o.solved for o in improved) and not before[0].solved
 
 
 def test_slopes_of_two_actions_chain_through_the_state_between(block):
@@ -334,12 +334,12 @@ def test_way_points_chain_through_positions_and_times(started):
     values = bend.start + rng.normal(0, 0.01, 11)
     path = bend.path(values)
     by_points, by_times = rng.normal(size=path.positions.shape), rng.normal(size=len(path.times))
-    told = bend.chained(values, by_points, by_times)
+    chained = bend.chained(values, by_points, by_times)
     for i in range(11):
         ends = [bend.path(values + sign * 1e-6 * np.eye(11)[i]) for sign in (1, -1)]
         change = (by_points * (ends[0].positions - ends[1].positions)).sum()
         change += by_times @ (ends[0].times - ends[1].times)
-        assert told[i] == pytest.approx(change / 2e-6, rel=1e-5, abs=1e-5)
+        assert chained[i] == pytest.approx(change / 2e-6, rel=1e-5, abs=1e-5)
     # the tip goes as fast as along the straight line
     speed = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)[bend.first : bend.first + 4]
     speed = speed / np.diff(path.times)[bend.first : bend.first + 4]

@@ -117,15 +117,15 @@ def test_motions_take_the_time_that_their_speed_says() -> None:
 def test_the_tip_turns_the_short_way_and_never_too_fast(
     start: float, goal: float, place: float, far: bool
 ) -> None:
-    there = approach(np.array([0.5, 0.0, 0.3, start]), pick(0.5, 0.1, goal), 0.3, 0.0, CONFIG)
-    assert there.way_points[-1, 3] == goal
-    assert np.cos(there.way_points[0, 3] - start) == pytest.approx(1.0)
+    approached = approach(np.array([0.5, 0.0, 0.3, start]), pick(0.5, 0.1, goal), 0.3, 0.0, CONFIG)
+    assert approached.way_points[-1, 3] == goal
+    assert np.cos(approached.way_points[0, 3] - start) == pytest.approx(1.0)
     _, path = carry_to(place, start_yaw=goal, place=(0.5, 0.2) if far else (0.5, 0.0))
     assert path.rotations is not None
     turns = Rotation.from_quat(path.rotations)
     assert (turns[-1] * Rotation.from_rotvec([0, 0, -place])).magnitude() < 1e-6
     for times, yaw in (
-        (there.times, there.way_points[:, 3]),
+        (approached.times, approached.way_points[:, 3]),
         (path.times, np.unwrap(turns.as_euler("xyz")[:, 2])),
     ):
         assert abs(yaw[-1] - yaw[0]) <= np.pi + 1e-9
@@ -155,10 +155,10 @@ def test_the_arm_goes_on_from_where_it_is_unless_its_wrist_is_wound_up() -> None
     for k in range(30):
         x, y, place_x, place_y = rng.uniform([0.45, -0.2] * 2, [0.6, 0.2] * 2)
         yaw, place_yaw = rng.uniform(-np.pi, np.pi, 2)
-        there = approach(tip, pick(x, y, yaw), 0.2, 0.012, CONFIG)
+        towards = approach(tip, pick(x, y, yaw), 0.2, 0.012, CONFIG)
         action = np.array([x, y, yaw, place_x, place_y, place_yaw, 0.04])
         onwards, _ = carry(action, HELD, STAGE, 0.012, 0.2, CONFIG)
-        for motion in (there, onwards):
+        for motion in (towards, onwards):
             [q] = solve_joints(arm, [motion], [posture])
             assert q is not None
             jump = q[0] - posture

@@ -177,12 +177,14 @@ def test_pendulum_is_of_first_order() -> None:
     # at a quarter of the period the bob hangs: dT / 4 is what its way is behind, over its speed
     quarter = ellipk(np.sin(ANGLE / 2) ** 2) * np.sqrt(LENGTH / G)
     of_period = [np.sqrt(LENGTH / G) * ellipk(np.sin((ANGLE + s) / 2) ** 2) * 4 for s in (h, -h)]
-    found = []
+    slopes_of_period = []
     for n in (960, 1920):
         _, velocity, slopes = pendulum(quarter / n, quarter)
-        found.append(-4 * slopes[0] / velocity[0])
+        slopes_of_period.append(-4 * slopes[0] / velocity[0])
     exact_period = np.array([(of_period[0] - of_period[1]) / (2 * h)])
-    assert_first_order(np.array([found[0]]), np.array([found[1]]), exact_period)
+    assert_first_order(
+        np.array([slopes_of_period[0]]), np.array([slopes_of_period[1]]), exact_period
+    )
 
 
 # -- a pushed box
@@ -256,10 +258,10 @@ def test_pushed_box_is_of_first_order() -> None:
     drop, least = MU * G, SLEEP_SPEED
     end = PUSH + (PUSHED**2 - least**2) / (2 * drop)
     held = np.array([end, 1 + SLIDE / LONG, -PUSHED - PUSHED * SLIDE / LONG])
-    found = []
+    of_steps = []
     for count in (90, 180):
         stop, gradients = pushed(SLIDE / (count + 0.25), 0.33)
         ways = gradients.way_points[0][:, 0]
-        found.append(np.array([stop, ways[1] + ways[2], gradients.knot_times[0][1]]))
-    assert_first_order(*found, held)
-    assert found[1][1] == pytest.approx(1 + PUSHED / (drop * LONG), rel=0.01)
+        of_steps.append(np.array([stop, ways[1] + ways[2], gradients.knot_times[0][1]]))
+    assert_first_order(*of_steps, held)
+    assert of_steps[1][1] == pytest.approx(1 + PUSHED / (drop * LONG), rel=0.01)

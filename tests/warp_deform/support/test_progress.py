@@ -23,21 +23,21 @@ class Clock:
 
 
 def made(total: int = 4000, **options: object) -> tuple[PlainLines, list[str], Clock]:
-    told: list[str] = []
+    printed: list[str] = []
     clock = Clock()
-    values = {"unit": "steps", "tell": told.append, "clock": clock} | options
-    return PlainLines("train cable-ring", total, **values), told, clock  # type: ignore[arg-type]
+    values = {"unit": "steps", "tell": printed.append, "clock": clock} | options
+    return PlainLines("train cable-ring", total, **values), printed, clock  # type: ignore[arg-type]
 
 
 def test_a_line_has_number_note_rate_and_the_time_that_is_left() -> None:
-    lines, told, clock = made()
+    lines, printed, clock = made()
     assert lines.line() == "train cable-ring: 0 of 4000 steps, 0 s so far", "no rate yet"
     for _ in range(250):
         lines()
     lines.note = "loss 8.81"
     clock.now += 100
     lines.milestone()
-    assert told == [
+    assert printed == [
         "train cable-ring: 250 of 4000 steps, loss 8.81, 2 min so far, 2.5 a second, 25 min left"
     ]
     clock.now += 900

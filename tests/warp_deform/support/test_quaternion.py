@@ -89,8 +89,8 @@ def test_a_small_turn_and_its_derivative(rng: np.random.Generator) -> None:
     moved = (Rotation.from_rotvec(turn) * quat).as_quat()
     moved *= np.sign((moved * quat.as_quat()).sum(axis=-1, keepdims=True))
     jacobian = quat_by_rotation(quat.as_quat())
-    told = quat.as_quat() + np.einsum("bk,bkq->bq", turn, jacobian)
-    np.testing.assert_allclose(moved, told, atol=1e-11)
+    linear = quat.as_quat() + np.einsum("bk,bkq->bq", turn, jacobian)
+    np.testing.assert_allclose(moved, linear, atol=1e-11)
     # what a turn cannot follow is what the tangent leaves out
     g = rng.normal(size=(COUNT, 4))
     tangent = quat_tangent(quat.as_quat(), g)

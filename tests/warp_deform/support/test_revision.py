@@ -39,8 +39,8 @@ def test_a_checkout_has_a_commit_and_is_clean_or_not(module: Path) -> None:
     assert running_revision(module).dirty is False
     module.write_text("a = 2\n")
     running_revision.cache_clear()
-    found = running_revision(module)
-    assert found.dirty and str(found) == f"{__version__} at {commit[:12]}, edited"
+    revision = running_revision(module)
+    assert revision.dirty and str(revision) == f"{__version__} at {commit[:12]}, edited"
 
 
 def test_a_package_inside_of_another_checkout_is_no_part_of_it(module: Path) -> None:
@@ -48,8 +48,8 @@ def test_a_package_inside_of_another_checkout_is_no_part_of_it(module: Path) -> 
     installed = module.parent / "site-packages" / "revision.py"
     installed.parent.mkdir()
     installed.write_text("")
-    found = running_revision(installed)
-    assert found == Revision(__version__) and str(found) == __version__
+    revision = running_revision(installed)
+    assert revision == Revision(__version__) and str(revision) == __version__
 
 
 def test_without_git_there_is_a_version(module: Path, monkeypatch: pytest.MonkeyPatch) -> None:

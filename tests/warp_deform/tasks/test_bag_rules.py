@@ -36,7 +36,9 @@ def past(
     return PastAction(np.array([0.0] * 6 + [lift]), outcome, held, aloft)
 
 
-def there(task: BagItems1, layout: Layout, *history: PastAction, over: bool = False) -> Snapshot:
+def in_the_zone(
+    task: BagItems1, layout: Layout, *history: PastAction, over: bool = False
+) -> Snapshot:
     """Everything in the zone after a history."""
     state = delivered(task, layout, ())
     return Snapshot(**{**vars(state), "history": history, "over": over})
@@ -61,7 +63,7 @@ def there(task: BagItems1, layout: Layout, *history: PastAction, over: bool = Fa
 def test_what_is_no_carry_neither_scores_nor_ends(cls, last) -> None:
     task, layout = start(cls, 2)
     for history in ((last,), (past(INSERT.lift, held=CUBE), last), (past(), last)):
-        state = there(task, layout, *history)
+        state = in_the_zone(task, layout, *history)
         assert task.score(layout, state) == 0.0
         assert not task.solved(layout, state) and not task.ended(layout, state)
 
@@ -69,8 +71,8 @@ def test_what_is_no_carry_neither_scores_nor_ends(cls, last) -> None:
 @each_items
 def test_a_carry_into_the_zone_ends_the_episode_solved_or_not(cls) -> None:
     task, layout = start(cls, 2)
-    assert task.ended(layout, there(task, layout, past()))
-    assert task.solved(layout, there(task, layout, past()))
+    assert task.ended(layout, in_the_zone(task, layout, past()))
+    assert task.solved(layout, in_the_zone(task, layout, past()))
     alone = delivered(task, layout, (CARRY.lift,))
     beside = snapshot(task, layout, alone.particle_q, layout.body_q, (CARRY.lift,))
     assert task.ended(layout, beside) and not task.solved(layout, beside)
@@ -81,7 +83,7 @@ def test_a_carry_into_the_zone_ends_the_episode_solved_or_not(cls) -> None:
 @each_items
 def test_nothing_counts_after_the_end(cls) -> None:
     task, layout = start(cls, 2)
-    state = there(task, layout, past(), past(), over=True)
+    state = in_the_zone(task, layout, past(), past(), over=True)
     assert task.score(layout, state) == 0.0
     assert not task.solved(layout, state) and not task.ended(layout, state)
 
@@ -92,7 +94,7 @@ def test_a_pick_on_an_item_is_an_insertion_whatever_its_lift(cls) -> None:
     rng = np.random.default_rng(0)
     for lift in (OPEN.lift, INSERT.lift, CARRY.lift):
         picked = [past(lift, held=CUBE + k) for k in range(len(task.cubes))]
-        action = task.demonstrate(layout, there(task, layout, *picked), rng)
+        action = task.demonstrate(layout, in_the_zone(task, layout, *picked), rng)
         assert task.stage_of(float(action[6])) is CARRY
 
 
@@ -120,12 +122,12 @@ def test_enclosed_asks_for_the_end_and_for_the_carry(cls) -> None:
     task, layout = start(cls, 2)
     hung, lost = aloft(task, layout), aloft(task, layout, inside=False)
     dragged = aloft(task, layout, lift=-0.03)
-    assert task.enclosed(layout, there(task, layout, past(aloft=hung)))
+    assert task.enclosed(layout, in_the_zone(task, layout, past(aloft=hung)))
     for carry in (past(aloft=lost), past(aloft=dragged), past(), past(INSERT.lift, aloft=hung)):
-        assert not task.enclosed(layout, there(task, layout, carry))
-    assert not task.enclosed(layout, there(task, layout))
+        assert not task.enclosed(layout, in_the_zone(task, layout, carry))
+    assert not task.enclosed(layout, in_the_zone(task, layout))
     # the last carry counts
-    assert not task.enclosed(layout, there(task, layout, past(aloft=hung), past(aloft=lost)))
+    assert not task.enclosed(layout, in_the_zone(task, layout, past(aloft=hung), past(aloft=lost)))
     beside = delivered(task, layout, ())
     body_q = beside.body_q.copy()
     body_q[-1, :2] += 0.25
@@ -156,11 +158,13 @@ class Told:
     def try_each(self, jobs, *, keep: bool = False) -> list[Outlook]:
         self.rollouts += len(jobs)
         self.tried += [float(action[0]) for _, action in jobs]
-        found = []
+        outlooks = []
         for state, action in jobs:
             grades = self.first if state is STATE else self.second
-            found.append(outlook(action, grades.get(float(action[0]), 0), LATER if keep else None))
-        return found
+            outlooks.append(
+                outlook(action, grades.get(float(action[0]), 0), LATER if keep else None)
+            )
+        return outlooks
 
 
 def state_of(episode: object) -> SimpleNamespace:
@@ -191,9 +195,9 @@ def test_a_search_goes_on_where_a_solution_would_lose_the_item() -> None:
     assert best.action[0] == pick_x(1)  # two actions that keep it go before one that does not
     lost_or_nothing = Told({pick_x(0): 3, pick_x(1): 2}, {})
     assert search(lost_or_nothing, Offers(), STATE, rng, config)[0].action[0] == pick_x(0)
-    kept = Told({pick_x(0): 3, pick_x(3): 4}, {})
-    assert search(kept, Offers(), STATE, rng, config)[0].action[0] == pick_x(3)
-    assert len(kept.tried) == 4, "nothing is left to search for"
+    lost_or_kept = Told({pick_x(0): 3, pick_x(3): 4}, {})
+    assert search(lost_or_kept, Offers(), STATE, rng, config)[0].action[0] == pick_x(3)
+    assert len(lost_or_kept.tried) == 4, "nothing is left to search for"
 
 
 @pytest.mark.parametrize(
@@ -209,12 +213,12 @@ def test_a_search_goes_on_where_a_solution_would_lose_the_item() -> None:
 def test_mpc_tries_more_where_the_best_would_end_badly(
     monkeypatch, early, late, chosen, tries
 ) -> None:
-    told = Told({pick_x(k): grade for k, grade in (early | late).items()}, {})
-    monkeypatch.setattr(demonstrators, "_lookahead", lambda worlds: told)
+    lookahead = Told({pick_x(k): grade for k, grade in (early | late).items()}, {})
+    monkeypatch.setattr(demonstrators, "_lookahead", lambda worlds: lookahead)
     worlds = SimpleNamespace(task=Offers(), episodes={0: EPISODE}, state=lambda slot: STATE)
     run = SimpleNamespace(rng=np.random.default_rng(0))
     action = demonstrators.DEMONSTRATORS["mpc"](worlds, {0: run})[0]
-    assert action[0] == pick_x(chosen) and len(told.tried) == tries
+    assert action[0] == pick_x(chosen) and len(lookahead.tried) == tries
 
 
 # -- simulated

@@ -105,8 +105,8 @@ def test_a_goal_from_elsewhere_keeps_its_bag_and_colour() -> None:
         mine = task.sample_for_goal(np.random.default_rng(seed), REACH, goal)
         np.testing.assert_array_equal(mine.targets, goal)
         assert mine.configs[0].color == layout.configs[0].color != mine.configs[2].color
-        there = mine.particle_q[: len(SHELL.vertices), :2].mean(axis=0)
-        assert np.linalg.norm(there - goal[0, :2]) < 0.03
+        middle = mine.particle_q[: len(SHELL.vertices), :2].mean(axis=0)
+        assert np.linalg.norm(middle - goal[0, :2]) < 0.03
 
 
 # -- states and scores
@@ -237,15 +237,18 @@ def test_a_bag_lifted_by_one_bead_stays_within_its_tether() -> None:
     side = Worlds(BagAloneOpen(), 1)
     side.reset({0: 1})
     bead = side.objects[0].ring[5]
-    here = side.episodes[0].snapshot.particle_q[bead].astype(float)
-    times, knots = np.array([0.0, 0.8, 1.2]), here + np.array([[0, 0, 0], [0, 0, 0.4], [0, 0, 0.4]])
+    lying = side.episodes[0].snapshot.particle_q[bead].astype(float)
+    times, knots = (
+        np.array([0.0, 0.8, 1.2]),
+        lying + np.array([[0, 0, 0], [0, 0, 0.4], [0, 0, 0.4]]),
+    )
     run = rollout(
         side.solver, [0], paths={0: GripPath(times, knots, particle=bead)}, most=1.2, record=0.05
     )[0]
     tether = side.solver.data.lane("particles.tether", 0)
     particles = np.array(run.frames.particle_q, dtype=float)
     away = np.linalg.norm(particles - particles[:, [bead]], axis=2)
-    assert particles[-1, bead, 2] > here[2] + 0.35  # it was lifted
+    assert particles[-1, bead, 2] > lying[2] + 0.35  # it was lifted
     assert tether.max() < 1.0 and (away <= tether * (1 + 1e-3) + 1e-4).all()
 
 

@@ -120,8 +120,8 @@ def test_starts_are_in_view_at_rest_and_unsolved_and_goals_are_reached_by_their_
         assert episode.goal is not None and episode.goal.targets.shape == (90, 2)
         scores.append(side.score(slot))
         at_goal = np.column_stack([episode.goal.targets, np.full(90, 0.0025)])
-        there = replace(episode.snapshot, particle_q=at_goal)
-        assert TASK.score(episode.layout, there) == 1.0
+        reached = replace(episode.snapshot, particle_q=at_goal)
+        assert TASK.score(episode.layout, reached) == 1.0
         turned = replace(episode.snapshot, particle_q=at_goal[::-1])
         assert TASK.score(episode.layout, turned) > 0.98
     assert np.median(scores) < 0.1

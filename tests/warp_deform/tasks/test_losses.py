@@ -34,12 +34,14 @@ def test_every_task_has_a_loss_with_the_slopes_of_finite_differences(name):
     seen = 0.0
     for _ in range(4):
         ways = [torch.tensor(rng.normal(size=t.shape)) for t in (x, q)]
-        told = sum(float((g * w).sum()) for g, w in zip(slopes, ways, strict=True) if g is not None)
+        by_slopes = sum(
+            float((g * w).sum()) for g, w in zip(slopes, ways, strict=True) if g is not None
+        )
         eps = 1e-7
         ends = [loss(x + s * eps * ways[0], q + s * eps * ways[1]) for s in (1, -1)]
         measured = (ends[0] - ends[1]).item() / (2 * eps)
-        assert told == pytest.approx(measured, rel=1e-4, abs=1e-6)
-        seen = max(seen, abs(told))
+        assert by_slopes == pytest.approx(measured, rel=1e-4, abs=1e-6)
+        seen = max(seen, abs(by_slopes))
     assert seen > 1e-3, "the state matters"
 
 

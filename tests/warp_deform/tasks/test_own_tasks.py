@@ -97,8 +97,8 @@ def reported(capfd: pytest.CaptureFixture[str], *words: object) -> dict[str, Any
     code = main([*map(str, words), "--json"])
     said = capfd.readouterr()
     assert code == 0, said.err
-    found: dict[str, Any] = json.loads(said.out)
-    return found
+    report: dict[str, Any] = json.loads(said.out)
+    return report
 
 
 def refused(capfd: pytest.CaptureFixture[str], *words: object) -> str:
@@ -117,8 +117,8 @@ def box_away(folder: Path) -> type[Task]:
     assert spec is not None and spec.loader is not None
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
-    found: type[Task] = script.BoxAway
-    return found
+    cls: type[Task] = script.BoxAway
+    return cls
 
 
 def test_an_installed_task_goes_the_whole_way(
@@ -146,8 +146,8 @@ def test_an_installed_task_goes_the_whole_way(
     how = ("--agent", "gt-mlp", "--steps", 2, "--batch", 2, "--snapshots", 1)
     assert reported(capfd, "train", "box-away", *how, "--data", demos, "--out", run)["steps"] == 2
     test = ("--episodes", 2, "--validation-episodes", 1, "--videos", 1)
-    found = reported(capfd, "eval", run, *test, "--video", tmp_path / "films")
-    assert found["test"]["n_episodes"] == 2 and len(found["videos"]) == 2
+    evaluation = reported(capfd, "eval", run, *test, "--video", tmp_path / "films")
+    assert evaluation["test"]["n_episodes"] == 2 and len(evaluation["videos"]) == 2
     (cell,) = reported(capfd, "report", run)["cells"]
     assert (cell["task"], cell["paper"]) == ("box-away", None)
 
@@ -233,11 +233,11 @@ def test_a_broken_distribution_is_one_line_that_names_it(
     name = points.split(" = ")[0]
     assert main(["list", "--json"]) == 0
     said = capfd.readouterr()
-    found = json.loads(said.out)
-    (line,) = found["warnings"]
+    listed = json.loads(said.out)
+    (line,) = listed["warnings"]
     assert "odd-things" in line and expected in line
     assert said.err == f"warp-deform: warning: {line}\n"
-    assert [task["name"] for task in found["tasks"]][-1] == "cable-mask-goal"
+    assert [task["name"] for task in listed["tasks"]][-1] == "cable-mask-goal"
     main(["doctor", "--json"])
     assert line in json.loads(capfd.readouterr().out)["warnings"]
     if name != "cable-ring":

@@ -42,8 +42,8 @@ def test_free_space_samples_every_free_pixel_alike() -> None:
     cover = np.ones(SHAPE, bool)
     cover[10:12, 20:23] = False
     rng = np.random.default_rng(0)
-    found = [FreeSpace(None, cover).sample(rng, 0, 0)[:2] for _ in range(1200)]
-    pixels, counts = np.unique(world_to_pixel(np.array(found)), axis=0, return_counts=True)
+    places = [FreeSpace(None, cover).sample(rng, 0, 0)[:2] for _ in range(1200)]
+    pixels, counts = np.unique(world_to_pixel(np.array(places)), axis=0, return_counts=True)
     assert len(pixels) == 6
     assert counts.min() > 150
 
