@@ -179,21 +179,21 @@ def soft_labels(deviation: float) -> Iterator[None]:
 
 @torch.no_grad()
 def held_out(run: RunFolder, data: Demonstrations) -> dict[str, float]:
-    """Likelihoods and distances over every moment of demonstrations that were not trained on."""
+    """Likelihoods and distances over all transitions of demonstrations that were not trained on."""
     policy = load_policy(run.path)
     assert isinstance(policy, ImagePolicy)
     agent, grid = policy.agent, data.task.grid
     config = agent.config
-    moments = [(e, t) for e, length in enumerate(data.lengths()) for t in range(length)]
+    transitions = [(e, t) for e, length in enumerate(data.lengths()) for t in range(length)]
     likelihoods, distances = [], []
-    for moment in (data.moment(*each) for each in moments):
-        goal = (moment.goal_color, moment.goal_height) if agent.pictures == 2 else None
-        image = agent.image((moment.color, moment.height), goal)[None]
+    for transition in (data.transition(*each) for each in transitions):
+        goal = (transition.goal_color, transition.goal_height) if agent.pictures == 2 else None
+        image = agent.image((transition.color, transition.height), goal)[None]
         pick, place = (
             torch.from_numpy(config.to_network(grid.to_pixel(xy)))[None]
-            for xy in (moment.action[:2], moment.action[3:5])
+            for xy in (transition.action[:2], transition.action[3:5])
         )
-        turn = moment.action[2] - moment.action[5]
+        turn = transition.action[2] - transition.action[5]
         n = config.n_rotations_eval
         heats = agent.attention(image), agent.transport(image, pick, n_rotations=n)[0]
         row = [
@@ -207,11 +207,13 @@ def held_out(run: RunFolder, data: Demonstrations) -> dict[str, float]:
         likelihoods.append(row)
         best = int(heats[1].argmax()) % (config.shape[0] * config.shape[1])
         at = np.array([best // config.shape[1], best % config.shape[1]])
-        distances.append(np.linalg.norm(grid.to_world(config.to_camera(at)) - moment.action[3:5]))
+        distances.append(
+            np.linalg.norm(grid.to_world(config.to_camera(at)) - transition.action[3:5])
+        )
     millimetres = 1e3 * np.array(distances)
     picks, places = np.mean(likelihoods, axis=0)
     return {
-        "moments": len(moments),
+        "moments": len(transitions),
         "pick_nat": float(picks),
         "place_nat": float(places),
         "place_mm": float(np.median(millimetres)),

@@ -29,7 +29,7 @@ from warp_deform.quiet import quiet_warp
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Task
 from warp_deform.worlds import Worlds
-from warp_deform.worlds.loop import SOLVED, Act, Run, play, worlds_for
+from warp_deform.worlds.loop import SOLVED, Act, EpisodeRun, play, worlds_for
 
 TASKS = ("cable-line-notarget", "cable-shape", "fabric-flat-notarget", "block-notarget")
 GRIDS = {"none": "as it is", "paper": "grid of `paper`", "fast": "grid of `fast`"}
@@ -69,7 +69,7 @@ def on_grid(task: Task, config: TransporterConfig | None) -> Act[float]:
     """The scripted demonstrator, on the grid of `config` where there is one."""
     scripted = demonstrator("scripted")
 
-    def act(worlds: Worlds, runs: Mapping[int, Run[float]]) -> dict[int, np.ndarray | None]:
+    def act(worlds: Worlds, runs: Mapping[int, EpisodeRun[float]]) -> dict[int, np.ndarray | None]:
         actions = dict(scripted(worlds, runs))
         if config is not None:
             for slot, action in actions.items():

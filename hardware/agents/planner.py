@@ -76,7 +76,7 @@ class SeenChain(CableMaskGoal):
         """Overlap with the goal's own mask."""
         return mask_iou(self.mask(snapshot.particle_q), self._goal)
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """Score, less the mean distance from the targets and the `chord_error`, the better way.
 
         Without the second of them moves that push the chain together look as good as others; it

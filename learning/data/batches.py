@@ -65,7 +65,7 @@ def image_batch(
     data: Demonstrations,
     agent: Transporter,
     *,
-    moments: Iterable[tuple[int, int]],
+    transitions: Iterable[tuple[int, int]],
     rng: np.random.Generator,
     augment: bool = True,
     mirror: bool = False,
@@ -73,7 +73,7 @@ def image_batch(
     """Moments, moved by `rng`, as an agent over pictures sees them.
 
     Args:
-        moments: demonstrations and moments, `Demonstrations.drawn` say
+        transitions: number of a demonstration, and of an action in it, as of `Demonstrations.drawn`
         mirror: show every second one mirrored, where mirror images are scenes of the task
 
     Raises:
@@ -81,26 +81,26 @@ def image_batch(
     """
     images, picks, places, thetas, lifts = [], [], [], [], []
     grid, copies, mirrors = data.task.grid, data.task.rotated_copies, data.task.mirrors
-    for moment in (data.moment(*each) for each in moments):
-        pictures = [(moment.color, moment.height)]
+    for transition in (data.transition(*each) for each in transitions):
+        pictures = [(transition.color, transition.height)]
         if agent.pictures == 2:
-            pictures.append((moment.goal_color, moment.goal_height))
-        pixels = grid.to_pixel(np.stack([moment.action[:2], moment.action[3:5]]))
-        turn = moment.action[2] - moment.action[5]
+            pictures.append((transition.goal_color, transition.goal_height))
+        pixels = grid.to_pixel(np.stack([transition.action[:2], transition.action[3:5]]))
+        turn = transition.action[2] - transition.action[5]
         if augment:
             moved = draw_transform(
-                moment.action, rng=rng, grid=grid, copies=copies, mirror=mirror and mirrors
+                transition.action, rng=rng, grid=grid, copies=copies, mirror=mirror and mirrors
             )
             turn *= moved.handed
             pictures = [move_picture(*picture, moved) for picture in pictures]
             pixels = np.round(moved.of_pixels(pixels)).astype(np.int64)
-        _check_pixels(pixels, moment.action)
+        _check_pixels(pixels, transition.action)
         images.append(agent.image(*pictures))
         pick, place = agent.config.to_network(pixels)
         picks.append(pick)
         places.append(place)
         thetas.append(turn)
-        lifts.append(_lift_index(moment.action, agent.config.lifts))
+        lifts.append(_lift_index(transition.action, agent.config.lifts))
     return Batch(
         torch.stack(images),
         torch.from_numpy(np.stack(picks)),
@@ -114,7 +114,7 @@ def state_batch(
     data: Demonstrations,
     lifts: tuple[float, ...],
     *,
-    moments: Iterable[tuple[int, int]],
+    transitions: Iterable[tuple[int, int]],
     rng: np.random.Generator,
     augment: bool = True,
 ) -> StateBatch:
@@ -125,9 +125,9 @@ def state_batch(
     """
     grid, copies = data.task.grid, data.task.rotated_copies
     pairs, transforms = [], []
-    for state, action in (data.state(*each) for each in moments):
+    for state, action in (data.state(*each) for each in transitions):
         pairs.append((state, action))
-        if augment:  # drawn between the moments, which `rng` may draw too
+        if augment:  # drawn between the transitions, which `rng` may draw too
             transforms.append(draw_transform(action, rng=rng, grid=grid, copies=copies))
     states, actions = (np.stack(each) for each in zip(*pairs, strict=True))
     if augment:

@@ -21,7 +21,7 @@ from warp_deform.episodes import Episode, EpisodeReader, episode_name, read_inde
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
 
-__all__ = ["Demonstrations", "Moment", "choose"]
+__all__ = ["Demonstrations", "Transition", "choose"]
 
 _FOLDER = "rows"
 _FORMAT = 1
@@ -34,11 +34,11 @@ _IMPORTED_SOLVED = "bag-items-1", "bag-items-2"
 """Tasks of whose recordings by the original code it keeps the solved ones."""
 
 
-class Moment(NamedTuple):
+class Transition(NamedTuple):
     """One demonstrated action: what was seen, what was done, and what came of the episode.
 
     Attributes:
-        color: (H, W, 3) uint8, of the moment and of the episode's end
+        color: (H, W, 3) uint8, before the action and at the episode's end
         height: (H, W) float32 [m], likewise
         action: (7,) float64 pick x, y, yaw, place x, y, yaw, lift [m, rad]
     """
@@ -83,7 +83,7 @@ class _Rows:
 class Demonstrations:
     """Demonstrations of one task, of which `count` were chosen for training run `seed`.
 
-    Pictures stay on the disk: one moment takes two reads, and memory holds only actions and
+    Pictures stay on the disk: one transition takes two reads, and memory holds only actions and
     ground truth. Building reads each chosen episode once, unless the cache has it.
 
     Recordings that were imported from the original code count as it counts them: it keeps failed
@@ -182,9 +182,9 @@ class Demonstrations:
         return size
 
     def drawn(self, count: int, rng: np.random.Generator) -> Iterator[tuple[int, int]]:
-        """So many times a demonstration, then one of its moments, both drawn uniformly by `rng`.
+        """So many times a demonstration, then one of its transitions, each drawn uniformly.
 
-        Each is drawn when it is asked for, so `rng` may serve between them.
+        Each is drawn when it is asked for, so `rng` may serve between the draws.
 
         Source: Seita et al., ICRA 2021, code of the training loop.
         """
@@ -192,12 +192,12 @@ class Demonstrations:
             episode = int(rng.integers(len(self._episodes)))
             yield episode, int(rng.integers(len(self._episodes[episode].actions)))
 
-    def moment(self, episode: int, t: int) -> Moment:
-        """Moment t of a demonstration; its goal is how the demonstration ended (hindsight)."""
+    def transition(self, episode: int, t: int) -> Transition:
+        """Transition t of a demonstration; its goal is how the demonstration ended (hindsight)."""
         recorded = self._episodes[episode]
         rows = np.load(recorded.path, mmap_mode="r", allow_pickle=False)
         now, end = rows[t], rows[-1]
-        return Moment(
+        return Transition(
             np.array(now["color"]),
             np.array(now["height"]),
             np.array(end["color"]),
@@ -206,10 +206,10 @@ class Demonstrations:
         )
 
     def state(self, episode: int, t: int) -> tuple[np.ndarray, np.ndarray]:
-        """Ground truth (D,) float32 of moment t, and the action (7,) taken there.
+        """Ground truth (D,) float32 before transition t, and its action (7,).
 
         Where the task has a goal, the second half is the goal's state: here that of the
-        demonstration's end (hindsight), as in `moment`.
+        demonstration's end (hindsight), as in `transition`.
         """
         recorded = self._episodes[episode]
         state = recorded.ground_truth[t].copy()

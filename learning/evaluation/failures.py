@@ -27,7 +27,7 @@ import numpy as np
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.bag_opening import BagTask
 from warp_deform.tasks.bag_physics import CARRY, OPEN
-from warp_deform.worlds.loop import SOLVED, Run
+from warp_deform.worlds.loop import SOLVED, EpisodeRun
 from warp_deform.worlds.worlds import Worlds
 
 __all__ = [
@@ -65,7 +65,7 @@ def bag_holds_items(worlds: Worlds, slot: int) -> bool | None:
 
 
 def failure(
-    worlds: Worlds, slot: int, run: Run[Any], openings: Sequence[float | None]
+    worlds: Worlds, slot: int, run: EpisodeRun[Any], openings: Sequence[float | None]
 ) -> str | None:
     """Which of `FAILURES` an episode is that has just ended in a slot; None if it was solved.
 

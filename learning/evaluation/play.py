@@ -12,7 +12,7 @@ from warp_deform.envs.wrappers import stage_at
 from warp_deform.episodes import Goal
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.task import Stage
-from warp_deform.worlds.loop import SOLVED, Run, play
+from warp_deform.worlds.loop import SOLVED, EpisodeRun, play
 from warp_deform.worlds.worlds import Worlds
 
 from ..policy.policy import ImagePolicy, Policy, RetryingPolicy, StatePolicy
@@ -59,7 +59,7 @@ def play_policy(
     goals: Mapping[int, Goal] | None = None,
     *,
     watch: Callable[[int, Mapping[str, np.ndarray], np.ndarray], None] | None = None,
-) -> Iterator[tuple[int, Played, Run[Measured]]]:
+) -> Iterator[tuple[int, Played, EpisodeRun[Measured]]]:
     """Play episodes of a protocol in `worlds`; each is yielded, after its slot, when it is over.
 
     Args:
@@ -69,7 +69,9 @@ def play_policy(
     stages: dict[int, Stage | None] = {}
     players: dict[int, Policy] = {}
 
-    def act(worlds: Worlds, runs: Mapping[int, Run[Measured]]) -> dict[int, np.ndarray | None]:
+    def act(
+        worlds: Worlds, runs: Mapping[int, EpisodeRun[Measured]]
+    ) -> dict[int, np.ndarray | None]:
         """What the policy does in every slot, one picture at a time: no neighbour changes a bit."""
         chosen: dict[int, np.ndarray | None] = {}
         for slot, run in runs.items():
@@ -114,7 +116,7 @@ def play_policy(
         yield slot, played, run
 
 
-def _failed_motion(run: Run[Measured], protocol: Protocol) -> bool:
+def _failed_motion(run: EpisodeRun[Measured], protocol: Protocol) -> bool:
     """Whether an episode is over for an action that the arm could not carry out."""
     unreachable = run.outcomes[-1:] == [Outcome.UNREACHABLE.value]
     return protocol.motions_must_succeed and unreachable

@@ -23,7 +23,7 @@ from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.rendering.pixels import PixelGrid
 from warp_deform.rendering.video import VideoWriter
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.worlds.loop import Run, worlds_for
+from warp_deform.worlds.loop import EpisodeRun, worlds_for
 from warp_deform.worlds.worlds import Worlds
 
 from ..policy.policy import ImagePolicy, load_policy
@@ -167,7 +167,7 @@ def film_episodes(
 def _take(
     worlds: Worlds,
     slot: int,
-    run: Run[Measured],
+    run: EpisodeRun[Measured],
     sights: Sequence[Sight],
     hashes: Sequence[str],
     goal: Goal | None,
@@ -234,7 +234,7 @@ def _essence(played: Played) -> tuple[object, ...]:
 
 
 def _write_video(
-    path: Path, task: str, played: Played, run: Run[Measured], seen: list[Sight]
+    path: Path, task: str, played: Played, run: EpisodeRun[Measured], seen: list[Sight]
 ) -> None:
     total, maps = len(run.actions), any(sight.heat for sight in seen)
     grid = find_task(task).grid

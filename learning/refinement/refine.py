@@ -38,7 +38,7 @@ from warp_deform.robots import robot as find_robot
 from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Action, Task
-from warp_deform.worlds.loop import SOLVED, Run, play, worlds_for
+from warp_deform.worlds.loop import SOLVED, EpisodeRun, play, worlds_for
 from warp_deform.worlds.worlds import Worlds
 
 from .settings import RefineSettings
@@ -242,11 +242,11 @@ class _Searcher:
         self._original, self._config = original, config
         self.origins: list[str] = []
 
-    def act(self, worlds: Worlds, runs: Mapping[int, Run[Step]]) -> dict[int, Action | None]:
+    def act(self, worlds: Worlds, runs: Mapping[int, EpisodeRun[Step]]) -> dict[int, Action | None]:
         """The best action that a search finds, None when the original had no more."""
         return {slot: self._next(worlds, slot, run) for slot, run in runs.items()}
 
-    def _next(self, worlds: Worlds, slot: int, run: Run[Step]) -> Action | None:
+    def _next(self, worlds: Worlds, slot: int, run: EpisodeRun[Step]) -> Action | None:
         t, steps = len(run.actions), self._original.steps
         if t == 0:
             _check_start(self._original, run)
@@ -266,14 +266,14 @@ class _Searcher:
         if not outlooks:
             return None
         best = outlooks[0]
-        if best.solved:  # the search goes by promise, but the score is what counts now
+        if best.solved:  # the search goes by the value of states, but now the score counts
             best = max((o for o in outlooks if o.solved), key=lambda o: (o.grade, o.score))
         same = recorded is not None and best.action.tobytes() == recorded.tobytes()
         self.origins.append(RECORDED if same else best.origin)
         return best.action
 
 
-def _check_start(original: Episode, run: Run[Step]) -> None:
+def _check_start(original: Episode, run: EpisodeRun[Step]) -> None:
     """Raise InputError unless the episode started as it was recorded."""
     start = original.steps[0]
     if not run.rows or (run.rows[0].state_hash, run.rows[0].score) != (
@@ -287,7 +287,7 @@ def _check_start(original: Episode, run: Run[Step]) -> None:
 
 
 def _better(
-    run: Run[Step], before: EpisodeInfo, accept: str, *, enclosed: bool | None = None
+    run: EpisodeRun[Step], before: EpisodeInfo, accept: str, *, enclosed: bool | None = None
 ) -> bool:
     """Whether an episode takes the place of the original.
 

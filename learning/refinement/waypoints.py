@@ -31,7 +31,7 @@ from warp_deform.rollout.rollouts import GripPath
 from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Action, Task
-from warp_deform.worlds.loop import Run, play, worlds_for
+from warp_deform.worlds.loop import EpisodeRun, play, worlds_for
 from warp_deform.worlds.state import WorldState
 from warp_deform.worlds.worlds import Worlds
 
@@ -191,7 +191,7 @@ def _recorded(worlds: Worlds, recording: Recording, seed: int) -> list[tuple[Wor
     """The recorded actions of an episode, and the states they were recorded in."""
     jobs: list[tuple[WorldState, Action]] = []
 
-    def act(worlds: Worlds, runs: Mapping[int, Run[str]]) -> dict[int, Action | None]:
+    def act(worlds: Worlds, runs: Mapping[int, EpisodeRun[str]]) -> dict[int, Action | None]:
         actions = recording.act(worlds, runs)
         for slot, action in actions.items():
             if action is not None:

@@ -27,7 +27,7 @@ from warp_deform.tasks.registry import TASKS
 from ..evaluation.evaluate import wilson
 from ..evaluation.paper_results import PARTIAL_SCORE, SUCCESS, PaperResults, partial_credit
 
-__all__ = ["Cell", "Point", "RunResult", "check_run", "pool", "version_notes"]
+__all__ = ["Cell", "CurvePoint", "RunResult", "check_run", "pool", "version_notes"]
 
 _ALIKE = ("agent", "schedule", "augment", "processes", "device", "patience")
 """Settings that runs of a cell have in common."""
@@ -37,7 +37,7 @@ _VERSIONS = ("warp-deform", "torch")
 
 
 @dataclass(frozen=True)
-class Point:
+class CurvePoint:
     """A value [%] and its standard error [%], after so many steps of training."""
 
     step: int
@@ -105,8 +105,8 @@ class Cell:
     paper_protocol_stage_rule: str | None
     paper: float | None
     failures: dict[str, int]
-    validation: tuple[Point, ...]
-    test: tuple[Point, ...]
+    validation: tuple[CurvePoint, ...]
+    test: tuple[CurvePoint, ...]
 
 
 def pool(runs: Sequence[RunResult], paper: PaperResults) -> list[Cell]:
@@ -259,11 +259,13 @@ def _together(
     return mean, float(np.std(values, ddof=1) / math.sqrt(len(values)))
 
 
-def _curve(snapshots: Sequence[Mapping[str, Mapping[str, Any]]], task: str) -> tuple[Point, ...]:
+def _curve(
+    snapshots: Sequence[Mapping[str, Mapping[str, Any]]], task: str
+) -> tuple[CurvePoint, ...]:
     """Results by step, over the runs that have the step."""
     steps = sorted({int(step) for each in snapshots for step in each})
     points = []
     for step in steps:
         values = [_value(each[str(step)], task) for each in snapshots if str(step) in each]
-        points.append(Point(step, *_together(values)))
+        points.append(CurvePoint(step, *_together(values)))
     return tuple(points)

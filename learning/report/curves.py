@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ..evaluation.paper_results import PaperResults
-from .cells import Cell, Point
+from .cells import Cell, CurvePoint
 
 __all__ = ["draw_curves"]
 
@@ -54,7 +54,7 @@ def _draw_steps(axes: Axes, cells: Sequence[Cell], paper: PaperResults) -> None:
             _band(axes, cell.test, color=color, label=f"{name}: {rule}", style="--")
 
 
-def _band(axes: Axes, points: Sequence[Point], *, color: str, label: str, style: str) -> None:
+def _band(axes: Axes, points: Sequence[CurvePoint], *, color: str, label: str, style: str) -> None:
     steps = [p.step for p in points]
     values = np.array([p.value for p in points])
     errors = np.array([0.0 if p.error is None else p.error for p in points])

@@ -23,7 +23,7 @@ __all__ = ["HeldOut"]
 
 
 class HeldOut:
-    """Every moment of demonstrations that are not learnt from.
+    """Every transition of demonstrations that are not learnt from.
 
     Args:
         agent: whose losses
@@ -35,23 +35,27 @@ class HeldOut:
 
     @torch.no_grad()
     def loss(self, weights: Mapping[str, Tensor]) -> float:
-        """Mean loss [nat] over all moments, as they were recorded, with weights by name."""
+        """Mean loss [nat] over all transitions, as they were recorded, with weights by name."""
         device = next(iter(weights.values())).device
-        moments = [(e, t) for e, length in enumerate(self._data.lengths()) for t in range(length)]
+        transitions = [
+            (e, t) for e, length in enumerate(self._data.lengths()) for t in range(length)
+        ]
         losses = [
-            torch.func.functional_call(self._agent, dict(weights), self._inputs(moment, device))
+            torch.func.functional_call(self._agent, dict(weights), self._inputs(transition, device))
             .total()
             .item()
-            for moment in moments
+            for transition in transitions
         ]
         return float(np.mean(losses))
 
-    def _inputs(self, moment: tuple[int, int], device: torch.device) -> tuple[object, ...]:
+    def _inputs(self, transition: tuple[int, int], device: torch.device) -> tuple[object, ...]:
         rng = np.random.default_rng(0)  # nothing is drawn
         if isinstance(self._agent, Transporter):
-            batch = image_batch(self._data, self._agent, moments=[moment], rng=rng, augment=False)
+            batch = image_batch(
+                self._data, self._agent, transitions=[transition], rng=rng, augment=False
+            )
             return (batch._replace(image=batch.image.to(device)),)
         tensors = state_batch(
-            self._data, self._agent.config.lifts, moments=[moment], rng=rng, augment=False
+            self._data, self._agent.config.lifts, transitions=[transition], rng=rng, augment=False
         )
         return tuple(each.to(device) for each in tensors)

@@ -262,13 +262,15 @@ def _batch(
     device: torch.device,
 ) -> tuple[Any, ...]:
     """Arguments of the agent's losses."""
-    moments = data.drawn(plan.batch, rng)
+    transitions = data.drawn(plan.batch, rng)
     if isinstance(agent, Transporter):
         batch = image_batch(
-            data, agent, moments=moments, rng=rng, augment=augment, mirror=plan.mirror
+            data, agent, transitions=transitions, rng=rng, augment=augment, mirror=plan.mirror
         )
         return (batch._replace(image=batch.image.to(device)),)
-    tensors = state_batch(data, agent.config.lifts, moments=moments, rng=rng, augment=augment)
+    tensors = state_batch(
+        data, agent.config.lifts, transitions=transitions, rng=rng, augment=augment
+    )
     return tuple(each.to(device) for each in tensors)
 
 

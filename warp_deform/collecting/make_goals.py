@@ -15,7 +15,7 @@ from ..errors import InputError, WarpDeformError
 from ..support.progress import progress_bar
 from ..tasks.registry import task as find_task
 from ..tasks.task import Task
-from ..worlds.loop import SLOTS, Run, play
+from ..worlds.loop import SLOTS, EpisodeRun, play
 from ..worlds.worlds import Worlds
 from .collect import CollectConfig, collect
 from .folder import Attempt, Collection, append_attempt, check_seeds
@@ -119,12 +119,12 @@ def _construct(name: str, out: Path, seeds: range, robot: str) -> None:
     rebuild_index(out)
 
 
-def _rest(worlds: Worlds, runs: Mapping[int, Run[Step]]) -> dict[int, np.ndarray | None]:
+def _rest(worlds: Worlds, runs: Mapping[int, EpisodeRun[Step]]) -> dict[int, np.ndarray | None]:
     """Do nothing."""
     return dict.fromkeys(runs)
 
 
-def _goal_episode(worlds: Worlds, slot: int, run: Run[Step], task: Task) -> Episode:
+def _goal_episode(worlds: Worlds, slot: int, run: EpisodeRun[Step], task: Task) -> Episode:
     """A slot's state as a goal of the task: one row, at which it is done."""
     made = record(worlds, slot, run, demonstrator=CONSTRUCTED)
     goal = worlds.as_goal(slot, kind=CONSTRUCTED)

@@ -12,7 +12,7 @@ from ..episodes.enclosed import ENCLOSED
 from ..tasks.registry import FURTHER_TASKS, TASKS, task_name
 from ..tasks.registry import task as find_task
 from ..tasks.task import Task
-from ..worlds.loop import SOLVED, Run
+from ..worlds.loop import SOLVED, EpisodeRun
 from ..worlds.worlds import Worlds
 
 __all__ = ["GOAL_TARGETS", "observe", "origin", "record", "recorded_task", "task_config"]
@@ -49,7 +49,7 @@ def observe(worlds: Worlds, slot: int) -> Step:
     )
 
 
-def record(worlds: Worlds, slot: int, run: Run[Step], *, demonstrator: str) -> Episode:
+def record(worlds: Worlds, slot: int, run: EpisodeRun[Step], *, demonstrator: str) -> Episode:
     """The episode that has just ended in a slot; `run` holds a row for every state."""
     rows = [
         replace(row, action=action, outcome=outcome)

@@ -14,7 +14,7 @@ from ..episodes import Episode, EpisodeReader, Goal, Step, cpu_fingerprint, vers
 from ..errors import InputError
 from ..support.progress import progress_bar
 from ..tasks.registry import task as find_task
-from ..worlds.loop import SLOTS, Run, play, worlds_for
+from ..worlds.loop import SLOTS, EpisodeRun, play, worlds_for
 from ..worlds.worlds import Worlds
 from .goals import CONSTRUCTED, at_goal
 from .recording import recorded_task
@@ -99,7 +99,9 @@ class Recording:
         own = goal is not None and goal.kind == CONSTRUCTED and goal.seed == seed
         return None if own else goal
 
-    def act(self, worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, np.ndarray | None]:
+    def act(
+        self, worlds: Worlds, runs: Mapping[int, EpisodeRun[Any]]
+    ) -> dict[int, np.ndarray | None]:
         """The recorded actions, one after the other."""
         return {
             slot: self._episode(run.seed).steps[len(run.actions)].action

@@ -15,7 +15,7 @@ from ..planning.demonstrators import demonstrator as find_demonstrator
 from ..rendering.scene_view import ArmMeshes, SceneView
 from ..tasks.task import Action, Task
 from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
-from ..worlds.loop import Run
+from ..worlds.loop import EpisodeRun
 from ..worlds.spaces import action_space, check_action, information, observation, observation_space
 from ..worlds.worlds import Worlds
 from .reset_options import check_options, goal_for, next_seed
@@ -82,7 +82,7 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         goals = {} if given is None else {0: goal_for(self.task, given, seed=number)}
         self._running = False
         self.worlds.reset({0: number}, goals=goals)
-        self._run = Run[Any](number, episode_rng(number, DEMONSTRATOR_STREAM))
+        self._run = EpisodeRun[Any](number, episode_rng(number, DEMONSTRATOR_STREAM))
         self._score = self.worlds.score(0)
         self._running = True
         return observation(self.worlds, 0), information(self.worlds, 0, outcome=None)

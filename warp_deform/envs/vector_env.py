@@ -17,7 +17,7 @@ from ..planning.demonstrators import demonstrator as find_demonstrator
 from ..support.checked import real_array
 from ..tasks.task import Action, Task
 from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
-from ..worlds.loop import Run
+from ..worlds.loop import EpisodeRun
 from ..worlds.spaces import action_space, check_action, information, observation, observation_space
 from ..worlds.worlds import Worlds
 from .env import WorldsView, check_render_mode, ending
@@ -81,7 +81,7 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         """(num_envs,) bool: which episodes are over and wait for their reset."""
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._scores = np.zeros(num_envs)
-        self._runs: dict[int, Run[Any]] = {}
+        self._runs: dict[int, EpisodeRun[Any]] = {}
         self._view = WorldsView(self.worlds)
 
     @property
@@ -206,7 +206,7 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         made = {i: goal_for(self.task, goal, seed=numbers[i]) for i, goal in goals.items()}
         self.worlds.reset(numbers, goals=made)
         for i, number in numbers.items():
-            self._runs[i] = Run(number, episode_rng(number, DEMONSTRATOR_STREAM))
+            self._runs[i] = EpisodeRun(number, episode_rng(number, DEMONSTRATOR_STREAM))
             self._scores[i] = self.worlds.score(i)
             self.ended[i] = False
 

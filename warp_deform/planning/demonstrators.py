@@ -13,7 +13,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..tasks.task import Action
-from ..worlds.loop import SLOTS, Act, Run
+from ..worlds.loop import SLOTS, Act, EpisodeRun
 from ..worlds.spaces import action_space
 from ..worlds.worlds import Worlds
 from . import Lookahead, Outlook, SearchConfig, lookahead_for, search
@@ -40,18 +40,18 @@ def demonstrator(name: str) -> Act[Any]:
     return DEMONSTRATORS[name]
 
 
-def _scripted(worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, Action | None]:
+def _scripted(worlds: Worlds, runs: Mapping[int, EpisodeRun[Any]]) -> dict[int, Action | None]:
     """What the task's scripted demonstrator does next, in every slot."""
     return _each(worlds, runs, worlds.task.demonstrate)
 
 
-def _visible(worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, Action | None]:
+def _visible(worlds: Worlds, runs: Mapping[int, EpisodeRun[Any]]) -> dict[int, Action | None]:
     """What the task's visible demonstrator does next, in every slot."""
     return _each(worlds, runs, worlds.task.demonstrate_visible)
 
 
 def _each(
-    worlds: Worlds, runs: Mapping[int, Run[Any]], choose: Callable[..., Action | None]
+    worlds: Worlds, runs: Mapping[int, EpisodeRun[Any]], choose: Callable[..., Action | None]
 ) -> dict[int, Action | None]:
     episodes = worlds.episodes
     return {
@@ -60,7 +60,7 @@ def _each(
     }
 
 
-def _mpc(worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, Action | None]:
+def _mpc(worlds: Worlds, runs: Mapping[int, EpisodeRun[Any]]) -> dict[int, Action | None]:
     """The candidate with the best outlook in every slot; of equals the one proposed first.
 
     Where even the best would end the episode with an item outside of the bag, more are tried.
@@ -77,7 +77,7 @@ def _mpc(worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, Action | Non
 
 
 def _outlooks(
-    worlds: Worlds, runs: Mapping[int, Run[Any]], count: int
+    worlds: Worlds, runs: Mapping[int, EpisodeRun[Any]], count: int
 ) -> Iterator[tuple[int, Outlook]]:
     """Slots and what up to `count` candidates lead to there."""
     slots, jobs = [], []
@@ -88,7 +88,7 @@ def _outlooks(
     return zip(slots, _lookahead(worlds).try_each(jobs), strict=True)
 
 
-def _candidates(worlds: Worlds, slot: int, run: Run[Any], count: int) -> list[Action]:
+def _candidates(worlds: Worlds, slot: int, run: EpisodeRun[Any], count: int) -> list[Action]:
     """Different candidates of the task that the environments allow, at most `count`."""
     episode = worlds.episodes[slot]
     proposed = worlds.task.candidates(episode.layout, episode.snapshot, run.rng, count)
@@ -99,7 +99,7 @@ def _candidates(worlds: Worlds, slot: int, run: Run[Any], count: int) -> list[Ac
 def planner(config: SearchConfig) -> Act[Any]:
     """Who takes, in every slot, the best action of a search."""
 
-    def act(worlds: Worlds, runs: Mapping[int, Run[Any]]) -> dict[int, Action | None]:
+    def act(worlds: Worlds, runs: Mapping[int, EpisodeRun[Any]]) -> dict[int, Action | None]:
         chosen: dict[int, Action | None] = {}
         for slot, run in runs.items():
             state = worlds.state(slot)

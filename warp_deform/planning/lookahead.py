@@ -28,12 +28,12 @@ class Outlook:
     Attributes:
         grade: 4 solved, 3 solved but an item is not enclosed (`Task.enclosed`), 2 placed, 1 nothing
             moved, 0 not to be trusted or the episode over without success
-        promise: of the task for the state that the action leaves; greater is better
+        state_value: of the task for the state that the action leaves; greater is better
     """
 
     action: Action
     grade: int
-    promise: float
+    state_value: float
     score: float
     after: WorldState | None
     """The state that the action leaves, where it was asked for."""
@@ -43,7 +43,7 @@ class Outlook:
     @property
     def rank(self) -> tuple[int, float]:
         """Orders outlooks; the greater the better."""
-        return self.grade, self.promise
+        return self.grade, self.state_value
 
     @property
     def done(self) -> bool:
@@ -117,9 +117,9 @@ class Lookahead:
         if outcome is Outcome.INVALID:
             return Outlook(action, 0, -math.inf, 0.0, None)
         episode = worlds.episodes[slot]
-        promise = float(worlds.task.promise(episode.layout, episode.snapshot))
-        if not math.isfinite(promise):
-            raise WarpDeformError(f"{worlds.task.name}: the promise of a state is {promise}")
+        state_value = float(worlds.task.state_value(episode.layout, episode.snapshot))
+        if not math.isfinite(state_value):
+            raise WarpDeformError(f"{worlds.task.name}: the value of a state is {state_value}")
         if outcome is not Outcome.PLACED:
             grade = 1
         elif worlds.solved(slot):
@@ -127,7 +127,7 @@ class Lookahead:
         else:
             grade = 0 if episode.ended else 2
         after = worlds.state(slot) if keep else None
-        return Outlook(action, grade, promise, worlds.score(slot), after)
+        return Outlook(action, grade, state_value, worlds.score(slot), after)
 
 
 @functools.lru_cache(maxsize=2)

@@ -20,7 +20,7 @@ from ..robots.primitive import LIFT, Motion, solve_joints
 from ..rollout.rollouts import GripPath, rollout
 from ..support.quaternion import quat_from_yaw
 from ..tasks.task import Action, Task
-from ..worlds.episode import ALOFT_EVERY, Carry, Plan
+from ..worlds.episode import ALOFT_EVERY, Carry, Execution
 from ..worlds.state import WorldState
 from ..worlds.worlds import CALM, RETREAT_LEAST, Worlds
 from .descent import Descent
@@ -128,9 +128,9 @@ class WayPoints:
             episode.problems += runs[slot].watch.problems(slot, worlds.solver.config.limits)
             if not episode.physics_ok:
                 continue
-            plan = Plan(jobs[slot][1])
-            plan.placed(runs[slot], carries[slot], paths[slot])
-            episode.history += (plan.past(plan.outcome),)
+            execution = Execution(jobs[slot][1])
+            execution.placed(runs[slot], carries[slot], paths[slot])
+            episode.history += (execution.past(execution.outcome),)
             worlds.restore(slot, worlds.state(slot))  # which looks at where it ended
             end = worlds.episodes[slot].snapshot
             before = jobs[slot][0].episode

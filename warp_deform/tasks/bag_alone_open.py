@@ -77,7 +77,7 @@ class BagAloneOpen(BagTask):
         """Pulls of several beads."""
         return self.pulls(layout, snapshot, rng, count)
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """The opening, less how far the beads are from where they should be."""
         return self.opening(snapshot) - 0.5 * self.map_distance(layout, snapshot)
 

@@ -195,7 +195,7 @@ class BagColorGoal(BagTask):
             actions = [action for action in draws if action is not None]
         return actions + self.pulls(layout, snapshot, rng, count - len(actions))
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """The score, then how far the target bag is open."""
         opened = self.opening(snapshot) - 0.5 * self.map_distance(layout, snapshot)
         return 2.0 * self.score(layout, snapshot) + opened

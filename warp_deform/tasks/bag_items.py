@@ -223,7 +223,7 @@ class BagItems1(BagTask):
             actions = [action for action in draws if action is not None]
         return actions + self.pulls(layout, snapshot, rng, count - len(actions))
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """Solved with every item enclosed, else solved; items in the bag; how far it is open."""
         if self.solved(layout, snapshot):
             return 10.0 if self.enclosed(layout, snapshot) else 5.0

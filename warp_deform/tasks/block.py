@@ -85,7 +85,7 @@ class BlockNotarget(Task):
             return None
         return pick_place_pose(pick, self._pose(snapshot), layout.targets, stage=self.stages[0])
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """The score, less the distance from the target [m] and the turn from it [rad] by 100."""
         distance, turn = pose_error(self._pose(snapshot), layout.targets)
         return self.score(layout, snapshot) - distance - turn / 100

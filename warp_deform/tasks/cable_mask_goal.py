@@ -206,7 +206,7 @@ class CableMaskGoal(Task):
         inside = np.flatnonzero(long & (y <= inner - r))
         return len(inside) > 0 and bool((np.diff(inside) == 1).all())
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """Score, less the beads' mean distance from their targets the better way round."""
         q = snapshot.particle_q[:, :2]
         ways = np.stack([layout.targets, layout.targets[::-1]])

@@ -110,7 +110,7 @@ class CableRing(Task):
         drawn = [scripted, *others[:_FAR_BEADS]]
         return drawn + self._outward(snapshot, count - len(drawn))
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """Share of the circle that is spanned, less half the beads' mean distance in radii."""
         _, distances = self._mapped(layout, snapshot)
         return self.score(layout, snapshot) - 0.5 * float(distances.mean()) / self.cable.ring_radius

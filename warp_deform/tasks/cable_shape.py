@@ -115,7 +115,7 @@ class CableShape(Task):
             drawn += [move for _, move in itertools.islice(moves, (count + 1) // 2)]
         return drawn[:count]
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """Share in the zone, less the beads' mean distance with the cable the better way round."""
         ways = np.stack([layout.targets, layout.targets[::-1]])
         distances = np.linalg.norm(snapshot.particle_q[:, :2] - ways, axis=2).mean(axis=1)

@@ -126,7 +126,7 @@ class FabricCover(Task):
                 drawn += self._folds(snapshot, rng, far).values()
         return [action for action in drawn[:count] if on_table(action[3:5])]
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """Share of the cube's face that is hidden, less its distance from the fabric's centre."""
         seen = np.count_nonzero(snapshot.images.segmentation == snapshot.segments[0][0])
         face = np.prod(self.cube.parts[0].size[:2]) / PIXEL_SIZE**2

@@ -150,7 +150,7 @@ class FabricFlat(Task):
             drawn += self._pulls(layout, snapshot, overshoot).values()
         return drawn[:count]
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """Coverage, less the corners' mean distance from their places [m]."""
         mean = self._distances(layout, snapshot).mean(axis=1).min()
         return self.score(layout, snapshot) - float(mean)

@@ -259,7 +259,7 @@ class Task(abc.ABC):
         drawn = [self.demonstrate_visible(layout, snapshot, rng) for _ in range(count)]
         return [action for action in drawn if action is not None]
 
-    def promise(self, layout: Layout, snapshot: Snapshot) -> float:
+    def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """How good a state is to go on from; `mpc` takes the action whose outcome has the most."""
         return self.score(layout, snapshot)
 

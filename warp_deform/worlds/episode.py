@@ -1,4 +1,4 @@
-"""An episode while it runs: its state, the plan of its present action, and what came of it."""
+"""An episode while it runs: its state, the execution of its present action, and what came of it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = [
     "DEMONSTRATOR_STREAM",
     "LAYOUT_STREAM",
     "Carry",
-    "Plan",
+    "Execution",
     "RunningEpisode",
     "StepReport",
     "aloft",
@@ -109,8 +109,8 @@ class StepReport:
 
 
 @dataclass(eq=False)
-class Plan:
-    """What becomes of one action while it is carried out."""
+class Execution:
+    """One action while it is carried out: what was done so far, and what came of it."""
 
     action: np.ndarray
     outcome: Outcome = Outcome.UNREACHABLE

@@ -14,7 +14,7 @@ from ..robots.primitive import Motion, Outcome
 from ..rollout.rollouts import rollout
 from ..tasks.task import Task
 from ..xpbd.fused_xpbd import FusedXPBD
-from .episode import Plan, episode_rng
+from .episode import Execution, episode_rng
 
 __all__ = ["jaw_step"]
 
@@ -36,34 +36,37 @@ class JawWorlds(Protocol):
     def solver(self) -> FusedXPBD:
         """What runs them."""
 
-    def reachable(self, plans: Mapping[int, Plan], motions: Mapping[int, Motion]) -> list[int]:
+    def reachable(
+        self, executions: Mapping[int, Execution], motions: Mapping[int, Motion]
+    ) -> list[int]:
         """Slots whose arm gets along its motion; notes the others' outcome."""
 
 
-def jaw_step(worlds: JawWorlds, plans: Mapping[int, Plan], record: float) -> None:
-    """Run the plans' actions; notes outcomes, runs and motions in them."""
+def jaw_step(worlds: JawWorlds, executions: Mapping[int, Execution], record: float) -> None:
+    """Carry out actions; notes outcomes, rollouts and motions in their executions."""
     config, chain = worlds.task.jaw, worlds.objects[0]
     assert config is not None and isinstance(chain, Cable), "a jaw takes a chain"
     episodes, solver = worlds.episodes, worlds.solver
     motions = {
-        slot: jaw_motion(episodes[slot].tip, plan.action, config) for slot, plan in plans.items()
+        slot: jaw_motion(episodes[slot].tip, execution.action, config)
+        for slot, execution in executions.items()
     }
-    moving = worlds.reachable(plans, motions)
+    moving = worlds.reachable(executions, motions)
     jaws, scripts = {}, {}
     for slot in moving:
         rng = episode_rng(episodes[slot].seed, _STREAM + len(episodes[slot].actions))
-        action = config.disturbed(plans[slot].action, rng)
+        action = config.disturbed(executions[slot].action, rng)
         jaws[slot] = Jaw(solver, slot, chain, config.fingers, rng=rng)
         scripts[slot] = jaw_script(jaws[slot], action, config)
     for slot, (outcome, run) in run_scripts(solver, jaws, scripts, config, record=record).items():
         jaws[slot].reset()
-        plans[slot].outcome = outcome
-        plans[slot].held = 0 if outcome is Outcome.PLACED else None  # the chain
-        plans[slot].runs.append(run)
+        executions[slot].outcome = outcome
+        executions[slot].held = 0 if outcome is Outcome.PLACED else None  # the chain
+        executions[slot].runs.append(run)
     if not moving:
         return
     runs = rollout(solver, moving, least=_REST, most=_REST + worlds.rest_limit, record=record)
     for slot in moving:
-        plans[slot].runs.append(runs[slot])
+        executions[slot].runs.append(runs[slot])
         episodes[slot].at_rest = runs[slot].at_rest
         episodes[slot].tip = np.array(motions[slot].way_points[-1])

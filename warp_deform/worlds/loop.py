@@ -19,18 +19,18 @@ from ..tasks.task import Task
 from .episode import DEMONSTRATOR_STREAM, episode_rng
 from .worlds import Worlds
 
-__all__ = ["SLOTS", "SOLVED", "Act", "Run", "play", "worlds_for"]
+__all__ = ["SLOTS", "SOLVED", "Act", "EpisodeRun", "play", "worlds_for"]
 
 Row = TypeVar("Row")
 
 SLOTS = 8
 """Episodes that run side by side in one process: one group of SIMD lanes."""
 SOLVED = "solved"
-"""What `Run.ended` says of an episode that reached its task's success."""
+"""What `EpisodeRun.ended` says of an episode that reached its task's success."""
 
 
 @dataclass(eq=False)
-class Run(Generic[Row]):
+class EpisodeRun(Generic[Row]):
     """One episode as it goes.
 
     Attributes:
@@ -48,7 +48,7 @@ class Run(Generic[Row]):
     ended: str | None = None
 
 
-Act = Callable[[Worlds, Mapping[int, Run[Row]]], Mapping[int, np.ndarray | None]]
+Act = Callable[[Worlds, Mapping[int, EpisodeRun[Row]]], Mapping[int, np.ndarray | None]]
 """Next action (7,) of every running slot, or None for a slot whose episode is to end."""
 
 
@@ -74,7 +74,7 @@ def play(
     look: Callable[[Worlds, int], Row],
     goals: Callable[[int], Goal | None] | None = None,
     until_solved: bool = True,
-) -> Iterator[tuple[int, Run[Row]]]:
+) -> Iterator[tuple[int, EpisodeRun[Row]]]:
     """Play the episodes of `seeds` and yield each, with its slot, the moment it is over.
 
     A slot whose episode is over gets the next seed, so lanes stay full; the slot still shows the
@@ -90,11 +90,11 @@ def play(
     """
     waiting = iter(seeds)
     free = list(range(worlds.count))
-    running: dict[int, Run[Row]] = {}
+    running: dict[int, EpisodeRun[Row]] = {}
     while True:
         # zip asks `free` first, so no seed is lost when the slots run out
         new = {
-            slot: Run[Row](seed, episode_rng(seed, DEMONSTRATOR_STREAM))
+            slot: EpisodeRun[Row](seed, episode_rng(seed, DEMONSTRATOR_STREAM))
             for slot, seed in zip(free, waiting, strict=False)
         }
         free = free[len(new) :]
@@ -124,7 +124,7 @@ def play(
 
 def _start(
     worlds: Worlds,
-    new: Mapping[int, Run[Row]],
+    new: Mapping[int, EpisodeRun[Row]],
     goals: Callable[[int], Goal | None] | None,
 ) -> None:
     """Reset the slots of `new`; a seed without a valid start ends its own run alone."""
@@ -147,7 +147,7 @@ def _start(
 def _see(
     worlds: Worlds,
     slot: int,
-    run: Run[Row],
+    run: EpisodeRun[Row],
     look: Callable[[Worlds, int], Row],
     until_solved: bool,
 ) -> None:

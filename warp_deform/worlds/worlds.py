@@ -32,7 +32,7 @@ from .episode import (
     ALOFT_EVERY,
     LAYOUT_STREAM,
     Carry,
-    Plan,
+    Execution,
     RunningEpisode,
     StepReport,
     episode_rng,
@@ -255,61 +255,61 @@ class Worlds:
             actions: (7,) each, pick x, y [m], yaw [rad], place x, y, yaw, lift [m]; finite
             record: interval of recorded frames [s]; 0 records nothing.
         """
-        plans = {slot: self._checked(slot, action) for slot, action in actions.items()}
+        executions = {slot: self._checked(slot, action) for slot, action in actions.items()}
         if self.task.jaw is None:
-            self._approach(plans, record)
-            self._carry(plans, record)
+            self._approach(executions, record)
+            self._carry(executions, record)
         else:
-            jaw_step(self, plans, record)
+            jaw_step(self, executions, record)
         limits = self.solver.config.limits
         reports = {}
-        for slot, plan in plans.items():
+        for slot, execution in executions.items():
             episode = self.episodes[slot]
-            for run in plan.runs:
+            for run in execution.runs:
                 episode.sim_seconds += run.seconds
                 episode.problems += run.watch.problems(slot, limits)
-            outcome = plan.outcome if episode.physics_ok else Outcome.INVALID
-            episode.history += (plan.past(outcome),)
+            outcome = execution.outcome if episode.physics_ok else Outcome.INVALID
+            episode.history += (execution.past(outcome),)
             self._look(slot)
             episode.judge(self.task)
-            reports[slot] = plan.report(outcome, recorded=record > 0)
+            reports[slot] = execution.report(outcome, recorded=record > 0)
         return reports
 
-    def _checked(self, slot: int, action: np.ndarray) -> Plan:
+    def _checked(self, slot: int, action: np.ndarray) -> Execution:
         action = real_array(action, (7,), name=f"action of slot {slot}", finite=True)
         if slot not in self.episodes:
             raise InputError(f"slot {slot} has no episode: reset it first")
         self.episodes[slot].over |= self.episodes[slot].ended
-        return Plan(action)
+        return Execution(action)
 
-    def _approach(self, plans: Mapping[int, Plan], record: float) -> None:
+    def _approach(self, executions: Mapping[int, Execution], record: float) -> None:
         """Move the tips over the pick points and down to what they meet there."""
         config = self.task.primitive
         motions = {}
-        for slot, plan in plans.items():
-            pick = plan.action[:3]
-            grasp = plan.grasp(self.task, self.episodes[slot].snapshot)
+        for slot, execution in executions.items():
+            pick = execution.action[:3]
+            grasp = execution.grasp(self.task, self.episodes[slot].snapshot)
             hover = self.robot.hover_height(pick[0], pick[1], config.hover)
             height = grasp.height if grasp else 0.0
             motions[slot] = approach(self.episodes[slot].tip, pick, hover, height, config)
-        moving = self.reachable(plans, motions)
+        moving = self.reachable(executions, motions)
         waits = {slot: motions[slot].seconds for slot in moving}
         runs = rollout(self.solver, moving, least=1e3, most=waits, record=record)
         for slot in moving:
-            plan = plans[slot]
-            plan.runs.append(runs[slot])
-            plan.outcome = Outcome.MISSED
+            execution = executions[slot]
+            execution.runs.append(runs[slot])
+            execution.outcome = Outcome.MISSED
             above = motions[slot].way_points[-2]
             self.episodes[slot].tip = above
             self._look(slot)
 
-    def _carry(self, plans: Mapping[int, Plan], record: float) -> None:
+    def _carry(self, executions: Mapping[int, Execution], record: float) -> None:
         """Lift, carry and let go what the tips hold, and let the worlds come to rest."""
-        carries = self._carries(plans)
+        carries = self._carries(executions)
         motions, paths = {}, {}
         for slot, carried in carries.items():
-            motions[slot], paths[slot] = carried(plans[slot].action)
-        moving = self.reachable(plans, motions)
+            motions[slot], paths[slot] = carried(executions[slot].action)
+        moving = self.reachable(executions, motions)
         if not moving:
             return
         runs = rollout(
@@ -322,16 +322,20 @@ class Worlds:
             record=record or (ALOFT_EVERY if self.task.looks_aloft else 0.0),
         )
         for slot in moving:
-            plans[slot].placed(runs[slot], carries[slot], paths[slot])
+            executions[slot].placed(runs[slot], carries[slot], paths[slot])
             self.episodes[slot].at_rest = runs[slot].at_rest
             self.episodes[slot].tip = motions[slot].way_points[-1]
 
-    def _carries(self, plans: Mapping[int, Plan]) -> dict[int, Carry]:
+    def _carries(self, executions: Mapping[int, Execution]) -> dict[int, Carry]:
         """How the tips that have reached something would carry it, by slot."""
         radii, carries = self.solver.data.topologies[0].particle_radius, {}
-        for slot, plan in plans.items():
+        for slot, execution in executions.items():
             snapshot = self.episodes[slot].snapshot
-            grasp = plan.grasp(self.task, snapshot) if plan.outcome is Outcome.MISSED else None
+            grasp = (
+                execution.grasp(self.task, snapshot)
+                if execution.outcome is Outcome.MISSED
+                else None
+            )
             if grasp is not None:
                 carries[slot] = Carry(grasp, self.task, self.robot, snapshot, radii)
         return carries
@@ -341,19 +345,21 @@ class Worlds:
 
         Slots whose tip takes nothing, or cannot go there, are left out.
         """
-        plans = {slot: self._checked(slot, action) for slot, action in actions.items()}
-        self._approach(plans, 0.0)
-        return self._carries(plans)
+        executions = {slot: self._checked(slot, action) for slot, action in actions.items()}
+        self._approach(executions, 0.0)
+        return self._carries(executions)
 
-    def reachable(self, plans: Mapping[int, Plan], motions: Mapping[int, Motion]) -> list[int]:
+    def reachable(
+        self, executions: Mapping[int, Execution], motions: Mapping[int, Motion]
+    ) -> list[int]:
         """Slots whose motion the arm can make; notes motions, joints and what is out of reach."""
         postures = [self.episodes[slot].posture for slot in motions]
         joints = solve_joints(self.robot, list(motions.values()), postures)
         for (slot, motion), q in zip(motions.items(), joints, strict=True):
-            plans[slot].motions.append(motion)
-            plans[slot].joints.append(q)
+            executions[slot].motions.append(motion)
+            executions[slot].joints.append(q)
             if q is None:
-                plans[slot].outcome = Outcome.UNREACHABLE
+                executions[slot].outcome = Outcome.UNREACHABLE
             else:
                 self.episodes[slot].posture = q[-1]
         return [slot for slot, q in zip(motions, joints, strict=True) if q is not None]

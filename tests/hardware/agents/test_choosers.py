@@ -168,10 +168,10 @@ def test_a_planner_prefers_a_straight_chain_beside_its_goal_to_a_kinked_one_on_i
     kinked[60:, 1] -= 30 * 5e-3  # and on from there
     distances = [np.linalg.norm(q[:, :2] - targets, axis=1).mean() for q in (beside, kinked)]
     beside += [np.diff(distances)[0], 0.0, 0.0]
-    promises = [task.promise(layout, still_chain(q)) for q in (beside, kinked)]
+    values = [task.state_value(layout, still_chain(q)) for q in (beside, kinked)]
     scores = [task.score(layout, still_chain(q)) for q in (beside, kinked)]
     assert scores[0] < scores[1], "the kinked one lies half on the goal"
-    assert promises[0] - scores[0] > promises[1] - scores[1] + 0.1
+    assert values[0] - scores[0] > values[1] - scores[1] + 0.1
 
 
 def test_fingers_need_room_beside_the_strand() -> None:

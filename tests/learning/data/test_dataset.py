@@ -34,13 +34,15 @@ def test_a_moment_is_what_was_recorded_and_its_goal_the_end(folder: Path) -> Non
     for episode, seed in enumerate(data.seeds):
         recorded = EpisodeReader(folder).read(seed)
         for t in range(2):
-            moment = data.moment(episode, t)
-            assert (moment.color == recorded.steps[t].color).all()
-            assert (moment.height == recorded.steps[t].height).all()
-            assert (moment.goal_color == recorded.steps[-1].color).all()
-            assert (moment.goal_height == recorded.steps[-1].height).all()
-            assert np.abs(moment.height - block_episode(seed).steps[t].height).max() < HEIGHT_UNIT
-            assert (moment.action == recorded.steps[t].action).all()
+            transition = data.transition(episode, t)
+            assert (transition.color == recorded.steps[t].color).all()
+            assert (transition.height == recorded.steps[t].height).all()
+            assert (transition.goal_color == recorded.steps[-1].color).all()
+            assert (transition.goal_height == recorded.steps[-1].height).all()
+            assert (
+                np.abs(transition.height - block_episode(seed).steps[t].height).max() < HEIGHT_UNIT
+            )
+            assert (transition.action == recorded.steps[t].action).all()
 
 
 def test_the_goal_in_a_state_is_the_end_too(folder: Path) -> None:
@@ -59,17 +61,17 @@ def test_a_task_without_goal_keeps_its_state(tmp_path: Path) -> None:
 
 def test_the_cache_follows_the_episodes(tmp_path: Path) -> None:
     write_demonstrations(tmp_path, 2)
-    before = Demonstrations(tmp_path, task=TASK).moment(0, 0)
+    before = Demonstrations(tmp_path, task=TASK).transition(0, 0)
     cached = sorted((tmp_path / "rows").iterdir())
     cached[0].write_bytes(cached[0].read_bytes()[:100])  # cut short
-    assert (Demonstrations(tmp_path, task=TASK).moment(0, 0).color == before.color).all()
+    assert (Demonstrations(tmp_path, task=TASK).transition(0, 0).color == before.color).all()
     (tmp_path / "episode_000000000.parquet").unlink()
     EpisodeWriter(tmp_path).write(with_info(block_episode(7), seed=0))
-    after = Demonstrations(tmp_path, task=TASK).moment(0, 0)
+    after = Demonstrations(tmp_path, task=TASK).transition(0, 0)
     assert (after.color == block_episode(7).steps[0].color).all()
 
 
-def test_moments_are_drawn_uniformly_over_episodes_then_steps(tmp_path: Path) -> None:
+def test_transitions_are_drawn_uniformly_over_episodes_then_steps(tmp_path: Path) -> None:
     writer = EpisodeWriter(tmp_path)
     for seed, actions in ((0, 1), (1, 4)):
         writer.write(block_episode(seed, actions=actions))
@@ -170,7 +172,7 @@ def test_pictures_stay_on_the_disk(tmp_path: Path) -> None:
     before = _resident()
     for episode in range(40):
         for t in range(4):
-            data.moment(episode, t)
+            data.transition(episode, t)
     assert _resident() - before < 20e6
 
 

@@ -39,7 +39,7 @@ from warp_deform.episodes import EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
 from warp_deform.tasks.bag_items import BagItems1
 from warp_deform.tasks.cable_line import CableLineNotarget
-from warp_deform.worlds.loop import Run
+from warp_deform.worlds.loop import EpisodeRun
 
 TASK = "cable-line-notarget"
 SCHEDULE = Schedule(steps=2, batch=4, lr=1e-3, snapshots=2)
@@ -368,7 +368,7 @@ def test_failures_of_bags(
     snapshot = SimpleNamespace(body_q=np.zeros((1, 7)))
     episode = SimpleNamespace(physics_ok=True, snapshot=snapshot, layout=None)
     worlds: Any = SimpleNamespace(task=task, episodes={0: episode})
-    run: Run[Any] = Run(0, np.random.default_rng(0))
+    run: EpisodeRun[Any] = EpisodeRun(0, np.random.default_rng(0))
     run.actions = [action((0.3, 0.1 * n), (0.6, 0.0), lift) for n, lift in enumerate(lifts)]
     run.outcomes, run.ended = outcomes, "not solved"
     assert failure(worlds, 0, run, openings) == expected and expected in FAILURES
@@ -383,7 +383,7 @@ def test_failures_without_a_bag() -> None:
     episode = SimpleNamespace(physics_ok=True, snapshot=None, layout=None)
     worlds: Any = SimpleNamespace(task=CableLineNotarget(), episodes={0: episode})
     assert bag_opening(worlds, 0) is None and bag_holds_items(worlds, 0) is None
-    run: Run[Any] = Run(0, np.random.default_rng(0))
+    run: EpisodeRun[Any] = EpisodeRun(0, np.random.default_rng(0))
     run.actions, run.outcomes = [THERE, BACK, THERE], ["placed"] * 3
     run.ended = "not solved in 3 actions"
     assert failure(worlds, 0, run, [None] * 4) == "back and forth"

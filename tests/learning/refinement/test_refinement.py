@@ -26,7 +26,7 @@ from warp_deform.planning import SearchConfig
 from warp_deform.planning.waypoints import WayPointConfig, WayPoints
 from warp_deform.tasks.registry import TASKS
 from warp_deform.tasks.task import Task
-from warp_deform.worlds.loop import SOLVED, Run, worlds_for
+from warp_deform.worlds.loop import SOLVED, EpisodeRun, worlds_for
 
 SEARCH = SearchConfig(method="cem", depth=1, budget=24, candidates=8)
 
@@ -206,8 +206,8 @@ def test_the_command_reports_in_json(
 # -- which episode is better
 
 
-def _played(score: float, actions: int, ended: str = SOLVED) -> Run[Any]:
-    run: Run[Any] = Run(0, np.random.default_rng(0))
+def _played(score: float, actions: int, ended: str = SOLVED) -> EpisodeRun[Any]:
+    run: EpisodeRun[Any] = EpisodeRun(0, np.random.default_rng(0))
     run.rows = [SimpleNamespace(score=score)] * (actions + 1)
     run.actions, run.ended = [np.zeros(7)] * actions, ended
     return run

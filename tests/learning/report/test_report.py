@@ -17,7 +17,7 @@ from learning.evaluation.evaluate import summarise
 from learning.evaluation.paper_results import read_paper
 from learning.evaluation.play import Played
 from learning.policy.policy import AGENTS
-from learning.report.cells import Point, pool, version_notes
+from learning.report.cells import CurvePoint, pool, version_notes
 from learning.report.curves import draw_curves
 from learning.report.read import read_runs
 from learning.report.report import write_report
@@ -135,7 +135,7 @@ def test_one_run_keeps_its_own_error_and_curve(tmp_path: Path) -> None:
     assert cell.measure == "success" and cell.value == 50.0
     assert cell.value_error == pytest.approx(100 * math.sqrt(0.25 / 3))
     assert [point.step for point in cell.validation] == [0, 2000, 4000]
-    assert cell.validation[0] == Point(0, 0.0, 0.0)
+    assert cell.validation[0] == CurvePoint(0, 0.0, 0.0)
     assert cell.validation[2].value == 50.0 and cell.test == ()
 
 

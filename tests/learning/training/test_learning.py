@@ -28,14 +28,14 @@ def place_errors(snapshot: Path, held_out: Demonstrations) -> np.ndarray:
     errors = []
     for episode, length in enumerate(held_out.lengths()):
         for t in range(length):
-            moment = held_out.moment(episode, t)
-            image = agent.image((moment.color, moment.height))
-            pick = agent.config.to_network(grid.to_pixel(moment.action[:2]))
+            transition = held_out.transition(episode, t)
+            image = agent.image((transition.color, transition.height))
+            pick = agent.config.to_network(grid.to_pixel(transition.action[:2]))
             with torch.no_grad():
                 heat = agent.transport(image[None], torch.from_numpy(pick)[None])[0, 0].numpy()
             best = np.array(np.unravel_index(heat.argmax(), heat.shape))
             place = grid.to_world(agent.config.to_camera(best))
-            errors.append(np.linalg.norm(place - moment.action[3:5]))
+            errors.append(np.linalg.norm(place - transition.action[3:5]))
     return np.array(errors)
 
 

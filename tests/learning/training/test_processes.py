@@ -64,7 +64,7 @@ def test_two_processes_train_as_one_with_both_batches(
         drawn.append(1)
         ranks = (np.random.default_rng([training._STREAM, 0, len(drawn), k]) for k in (0, 1))
         batches = [
-            original(data, lifts, moments=data.drawn(BATCH, each), rng=each, augment=augment)
+            original(data, lifts, transitions=data.drawn(BATCH, each), rng=each, augment=augment)
             for each in ranks
         ]
         return tuple(torch.cat(parts) for parts in zip(*batches, strict=True))

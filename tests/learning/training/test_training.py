@@ -233,11 +233,13 @@ def test_a_lift_that_a_robot_makes_of_a_stage_s_is_taken(tmp_path: Path) -> None
     data = Demonstrations(tmp_path, task=TASK)
     check_lifts(data)
     assert (
-        state_batch(data, (0.04,), moments=[(0, 0)] * 8, rng=np.random.default_rng(0))[2].tolist()
+        state_batch(data, (0.04,), transitions=[(0, 0)] * 8, rng=np.random.default_rng(0))[
+            2
+        ].tolist()
         == [0] * 8
     )
     with pytest.raises(InputError, match=r"lifts to 0\.0[45] m"):
-        state_batch(data, (0.1, 0.3), moments=[(0, 0)], rng=np.random.default_rng(0))
+        state_batch(data, (0.1, 0.3), transitions=[(0, 0)], rng=np.random.default_rng(0))
 
 
 def test_damaged_and_foreign_snapshots_are_refused(

@@ -23,7 +23,7 @@ from warp_deform.tasks.demonstrators import met_particle
 from warp_deform.tasks.registry import TASKS
 from warp_deform.worlds import Worlds
 from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
-from warp_deform.worlds.loop import SOLVED, Run, play
+from warp_deform.worlds.loop import SOLVED, EpisodeRun, play
 
 LINE, BLOCK, RING = "cable-line-notarget", "block-notarget", "cable-ring"
 SAMPLES = [name for name in (RING, BLOCK, "fabric-flat", "bag-items-2") if name in TASKS]
@@ -35,13 +35,15 @@ def worlds(name: str, count: int) -> Worlds:
     return Worlds(name, count, lanes=8)
 
 
-def runs_of(side: Worlds, seeds: list[int]) -> dict[int, Run[Any]]:
+def runs_of(side: Worlds, seeds: list[int]) -> dict[int, EpisodeRun[Any]]:
     """Start the seeds in the first slots."""
     side.reset(dict(enumerate(seeds)))
-    return {i: Run(seed, episode_rng(seed, DEMONSTRATOR_STREAM)) for i, seed in enumerate(seeds)}
+    return {
+        i: EpisodeRun(seed, episode_rng(seed, DEMONSTRATOR_STREAM)) for i, seed in enumerate(seeds)
+    }
 
 
-def played(side: Worlds, seeds: list[int], name: str) -> dict[int, Run[str]]:
+def played(side: Worlds, seeds: list[int], name: str) -> dict[int, EpisodeRun[str]]:
     """Whole episodes, with hashes of their states."""
     act = demonstrator(name)
     with single_threaded():

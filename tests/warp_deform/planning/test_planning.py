@@ -49,7 +49,7 @@ def test_an_outlook_depends_on_its_state_and_action_alone(started):
     alone = [lookahead.try_each([job])[0] for job in jobs]
     for a, b, c in zip(together, backwards, alone, strict=True):
         assert a.rank == b.rank == c.rank and a.score == b.score == c.score
-    assert len({o.promise for o in together}) > 3
+    assert len({o.state_value for o in together}) > 3
     assert worlds.hash(0) == before
     # the state that is kept is the one that the action really leaves
     worlds.step({0: jobs[0][1]})
@@ -72,8 +72,8 @@ def test_solved_ranks_before_placed_before_idle_before_untrusted(started, monkey
     assert rank(Outcome.MISSED) == rank(Outcome.UNREACHABLE)
     monkeypatch.setattr(side, "solved", lambda slot: True)
     assert rank(Outcome.PLACED) > placed.rank
-    monkeypatch.setattr(side.task, "promise", lambda *_: float("nan"), raising=False)
-    with pytest.raises(WarpDeformError, match="promise of a state is nan"):
+    monkeypatch.setattr(side.task, "state_value", lambda *_: float("nan"), raising=False)
+    with pytest.raises(WarpDeformError, match="value of a state is nan"):
         rank(Outcome.PLACED)
 
 

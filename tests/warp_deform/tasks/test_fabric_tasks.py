@@ -178,7 +178,7 @@ def test_coverage_of_a_flat_fabric(cls) -> None:
         half = snapshot(task, layout, on_square(task, layout, 0.1))
         assert task.score(layout, half) == pytest.approx(0.5, abs=0.02)
         assert task.iou(layout, half) == pytest.approx(1 / 3, abs=0.02)
-        assert task.promise(layout, exact) > task.promise(layout, half)
+        assert task.state_value(layout, exact) > task.state_value(layout, half)
         away = snapshot(task, layout, on_square(task, layout, 0.25))
         assert task.score(layout, away) == 0.0
 
@@ -227,7 +227,7 @@ def test_cover_needs_the_cube_hidden_and_near() -> None:
     far[list(task.fabric.inner_corners), 1] += 0.3
     assert not task.solved(layout, snapshot(task, layout, far, cube))
     hidden, seen = (snapshot(task, layout, points, cube) for points in (over, under))
-    assert task.promise(layout, hidden) > task.promise(layout, seen) + 0.5
+    assert task.state_value(layout, hidden) > task.state_value(layout, seen) + 0.5
 
 
 # -- state vectors
