@@ -22,7 +22,8 @@ from ..support.quaternion import quat_from_yaw
 from ..tasks.task import Action, Task
 from ..worlds.episode import ALOFT_EVERY, Carry, Execution
 from ..worlds.state import WorldState
-from ..worlds.worlds import CALM, RETREAT_LEAST, Worlds
+from ..worlds.tip_step import CALM, RETREAT_LEAST
+from ..worlds.worlds import Worlds
 from .descent import Descent
 from .gradients import LANES, gradients_for, loss_and_gradients
 from .places import MOST_GROWTH

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from ..objects.cable import Cable
+from ..objects.scene_object import SceneObject
 from ..robots.jaw import Jaw
 from ..robots.jaw_primitive import jaw_motion, jaw_script, run_scripts
-from ..robots.primitive import Motion, Outcome
+from ..robots.primitive import Outcome
 from ..rollout.rollouts import rollout
-from ..tasks.task import Task
-from ..xpbd.fused_xpbd import FusedXPBD
 from .episode import Execution, episode_rng
+from .tip_step import ActingWorlds
 
 __all__ = ["jaw_step"]
 
@@ -24,22 +24,10 @@ _REST = 0.2
 """A world runs at least so long after the hand has gone up [s]."""
 
 
-class JawWorlds(Protocol):
+class JawWorlds(ActingWorlds, Protocol):
     """What `jaw_step` needs of `worlds.Worlds`."""
 
-    task: Task
-    objects: Any
-    episodes: Any
-    rest_limit: float
-
-    @property
-    def solver(self) -> FusedXPBD:
-        """What runs them."""
-
-    def reachable(
-        self, executions: Mapping[int, Execution], motions: Mapping[int, Motion]
-    ) -> list[int]:
-        """Slots whose arm gets along its motion; notes the others' outcome."""
+    objects: tuple[SceneObject, ...]
 
 
 def jaw_step(worlds: JawWorlds, executions: Mapping[int, Execution], record: float) -> None:

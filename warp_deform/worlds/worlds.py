@@ -21,7 +21,7 @@ from ..rendering.images import Images
 from ..rendering.pixels import BOUNDS
 from ..rendering.topdown import TopDown
 from ..robots import robot as find_robot
-from ..robots.primitive import Motion, Outcome, approach, solve_joints
+from ..robots.primitive import Motion, Outcome, solve_joints
 from ..rollout.rollouts import rollout
 from ..solver.solver import SolverFusedXPBD
 from ..support.checked import real_array
@@ -29,7 +29,6 @@ from ..tasks.free_space import FreeSpace
 from ..tasks.registry import task_of
 from ..tasks.task import PHYSICS, Layout, Snapshot, Task
 from .episode import (
-    ALOFT_EVERY,
     LAYOUT_STREAM,
     Carry,
     Execution,
@@ -40,6 +39,7 @@ from .episode import (
 )
 from .jaw_step import jaw_step
 from .state import WorldState
+from .tip_step import lead_down, tip_step
 
 __all__: list[str] = []  # `warp_deform.worlds` is the import path of what is here
 
@@ -47,11 +47,6 @@ MOST_STARTS = 100
 """Starts that are drawn before a seed is given up; the tasks need 1 to 3."""
 REST_LIMIT = 4.0
 """Longest wait for rest [s], after which a world that still moves is looked at as it is."""
-CALM = 0.2
-"""After a release, speeds stay under `calm_speed` for so long [s]: what the released bead's links
-and the beads under it had stored is dissipated instead of flinging it."""
-RETREAT_LEAST = 0.3
-"""A world runs at least so long after a release, while the tip retreats [s]."""
 
 
 class Worlds:
@@ -205,7 +200,7 @@ class Worlds:
                 tip=self._waiting_tip(),
                 posture=self.robot.home_q,
             )
-            self._look(slot)
+            self.look(slot)
 
     def _shape_boxes(self, slot: int, layout: Layout, objects: tuple[SceneObject, ...]) -> None:
         """Give the boxes of a slot the sizes and masses that they have in its episode."""
@@ -257,8 +252,7 @@ class Worlds:
         """
         executions = {slot: self._checked(slot, action) for slot, action in actions.items()}
         if self.task.jaw is None:
-            self._approach(executions, record)
-            self._carry(executions, record)
+            tip_step(self, executions, record)
         else:
             jaw_step(self, executions, record)
         limits = self.solver.config.limits
@@ -270,7 +264,7 @@ class Worlds:
                 episode.problems += run.watch.problems(slot, limits)
             outcome = execution.outcome if episode.physics_ok else Outcome.INVALID
             episode.history += (execution.past(outcome),)
-            self._look(slot)
+            self.look(slot)
             episode.judge(self.task)
             reports[slot] = execution.report(outcome, recorded=record > 0)
         return reports
@@ -282,72 +276,13 @@ class Worlds:
         self.episodes[slot].over |= self.episodes[slot].ended
         return Execution(action)
 
-    def _approach(self, executions: Mapping[int, Execution], record: float) -> None:
-        """Move the tips over the pick points and down to what they meet there."""
-        config = self.task.primitive
-        motions = {}
-        for slot, execution in executions.items():
-            pick = execution.action[:3]
-            grasp = execution.grasp(self.task, self.episodes[slot].snapshot)
-            hover = self.robot.hover_height(pick[0], pick[1], config.hover)
-            height = grasp.height if grasp else 0.0
-            motions[slot] = approach(self.episodes[slot].tip, pick, hover, height, config)
-        moving = self.reachable(executions, motions)
-        waits = {slot: motions[slot].seconds for slot in moving}
-        runs = rollout(self.solver, moving, least=1e3, most=waits, record=record)
-        for slot in moving:
-            execution = executions[slot]
-            execution.runs.append(runs[slot])
-            execution.outcome = Outcome.MISSED
-            above = motions[slot].way_points[-2]
-            self.episodes[slot].tip = above
-            self._look(slot)
-
-    def _carry(self, executions: Mapping[int, Execution], record: float) -> None:
-        """Lift, carry and let go what the tips hold, and let the worlds come to rest."""
-        carries = self._carries(executions)
-        motions, paths = {}, {}
-        for slot, carried in carries.items():
-            motions[slot], paths[slot] = carried(executions[slot].action)
-        moving = self.reachable(executions, motions)
-        if not moving:
-            return
-        runs = rollout(
-            self.solver,
-            moving,
-            paths={slot: paths[slot] for slot in moving},
-            least=RETREAT_LEAST,
-            most={slot: float(paths[slot].times[-1]) + self.rest_limit for slot in moving},
-            calm_after=CALM,
-            record=record or (ALOFT_EVERY if self.task.looks_aloft else 0.0),
-        )
-        for slot in moving:
-            executions[slot].placed(runs[slot], carries[slot], paths[slot])
-            self.episodes[slot].at_rest = runs[slot].at_rest
-            self.episodes[slot].tip = motions[slot].way_points[-1]
-
-    def _carries(self, executions: Mapping[int, Execution]) -> dict[int, Carry]:
-        """How the tips that have reached something would carry it, by slot."""
-        radii, carries = self.solver.data.topologies[0].particle_radius, {}
-        for slot, execution in executions.items():
-            snapshot = self.episodes[slot].snapshot
-            grasp = (
-                execution.grasp(self.task, snapshot)
-                if execution.outcome is Outcome.MISSED
-                else None
-            )
-            if grasp is not None:
-                carries[slot] = Carry(grasp, self.task, self.robot, snapshot, radii)
-        return carries
-
     def lead(self, actions: Mapping[int, np.ndarray]) -> dict[int, Carry]:
         """Move the tips down to what they take, and stop there: how they would carry it, by slot.
 
         Slots whose tip takes nothing, or cannot go there, are left out.
         """
         executions = {slot: self._checked(slot, action) for slot, action in actions.items()}
-        self._approach(executions, 0.0)
-        return self._carries(executions)
+        return lead_down(self, executions)
 
     def reachable(
         self, executions: Mapping[int, Execution], motions: Mapping[int, Motion]
@@ -364,7 +299,7 @@ class Worlds:
                 self.episodes[slot].posture = q[-1]
         return [slot for slot, q in zip(motions, joints, strict=True) if q is not None]
 
-    def _look(self, slot: int) -> None:
+    def look(self, slot: int) -> None:
         """Take a snapshot of a slot's state."""
         data, episode = self.solver.data, self.episodes[slot]
         particle_q = np.array(data.lane("particles.x", slot), np.float32)
@@ -401,7 +336,7 @@ class Worlds:
         episode = self.episodes[slot] = state.put(self.solver.data, slot)
         self._set_physics(slot, episode.layout)
         self._shape_boxes(slot, episode.layout, episode.objects)
-        self._look(slot)
+        self.look(slot)
 
     def score(self, slot: int) -> float:
         """The task's score of a slot's state; 0 when the physics cannot be trusted."""
