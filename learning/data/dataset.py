@@ -27,7 +27,7 @@ _FOLDER = "rows"
 _FORMAT = 1
 _COLUMNS = "color", "height", "action", "ground_truth"
 _IMPORTED = "original"
-"""Whose the recordings of the original code are, `interchange.deformable_ravens.DEMONSTRATOR`."""
+"""Whose the recordings of the original code are, `interchange.original_recording.DEMONSTRATOR`."""
 _IMPORTED_ABOVE = {"bag-color-goal": 0.5}
 """Scores that the original code's recordings of a task must exceed to be kept."""
 _IMPORTED_SOLVED = "bag-items-1", "bag-items-2"

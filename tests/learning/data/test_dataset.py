@@ -13,7 +13,7 @@ from fixtures.episode_samples import with_info
 from fixtures.training_samples import block_episode, write_demonstrations
 
 from learning.data.dataset import Demonstrations, choose
-from learning.interchange.deformable_ravens import DEMONSTRATOR
+from learning.interchange.original_recording import DEMONSTRATOR
 from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
 from learning.training.schedules import Schedule

@@ -23,8 +23,8 @@ from fixtures.original_recordings import (
 )
 from fixtures.places import TESTS
 
-from learning.interchange import deformable_ravens
-from learning.interchange.deformable_ravens import import_deformable_ravens, read_recording
+from learning.interchange.deformable_ravens import import_deformable_ravens
+from learning.interchange.original_recording import PARTS, read_recording
 from learning.runs.folder import RunFolder, read_snapshot
 from warp_deform.collecting.goals import load_goals
 from warp_deform.command.main import main
@@ -252,7 +252,7 @@ def test_no_stage_no_lift(tmp_path: Path) -> None:
         import_deformable_ravens(source, tmp_path / "out")
 
 
-@pytest.mark.parametrize("part", deformable_ravens._PARTS)
+@pytest.mark.parametrize("part", PARTS)
 def test_a_payload_anywhere_is_refused_and_not_run(
     tmp_path: Path, part: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -287,7 +287,7 @@ def test_folders_that_are_no_recordings(tmp_path: Path) -> None:
     (source / "last_info" / "000000-1.pkl").unlink()
     with pytest.raises(InputError, match=r"last_info/000000-1\.pkl is missing"):
         import_deformable_ravens(source, out)
-    for part in deformable_ravens._PARTS:
+    for part in PARTS:
         (source / part / "000000-1.pkl").unlink(missing_ok=True)
     with pytest.raises(InputError, match="holds no episodes"):
         import_deformable_ravens(source, out)
