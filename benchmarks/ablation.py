@@ -27,8 +27,8 @@ import torch
 from torch.nn import functional
 
 from learning.data.dataset import Demonstrations
-from learning.evaluation.evaluate import evaluate_snapshot
 from learning.evaluation.protocol import Protocol
+from learning.evaluation.snapshot import evaluate_snapshot
 from learning.models.transporter import PRESETS
 from learning.policy.policy import ImagePolicy, load_policy
 from learning.runs.folder import RunFolder

@@ -58,7 +58,7 @@ def trained(report: Mapping[str, Any], *, out: Path) -> str:
 
 
 def evaluated(report: Mapping[str, Any]) -> str:
-    """What `eval` came to: `report_run.evaluate_run`, and with other seeds what those came to."""
+    """What `eval` came to, see `evaluate_run`; with other seeds what those came to."""
     other = report.get("played")
     test = report["test"] if other is None else other["test"]
     low, high = test["pc_success_ci95"]

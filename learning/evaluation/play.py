@@ -19,11 +19,11 @@ from ..policy.policy import ImagePolicy, Policy, RetryingPolicy, StatePolicy
 from .failures import bag_opening, failure
 from .protocol import Protocol
 
-__all__ = ["Measured", "Played", "goal_distance", "play_policy"]
+__all__ = ["Measures", "PlayedEpisode", "goal_distance", "play_policy"]
 
 
 @dataclass(frozen=True)
-class Played:
+class PlayedEpisode:
     """One episode. score: at its end, 0 if its physics cannot be trusted; reason: why it ended.
 
     Attributes:
@@ -43,7 +43,7 @@ class Played:
     enclosed: bool | None = None
 
 
-class Measured(NamedTuple):
+class Measures(NamedTuple):
     """What evaluation takes down of a state: score, distance to the goal, opening of a bag."""
 
     score: float
@@ -59,7 +59,7 @@ def play_policy(
     goals: Mapping[int, Goal] | None = None,
     *,
     watch: Callable[[int, Mapping[str, np.ndarray], np.ndarray], None] | None = None,
-) -> Iterator[tuple[int, Played, EpisodeRun[Measured]]]:
+) -> Iterator[tuple[int, PlayedEpisode, EpisodeRun[Measures]]]:
     """Play episodes of a protocol in `worlds`; each is yielded, after its slot, when it is over.
 
     Args:
@@ -70,7 +70,7 @@ def play_policy(
     players: dict[int, Policy] = {}
 
     def act(
-        worlds: Worlds, runs: Mapping[int, EpisodeRun[Measured]]
+        worlds: Worlds, runs: Mapping[int, EpisodeRun[Measures]]
     ) -> dict[int, np.ndarray | None]:
         """What the policy does in every slot, one picture at a time: no neighbour changes a bit."""
         chosen: dict[int, np.ndarray | None] = {}
@@ -91,11 +91,11 @@ def play_policy(
             chosen[slot] = action
         return chosen
 
-    def measure(worlds: Worlds, slot: int) -> Measured:
+    def measure(worlds: Worlds, slot: int) -> Measures:
         episode, distance = worlds.episodes[slot], None
         if episode.goal is not None:
             distance = goal_distance(episode.snapshot.images.color, episode.goal.color)
-        return Measured(float(worlds.score(slot)), distance, bag_opening(worlds, slot))
+        return Measures(float(worlds.score(slot)), distance, bag_opening(worlds, slot))
 
     goal = goals.__getitem__ if goals else None
     for slot, run in play(worlds, seeds, act=act, look=measure, goals=goal):
@@ -103,7 +103,7 @@ def play_policy(
         # an episode that ends for its physics has one row fewer and counts with nothing
         trusted = bool(run.rows) and len(run.rows) == len(run.actions) + 1
         distances = tuple(row.goal_l2 for row in run.rows if row.goal_l2 is not None)
-        played = Played(
+        played = PlayedEpisode(
             seed=run.seed,
             success=ended == SOLVED,
             score=run.rows[-1].score if trusted else 0.0,
@@ -116,7 +116,7 @@ def play_policy(
         yield slot, played, run
 
 
-def _failed_motion(run: EpisodeRun[Measured], protocol: Protocol) -> bool:
+def _failed_motion(run: EpisodeRun[Measures], protocol: Protocol) -> bool:
     """Whether an episode is over for an action that the arm could not carry out."""
     unreachable = run.outcomes[-1:] == [Outcome.UNREACHABLE.value]
     return protocol.motions_must_succeed and unreachable

@@ -1,4 +1,8 @@
-"""A run's results: every snapshot on validation seeds, the chosen one on test seeds."""
+"""A training run's evaluation: every snapshot on validation seeds, the chosen one on test seeds.
+
+The paper's own protocol, the best of ten snapshots on the test seeds themselves, is a second,
+labelled result: it is optimistic.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +23,11 @@ from warp_deform.support.revision import running_revision
 from ..policy.policy import load_policy
 from ..runs.folder import RunFolder, write_json
 from ..runs.log import cpu_seconds, read_log
-from .evaluate import Evaluation, best, evaluate_snapshot, trained_steps
 from .paper_results import PARTIAL_SCORE, SUCCESS, partial_credit, read_paper
-from .play import Played
+from .play import PlayedEpisode
 from .protocol import FIRST_SEED, Protocol, check_goals, check_splits
+from .snapshot import evaluate_snapshot, trained_steps
+from .summary import Evaluation, best
 
 __all__ = ["evaluate_run"]
 
@@ -58,7 +63,7 @@ def evaluate_run(
     Step 0, the untrained network, is played for the learning curve and never chosen; `videos`:
     paths, where asked for; `measure`: what the paper's table shows for the task, and `published`:
     its number [%], None where it has none; `revision`: what evaluated; `training_cpu_seconds`.
-    See `evaluation.summarise` for a result's keys.
+    See `summary.summarise` for a result's keys.
 
     `other_seeds`: by first seed, what was played with `first_seed`: `first_seed`, `selected`,
     `test`, `paper` and the settings that may differ from those above. Such a call changes nothing
@@ -86,14 +91,16 @@ def evaluate_run(
     if workers is not None:
         workers = worker_count(workers, episodes)
 
-    def play(what: str, of: Sequence[int], protocol: Protocol) -> list[Evaluation]:
+    def evaluate(what: str, of: Sequence[int], protocol: Protocol) -> list[Evaluation]:
         count = workers or max(1, min(joblib.cpu_count(), protocol.episodes // _LEAST_EPISODES))
         total, evaluations = len(of) * protocol.episodes, []
         with progress_bar(f"eval {task}, {what}", total, shown=progress) as advance:
             for step in of:
                 solved: list[bool] = []
 
-                def heard(played: Played, step: int = step, solved: list[bool] = solved) -> None:
+                def heard(
+                    played: PlayedEpisode, step: int = step, solved: list[bool] = solved
+                ) -> None:
                     solved.append(played.success)
                     advance()
                     advance.note = f"step {step}: {sum(solved)} of {len(solved)} solved"
@@ -136,9 +143,9 @@ def evaluate_run(
     if video is not None and video.exists() and not video.is_dir():
         raise InputError(f"{video} is no folder; name one for the videos")
     earlier = _earlier(run)
-    validated = play("validation", steps, validation)
+    validated = evaluate("validation", steps, validation)
     chosen = best([each for each in validated if each.step], task=task)
-    (result,) = play("test", [chosen.step], test)
+    (result,) = evaluate("test", [chosen.step], test)
     paper_table = read_paper()
     demos, agent = len(settings["demonstrations"]), settings["agent"]["agent"]
     report: dict[str, Any] = {
@@ -164,7 +171,7 @@ def evaluate_run(
         "other_seeds": earlier.get("other_seeds", {}),
     }
     if paper:
-        played = play("paper's protocol", steps, theirs)
+        played = evaluate("paper's protocol", steps, theirs)
         top = best([each for each in played if each.step], task=task)
         report["paper"] = {
             "protocol": "best of the snapshots on the test seeds themselves (optimistic)",
@@ -175,16 +182,18 @@ def evaluate_run(
             "snapshots": {str(e.step): {"split": "test", **e.summary} for e in played},
         }
     report["seconds"] = time.perf_counter() - began
-    kept = report if first_seed is None else _beside(earlier, report, first_seed)
-    write_json(run.report, kept)  # before films, which may fail
+    stored = report if first_seed is None else _beside(earlier, report, first_seed)
+    write_json(run.report, stored)  # before films, which may fail
     if video is not None:
         from .video import film_episodes
 
         count = min(videos, episodes)
         paths = film_episodes(run, result, test, video, count=count, arm=video_arm)
-        kept = {**kept, "videos": [str(path) for path in paths]}
-        write_json(run.report, kept)
-    return kept if first_seed is None else {**kept, "played": kept["other_seeds"][str(first_seed)]}
+        stored = {**stored, "videos": [str(path) for path in paths]}
+        write_json(run.report, stored)
+    if first_seed is None:
+        return stored
+    return {**stored, "played": stored["other_seeds"][str(first_seed)]}
 
 
 _OWN = ("stage_rule", "retry", "robot", "goals", "selected", "test", "paper", "revision", "seconds")

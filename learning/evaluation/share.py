@@ -8,7 +8,7 @@ import torch
 
 from ..interchange.conversion import new_folder
 from ..runs.folder import RunFolder, read_snapshot, write_json
-from .evaluate import trained_steps
+from .snapshot import trained_steps
 
 __all__ = ["share_run"]
 

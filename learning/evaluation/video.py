@@ -28,9 +28,9 @@ from warp_deform.worlds.worlds import Worlds
 
 from ..policy.policy import ImagePolicy, load_policy
 from ..runs.folder import RunFolder
-from .evaluate import Evaluation
-from .play import Measured, Played, play_policy
+from .play import Measures, PlayedEpisode, play_policy
 from .protocol import Protocol, goals_for, goals_of
+from .summary import Evaluation
 
 __all__ = ["HeatMaps", "Sight", "draw", "film_episodes", "heat_maps"]
 
@@ -167,7 +167,7 @@ def film_episodes(
 def _take(
     worlds: Worlds,
     slot: int,
-    run: EpisodeRun[Measured],
+    run: EpisodeRun[Measures],
     sights: Sequence[Sight],
     hashes: Sequence[str],
     goal: Goal | None,
@@ -228,13 +228,13 @@ def _look(worlds: Worlds, slot: int, heat: HeatMaps | None) -> Sight:
     return Sight(episode.snapshot.images.color, goal, heat)
 
 
-def _essence(played: Played) -> tuple[object, ...]:
+def _essence(played: PlayedEpisode) -> tuple[object, ...]:
     """What every release stores of an episode."""
     return played.success, played.score, played.actions
 
 
 def _write_video(
-    path: Path, task: str, played: Played, run: EpisodeRun[Measured], seen: list[Sight]
+    path: Path, task: str, played: PlayedEpisode, run: EpisodeRun[Measures], seen: list[Sight]
 ) -> None:
     total, maps = len(run.actions), any(sight.heat for sight in seen)
     grid = find_task(task).grid

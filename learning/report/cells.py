@@ -24,8 +24,8 @@ import numpy as np
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import TASKS
 
-from ..evaluation.evaluate import wilson
 from ..evaluation.paper_results import PARTIAL_SCORE, SUCCESS, PaperResults, partial_credit
+from ..evaluation.summary import wilson
 
 __all__ = ["Cell", "CurvePoint", "RunResult", "check_run", "pool", "version_notes"]
 

@@ -120,7 +120,7 @@ class RunFolder:
         return settings
 
     def read_report(self) -> dict[str, Any]:
-        """What `eval_info.json` says, see `report_run.evaluate_run`.
+        """What `eval_info.json` says, see `evaluation.run.evaluate_run`.
 
         Raises:
             InputError: the file is missing or damaged.

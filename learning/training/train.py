@@ -122,7 +122,7 @@ def train(config: TrainConfig) -> TrainReport:
         # Go on where a run was interrupted, perhaps while its last snapshot was validated
         trained = Trained(agent, plan, run, key)
         first = trained.restore()
-        stopped = validation.play([k for k in run.steps() if 0 < k <= first])
+        stopped = validation.evaluate([k for k in run.steps() if 0 < k <= first])
         network: nn.Module = DistributedDataParallel(agent) if world > 1 else agent
         due_steps, store = set(plan.snapshot_steps()), state_steps(plan)
 
@@ -167,7 +167,7 @@ def train(config: TrainConfig) -> TrainReport:
                         trained.store(step)
                 if due:
                     with log.paused():
-                        stopped = validation.play([step])
+                        stopped = validation.evaluate([step])
                     if rank == 0 and stopped and step % store:
                         log.flush()
                         trained.store(step)

@@ -20,7 +20,7 @@ _REPORTED = ("n_success", "n_episodes", "mean_score")
 
 
 class Validation:
-    """Plays a run's snapshots.
+    """Evaluates a run's snapshots on validation seeds.
 
     Args:
         run: whose snapshots; its settings say what ends training
@@ -48,11 +48,11 @@ class Validation:
             self._protocol = Protocol(split="validation", episodes=episodes)
             check_splits(trained, [self._protocol], task=task)
 
-    def play(self, steps: Sequence[int]) -> bool:
-        """Play the snapshots of these steps; returns whether training ends with the last."""
+    def evaluate(self, steps: Sequence[int]) -> bool:
+        """Evaluate the snapshots of these steps; returns whether training ends with the last."""
         if self._protocol is None:
             return False
-        from ..evaluation.evaluate import evaluate_snapshot, stopped_early
+        from ..evaluation.snapshot import evaluate_snapshot, stopped_early
 
         for step in steps if self._process.rank == 0 else ():
             summary = evaluate_snapshot(self._run, step, self._protocol).summary

@@ -10,8 +10,8 @@ import pytest
 from fixtures.short_runs import TASK
 
 from learning.command.outcome_text import evaluated, trained
-from learning.evaluation.evaluate import summarise
-from learning.evaluation.play import Played
+from learning.evaluation.play import PlayedEpisode
+from learning.evaluation.summary import summarise
 from learning.runs.folder import RunFolder
 from learning.training import train as training
 from warp_deform.command import main as cli
@@ -51,7 +51,7 @@ def test_what_there_is_not_is_not_told_of() -> None:
 
 def report(**changes: Any) -> dict[str, Any]:
     task = "fabric-flat-notarget"
-    played = [Played(n, n < 15, 1.0 if n < 15 else 0.5, 3, "") for n in range(20)]
+    played = [PlayedEpisode(n, n < 15, 1.0 if n < 15 else 0.5, 3, "") for n in range(20)]
     return {
         "task": task, "agent": "goal-split", "demos": 100, "seed": 0, "selected": 3000,
         "test": summarise(played, task=task), "paper": None, "measure": "mean partial score",

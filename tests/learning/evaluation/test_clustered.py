@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from learning.evaluation.clustered import clustered_mean, clustered_rate
-from learning.evaluation.evaluate import wilson
+from learning.evaluation.summary import wilson
 from warp_deform.errors import InputError
 
 GOALS = [goal for goal in range(10) for _ in range(10)]

@@ -14,8 +14,7 @@ import pytest
 import torch
 from fixtures.training_samples import write_demonstrations
 
-from learning.evaluation import evaluate as evaluation
-from learning.evaluation.evaluate import Evaluation, best, evaluate_snapshot, known, summarise
+from learning.evaluation import snapshot as evaluating
 from learning.evaluation.failures import (
     FAILURES,
     bag_holds_items,
@@ -24,9 +23,11 @@ from learning.evaluation.failures import (
     failure,
     puts_back,
 )
-from learning.evaluation.play import Played, goal_distance
+from learning.evaluation.play import PlayedEpisode, goal_distance
 from learning.evaluation.protocol import Protocol
 from learning.evaluation.run import evaluate_run
+from learning.evaluation.snapshot import evaluate_snapshot, is_evaluated
+from learning.evaluation.summary import Evaluation, best, summarise
 from learning.policy.policy import load_policy
 from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
@@ -62,9 +63,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return RunFolder(root / "run")
 
 
-def played(scores: list[float], successes: int) -> list[Played]:
+def played(scores: list[float], successes: int) -> list[PlayedEpisode]:
     return [
-        Played(seed, seed < successes, score, 3 + seed, "solved")
+        PlayedEpisode(seed, seed < successes, score, 3 + seed, "solved")
         for seed, score in enumerate(scores)
     ]
 
@@ -135,9 +136,9 @@ def test_neither_workers_nor_parts_change_a_result(run: RunFolder) -> None:
     for path in run.evaluations.iterdir():
         path.unlink()
     part = replace(whole, episodes=5)
-    assert not known(run, step, part)
+    assert not is_evaluated(run, step, part)
     assert evaluate_snapshot(run, step, part).episodes == together.episodes[:5]
-    assert known(run, step, part) and not known(run, step, whole)
+    assert is_evaluated(run, step, part) and not is_evaluated(run, step, whole)
     assert evaluate_snapshot(run, step, whole, workers=2) == together
     assert [e.seed for e in together.episodes] == list(range(50_000, 50_012))
 
@@ -151,7 +152,7 @@ def test_what_was_played_is_not_played_again(
     def never(chunk: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(evaluation, "_play_chunk", never)
+    monkeypatch.setattr(evaluating, "_play_chunk", never)
     assert evaluate_snapshot(run, 1, protocol) == first
     with pytest.raises(AssertionError):
         evaluate_snapshot(run, 1, replace(protocol, stage_rule="privileged"))
@@ -270,7 +271,9 @@ def test_a_folder_of_goals(run: RunFolder, tmp_path: Path) -> None:
     assert distances[0] != own.episodes[0].goal_l2
     copy = tmp_path / "copy"
     (tmp_path / "goals").rename(copy)
-    assert known(run, 1, replace(protocol, goal_folder=copy)), "goals count, not where they lie"
+    assert is_evaluated(run, 1, replace(protocol, goal_folder=copy)), (
+        "goals count, not where they lie"
+    )
     with pytest.raises(InputError):
         evaluate_snapshot(run, 1, protocol)
 

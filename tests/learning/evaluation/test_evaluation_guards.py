@@ -15,19 +15,14 @@ from fixtures.places import ROOT
 from fixtures.short_runs import SHORT, TASK, said, settle
 from fixtures.training_samples import block_episode
 
-from learning.evaluation import evaluate as evaluation
 from learning.evaluation import protocol, share
-from learning.evaluation.evaluate import (
-    evaluate_snapshot,
-    measure,
-    stopped_early,
-    trained_steps,
-    wilson,
-)
-from learning.evaluation.play import Played
+from learning.evaluation import snapshot as evaluating
+from learning.evaluation.play import PlayedEpisode
 from learning.evaluation.protocol import Protocol, check_splits, goals_for, goals_of
 from learning.evaluation.run import evaluate_run
 from learning.evaluation.share import share_run
+from learning.evaluation.snapshot import evaluate_snapshot, stopped_early, trained_steps
+from learning.evaluation.summary import Evaluation, measure, summarise, wilson
 from learning.policy.policy import AgentDescription, ImagePolicy, RetryingPolicy, make_agent
 from learning.runs.folder import RunFolder, read_json
 from warp_deform.episodes import EpisodeReader
@@ -47,13 +42,13 @@ def test_a_longer_evaluation_plays_what_is_missing(
     before = {path.name: path.read_bytes() for path in goals.glob("*.parquet")}
     assert len(before) == 2
     chunks = []
-    play = evaluation._play_chunk
+    play = evaluating._play_chunk
 
-    def counted(chunk: evaluation._Chunk) -> Iterator[Played]:
+    def counted(chunk: evaluating._Chunk) -> Iterator[PlayedEpisode]:
         chunks.append(chunk.seeds)
         return play(chunk)
 
-    monkeypatch.setattr(evaluation, "_play_chunk", counted)
+    monkeypatch.setattr(evaluating, "_play_chunk", counted)
     longer = Protocol(split="test", episodes=4)
     second = evaluate_snapshot(run, 2, longer)
     assert chunks == [(10_002, 10_003)] and second.episodes[:2] == first.episodes
@@ -68,13 +63,13 @@ def test_a_longer_evaluation_plays_what_is_missing(
 
 
 def test_fewer_goals_are_another_result(run: RunFolder) -> None:
-    many = evaluation._Kept(run, 2, Protocol(split="test", episodes=4))
-    few = evaluation._Kept(run, 2, Protocol(split="test", episodes=4, n_goals=2))
+    many = evaluating._Results(run, 2, Protocol(split="test", episodes=4))
+    few = evaluating._Results(run, 2, Protocol(split="test", episodes=4, n_goals=2))
     assert many._path != few._path
     of_itself = Protocol(split="validation", episodes=4)
     assert (
-        evaluation._Kept(run, 2, of_itself)._path
-        == evaluation._Kept(run, 2, replace(of_itself, n_goals=2))._path
+        evaluating._Results(run, 2, of_itself)._path
+        == evaluating._Results(run, 2, replace(of_itself, n_goals=2))._path
     )
 
 
@@ -105,13 +100,13 @@ def test_processes_get_small_chunks(run: RunFolder, monkeypatch: pytest.MonkeyPa
 
         def __exit__(self, *error: object) -> None: ...
 
-        def run(self, function: object, chunks: list[Any]) -> Iterator[Played]:
+        def run(self, function: object, chunks: list[Any]) -> Iterator[PlayedEpisode]:
             sizes.append([len(chunk.seeds) for chunk in chunks])
             for chunk in chunks:
-                yield from (Played(seed, False, 0.0, 1, "") for seed in chunk.seeds)
+                yield from (PlayedEpisode(seed, False, 0.0, 1, "") for seed in chunk.seeds)
 
-    monkeypatch.setattr(evaluation, "Workers", Crew)
-    monkeypatch.setattr(evaluation, "goals_for", lambda *_: None)
+    monkeypatch.setattr(evaluating, "Workers", Crew)
+    monkeypatch.setattr(evaluating, "goals_for", lambda *_: None)
     evaluate_snapshot(run, 2, Protocol(split="test", episodes=50), workers=2)
     evaluate_snapshot(run, 1, Protocol(split="test", episodes=20), workers=2)
     evaluate_snapshot(run, 1, Protocol(split="validation", episodes=20), workers=1)
@@ -149,20 +144,20 @@ def test_a_run_that_stopped_early_is_finished(run: RunFolder) -> None:
     settle(run, schedule=plan(run, 8), patience=1, validate=2)
     assert not stopped_early(run), "nothing was validated"
     validation = Protocol(split="validation", episodes=2)
-    records = {step: evaluation._Kept(run, step, validation) for step in (1, 2)}
+    records = {step: evaluating._Results(run, step, validation) for step in (1, 2)}
     for step, score in ((1, 0.5), (2, 0.5)):
         for seed in validation.seeds:
-            records[step].add(Played(seed, score == 1.0, score, 1, ""))
+            records[step].add(PlayedEpisode(seed, score == 1.0, score, 1, ""))
     assert stopped_early(run) and trained_steps(run) == 2
     settle(run, patience=2)
     assert not stopped_early(run)
     settle(run, patience=1)
     first, second = validation.seeds
-    records[2].add(Played(first, True, 1.0, 1, ""))
+    records[2].add(PlayedEpisode(first, True, 1.0, 1, ""))
     assert not stopped_early(run), "it was getting better"
-    records[2].add(Played(second, True, 1.0, 1, ""))
+    records[2].add(PlayedEpisode(second, True, 1.0, 1, ""))
     assert stopped_early(run), "it cannot get better"
-    records[2].add(Played(second, False, 0.5, 1, ""))
+    records[2].add(PlayedEpisode(second, False, 0.5, 1, ""))
     with pytest.raises(InputError, match="to its end"):
         evaluate_run(run.path, episodes=1, progress=False)
 
@@ -173,10 +168,10 @@ def test_stopping_is_judged_by_the_versions_that_trained(
     older = {**read_json(run.settings)["versions"], "torch": "0.0.1"}
     settle(run, schedule=plan(run, 8), patience=1, validate=1, versions=older)
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "versions", lambda: older)
+        patch.setattr(evaluating, "versions", lambda: older)
         for step in (1, 2):
-            record = evaluation._Kept(run, step, Protocol(split="validation", episodes=1))
-            record.add(Played(50_000, False, 0.0, 1, ""))
+            record = evaluating._Results(run, step, Protocol(split="validation", episodes=1))
+            record.add(PlayedEpisode(50_000, False, 0.0, 1, ""))
     assert stopped_early(run)
 
 
@@ -237,10 +232,10 @@ def test_the_papers_rule_chooses_the_lift_where_there_are_several(
 ) -> None:
     seen = []
 
-    def judged(run: RunFolder, step: int, protocol: Protocol, **_: Any) -> evaluation.Evaluation:
+    def judged(run: RunFolder, step: int, protocol: Protocol, **_: Any) -> Evaluation:
         seen.append((protocol.split, protocol.goals, protocol.stage_rule))
-        episodes = tuple(Played(seed, False, 0.0, 1, "") for seed in protocol.seeds)
-        return evaluation.Evaluation(step, episodes, evaluation.summarise(episodes, task=TASK))
+        episodes = tuple(PlayedEpisode(seed, False, 0.0, 1, "") for seed in protocol.seeds)
+        return Evaluation(step, episodes, summarise(episodes, task=TASK))
 
     monkeypatch.setattr("learning.evaluation.run.evaluate_snapshot", judged)
     for lifts, rule in (([0.05], "action"), ([0.05, 0.3], "privileged")):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from fixtures.training_samples import block_episode, write_demonstrations
 
-from learning.evaluation.evaluate import evaluate_snapshot
 from learning.evaluation.protocol import Protocol
+from learning.evaluation.snapshot import evaluate_snapshot
 from learning.evaluation.video import HeatMaps, Sight, draw, film_episodes, heat_maps
 from learning.models.transporter import PRESETS
 from learning.policy.policy import AgentDescription, ImagePolicy, make_agent

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from fixtures.short_runs import SHORT, TASK, said, settle
 
-from learning.evaluation import evaluate as evaluation
-from learning.evaluation.evaluate import evaluate_snapshot
+from learning.evaluation import snapshot as evaluating
 from learning.evaluation.play import play_policy
 from learning.evaluation.protocol import Protocol, check_splits
 from learning.evaluation.run import evaluate_run
+from learning.evaluation.snapshot import evaluate_snapshot
 from learning.policy.policy import load_policy
 from learning.report.report import write_report
 from learning.runs.folder import RunFolder, read_json
@@ -119,9 +119,9 @@ def test_goals_of_other_seeds_are_not_trained_on() -> None:
 def test_what_was_played_before_keeps_its_name() -> None:
     """Files of results are found again, though a protocol can say more now."""
     usual, others = (Protocol(split="test", episodes=5, first_seed=s) for s in (None, 30_000))
-    described = evaluation._described(usual, TASK)
+    described = evaluating._described(usual, TASK)
     assert "first_seed" not in described and "motions_must_succeed" not in described
-    assert evaluation._described(others, TASK)["first_seed"] == 30_000
+    assert evaluating._described(others, TASK)["first_seed"] == 30_000
 
 
 class OutOfReach:

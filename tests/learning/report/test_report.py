@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
-from learning.evaluation.evaluate import summarise
 from learning.evaluation.paper_results import read_paper
-from learning.evaluation.play import Played
+from learning.evaluation.play import PlayedEpisode
+from learning.evaluation.summary import summarise
 from learning.policy.policy import AGENTS
 from learning.report.cells import CurvePoint, pool, version_notes
 from learning.report.curves import draw_curves
@@ -33,7 +33,7 @@ SCHEDULE = {"steps": 4000, "batch": 1, "lr": 1e-3, "snapshots": 2}
 def result(task: str, scores: list[float], *, failure: str = "other") -> dict[str, Any]:
     """A summary of episodes with these scores; those of 1 are solved."""
     played = [
-        Played(n, score == 1.0, score, 3, "", None if score == 1.0 else failure)
+        PlayedEpisode(n, score == 1.0, score, 3, "", None if score == 1.0 else failure)
         for n, score in enumerate(scores)
     ]
     return summarise(played, task=task)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fixtures.short_runs import SHORT, TASK, said, settle
 
-from learning.evaluation.evaluate import evaluate_snapshot
+from learning.evaluation.snapshot import evaluate_snapshot
 from learning.evaluation.protocol import Protocol
 from learning.evaluation.run import evaluate_run
 from learning.evaluation.share import share_run

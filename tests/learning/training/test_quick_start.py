@@ -15,8 +15,8 @@ import pytest
 from fixtures.places import ROOT
 from fixtures.training_samples import write_demonstrations
 
-from learning.evaluation import evaluate as evaluation
-from learning.evaluation.play import Played
+from learning.evaluation import snapshot as evaluating
+from learning.evaluation.play import PlayedEpisode
 from learning.runs.folder import RunFolder
 from warp_deform.command.main import main
 
@@ -30,12 +30,14 @@ class Episodes:
         self.solves_from = solves_from
         self.played: list[tuple[int, int]] = []
 
-    def __call__(self, chunk: evaluation._Chunk) -> Iterator[Played]:
+    def __call__(self, chunk: evaluating._Chunk) -> Iterator[PlayedEpisode]:
         step = int(chunk.snapshot.stem.split("_")[1])
         for seed in chunk.seeds:
             self.played.append((step, seed))
             solved = step >= self.solves_from or seed % 2 == 0
-            yield Played(seed, solved, 1.0 if solved else 0.5, 3, "", None if solved else "other")
+            yield PlayedEpisode(
+                seed, solved, 1.0 if solved else 0.5, 3, "", None if solved else "other"
+            )
 
 
 @pytest.fixture
@@ -53,7 +55,7 @@ def test_the_plain_commands_stop_when_all_is_solved(
 ) -> None:
     train, evaluate, run = commands
     episodes = Episodes(solves_from=2)
-    monkeypatch.setattr(evaluation, "_play_chunk", episodes)
+    monkeypatch.setattr(evaluating, "_play_chunk", episodes)
     assert main(train) == 0
     said = capsys.readouterr()
     report = json.loads(said.out)
@@ -83,7 +85,7 @@ def test_what_is_not_solved_is_trained_to_the_end(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     train, _, run = commands
-    monkeypatch.setattr(evaluation, "_play_chunk", Episodes(solves_from=99))
+    monkeypatch.setattr(evaluating, "_play_chunk", Episodes(solves_from=99))
     assert main(train) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["snapshots"] == [1, 2, 4, 8, 16] and not report["stopped_early"]

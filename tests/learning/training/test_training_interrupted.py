@@ -13,7 +13,7 @@ import torch
 from fixtures.training_samples import write_demonstrations
 from torch import nn
 
-from learning.evaluation import evaluate as evaluation
+from learning.evaluation import snapshot as evaluating
 from learning.runs import log
 from learning.runs.folder import RunFolder, read_json, write_json
 from learning.runs.log import TrainingLog, read_log
@@ -155,8 +155,8 @@ class Validation:
         return bool(values) and values[-1] < max(values)
 
     def install(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(evaluation, "evaluate_snapshot", self.evaluate)
-        monkeypatch.setattr(evaluation, "stopped_early", self.stopped)
+        monkeypatch.setattr(evaluating, "evaluate_snapshot", self.evaluate)
+        monkeypatch.setattr(evaluating, "stopped_early", self.stopped)
 
 
 def test_a_kill_during_validation_changes_nothing(

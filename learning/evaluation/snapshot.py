@@ -1,10 +1,6 @@
-"""Evaluation: which snapshot is best on validation seeds, and how good it is on test seeds.
+"""A snapshot's evaluation: it plays the episodes of a protocol, once; results are kept in its run.
 
-A snapshot is chosen on validation seeds and then plays the test seeds once. The paper's own
-protocol, the best of ten snapshots on the test seeds themselves, is a second, labelled result: it
-is optimistic.
-
-Source: Seita et al., ICRA 2021, sections on training and evaluation; Wilson, JASA 1927.
+Source: Seita et al., ICRA 2021, sections on training and evaluation.
 """
 
 from __future__ import annotations
@@ -13,14 +9,12 @@ import functools
 import hashlib
 import json
 import math
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from warp_deform.collecting.workers import Workers
 from warp_deform.episodes import EpisodeReader, combine_hashes, versions
@@ -30,33 +24,14 @@ from warp_deform.worlds.loop import SLOTS, worlds_for
 
 from ..policy.policy import ImagePolicy, StatePolicy, load_policy
 from ..runs.folder import Fields, RunFolder, check_fields, read_json, read_record, write_json
-from .paper_results import partial_credit
-from .play import Played, play_policy
+from .play import PlayedEpisode, play_policy
 from .protocol import Protocol, goals_for, goals_of
+from .summary import Evaluation, measure, summarise
 
-__all__ = [
-    "Evaluation",
-    "best",
-    "evaluate_snapshot",
-    "known",
-    "measure",
-    "stopped_early",
-    "summarise",
-    "trained_steps",
-    "wilson",
-]
+__all__ = ["evaluate_snapshot", "is_evaluated", "stopped_early", "trained_steps"]
 
 _CHUNK = 2 * SLOTS
 """Episodes that a process is given at a time: what a kill loses, against idle lanes at the end."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """A snapshot's episodes in the order of their seeds, and what they amount to."""
-
-    step: int
-    episodes: tuple[Played, ...]
-    summary: dict[str, Any]
 
 
 def evaluate_snapshot(
@@ -65,7 +40,7 @@ def evaluate_snapshot(
     protocol: Protocol,
     *,
     workers: int = 1,
-    heard: Callable[[Played], object] | None = None,
+    heard: Callable[[PlayedEpisode], object] | None = None,
 ) -> Evaluation:
     """Play a protocol with a snapshot of a run, or read what was played before.
 
@@ -78,34 +53,36 @@ def evaluate_snapshot(
     Raises:
         InputError: there is no such snapshot, it cannot play this, or a file is damaged.
     """
-    kept = _Kept(run, step, protocol)
-    missing = [seed for seed in protocol.seeds if seed not in kept.played]
+    results = _Results(run, step, protocol)
+    missing = [seed for seed in protocol.seeds if seed not in results.played]
     if heard is not None:
         for seed in protocol.seeds:
-            if seed in kept.played:
-                heard(kept.played[seed])
+            if seed in results.played:
+                heard(results.played[seed])
     if missing:
-        goals = goals_for(run, kept.task, protocol)
+        goals = goals_for(run, results.task, protocol)
         count = min(workers, len(missing))
         size = math.ceil(len(missing) / count)
         if count > 1:  # results of other processes come a chunk at a time
             size = min(size, _CHUNK)
         chunks = [
-            _Chunk(run.snapshot(step), kept.weights, protocol, goals, tuple(missing[i : i + size]))
+            _Chunk(
+                run.snapshot(step), results.weights, protocol, goals, tuple(missing[i : i + size])
+            )
             for i in range(0, len(missing), size)
         ]
         with Workers(count) as crew:
             for played in crew.run(_play_chunk, chunks):
-                kept.add(played)
+                results.add(played)
                 if heard is not None:
                     heard(played)
-    episodes = tuple(kept.played[seed] for seed in protocol.seeds)
-    return Evaluation(step, episodes, summarise(episodes, task=kept.task))
+    episodes = tuple(results.played[seed] for seed in protocol.seeds)
+    return Evaluation(step, episodes, summarise(episodes, task=results.task))
 
 
-def known(run: RunFolder, step: int, protocol: Protocol) -> bool:
+def is_evaluated(run: RunFolder, step: int, protocol: Protocol) -> bool:
     """Whether a snapshot has played all of a protocol."""
-    return _Kept(run, step, protocol).whole
+    return _Results(run, step, protocol).whole
 
 
 def stopped_early(run: RunFolder) -> bool:
@@ -124,12 +101,14 @@ def stopped_early(run: RunFolder) -> bool:
     protocol = Protocol(split="validation", episodes=episodes)
     values = []
     for step in filter(None, run.steps()):
-        kept = _Kept(run, step, protocol, by=settings.get("versions"))
-        if kept.whole:
-            summary = summarise([kept.played[seed] for seed in protocol.seeds], task=kept.task)
+        results = _Results(run, step, protocol, by=settings.get("versions"))
+        if results.whole:
+            summary = summarise(
+                [results.played[seed] for seed in protocol.seeds], task=results.task
+            )
             if summary["n_success"] == episodes:
                 return True
-            values.append(summary[measure(kept.task)])
+            values.append(summary[measure(results.task)])
     waited = len(values) - 1 - int(np.argmax(values or [0]))
     return patience is not None and waited >= patience
 
@@ -154,64 +133,6 @@ def trained_steps(run: RunFolder) -> int:
     return steps[-1]
 
 
-def best(evaluations: Sequence[Evaluation], *, task: str) -> Evaluation:
-    """The evaluation with the best result; of equals that with fewer actions, then the latest."""
-
-    def rank(each: Evaluation) -> tuple[float, float, int]:
-        return each.summary[measure(task)], -each.summary["mean_actions"], each.step
-
-    return max(evaluations, key=rank)
-
-
-def summarise(episodes: Sequence[Played], *, task: str) -> dict[str, Any]:
-    """Numbers that episodes amount to.
-
-    n_episodes, n_success, pc_success [%], pc_success_ci95: Wilson's interval [%], mean_score in
-    [0, 1] with its standard_error, mean_actions, mean_actions_solved (of successes, None without),
-    paper_value [%]: what the paper's table calls success, see `partial_credit`
-    failures: how often each of `failures.FAILURES` happened
-    goal_l2: mean of the last states' `goal_distance`, None where there is no goal
-    n_success_enclosed: successes whose every item the bag enclosed, which scores do not ask for,
-    see `Task.enclosed`; None where there is no bag or item
-    """
-    n, solved = len(episodes), [e for e in episodes if e.success]
-    scores = np.array([e.score for e in episodes])
-    mean, rate = float(scores.mean()), 100 * len(solved) / n
-    failed = Counter(e.failure for e in episodes if e.failure is not None)
-    distances = [e.goal_l2[-1] for e in episodes if e.goal_l2]
-    bagged = [e for e in episodes if e.enclosed is not None]
-    return {
-        "n_episodes": n,
-        "n_success": len(solved),
-        "pc_success": rate,
-        "pc_success_ci95": list(wilson(len(solved), n)),
-        "mean_score": mean,
-        "standard_error": float(scores.std(ddof=1) / math.sqrt(n)) if n > 1 else None,
-        "mean_actions": float(np.mean([e.actions for e in episodes])),
-        "mean_actions_solved": float(np.mean([e.actions for e in solved])) if solved else None,
-        "paper_value": 100 * mean if partial_credit(task) else rate,
-        "failures": dict(sorted(failed.items())),
-        "goal_l2": float(np.mean(distances)) if distances else None,
-        "n_success_enclosed": sum(e.success for e in bagged if e.enclosed) if bagged else None,
-    }
-
-
-def measure(task: str) -> str:
-    """The key of a summary by which snapshots of a task are compared."""
-    return "mean_score" if partial_credit(task) else "pc_success"
-
-
-def wilson(successes: int, n: int) -> tuple[float, float]:
-    """Wilson's 95 % interval [%] of a share of successes.
-
-    Examples:
-        >>> [round(bound, 1) for bound in wilson(15, 20)]
-        [53.1, 88.8]
-    """
-    interval = binomtest(successes, n).proportion_ci(method="wilson")
-    return 100 * float(interval.low), 100 * float(interval.high)
-
-
 @dataclass(frozen=True)
 class _Chunk:
     """Episodes for one process. weights: hash of the snapshot's file"""
@@ -223,7 +144,7 @@ class _Chunk:
     seeds: tuple[int, ...]
 
 
-def _play_chunk(chunk: _Chunk) -> Iterator[Played]:
+def _play_chunk(chunk: _Chunk) -> Iterator[PlayedEpisode]:
     """Play episodes side by side; each is yielded when it is over."""
     policy = _policy(chunk.snapshot, chunk.weights)
     worlds = worlds_for(policy.description.task, chunk.protocol.robot)
@@ -240,7 +161,7 @@ def _policy(snapshot: Path, weights: str) -> ImagePolicy | StatePolicy:
     return load_policy(snapshot)
 
 
-class _Kept:
+class _Results:
     """What a snapshot has played of a protocol so far, and the file that keeps it.
 
     A file's name is that of all that its episodes depend on, not of how many were played.
@@ -276,7 +197,7 @@ class _Kept:
         """Whether all of the protocol has been played."""
         return self.played.keys() >= set(self._seeds)
 
-    def add(self, played: Played) -> None:
+    def add(self, played: PlayedEpisode) -> None:
         """Keep an episode."""
         self.played[played.seed] = played
         self._path.parent.mkdir(exist_ok=True)
@@ -314,7 +235,7 @@ _PLAYED: Fields = {
 }
 
 
-def _read_played(path: Path) -> dict[int, Played]:
+def _read_played(path: Path) -> dict[int, PlayedEpisode]:
     """Episodes of a file of results, by their seeds; none where there is no file."""
     if not path.exists():
         return {}
@@ -330,5 +251,5 @@ def _read_played(path: Path) -> dict[int, Played]:
         for distance in distances or ():
             check_fields({"goal_l2": distance}, {"goal_l2": float}, what=what)
         values = {**entry, "goal_l2": None if distances is None else tuple(distances)}
-        episodes[entry["seed"]] = Played(**{name: values[name] for name in _PLAYED})
+        episodes[entry["seed"]] = PlayedEpisode(**{name: values[name] for name in _PLAYED})
     return episodes
