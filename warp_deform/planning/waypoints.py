@@ -17,12 +17,12 @@ import numpy as np
 from ..errors import InputError
 from ..rendering.pixels import BOUNDS
 from ..robots.primitive import LIFT, Motion, solve_joints
-from ..rollout.rollouts import GripPath, rollout
+from ..rollout.rollouts import GripPath
 from ..support.quaternion import quat_from_yaw
 from ..tasks.task import Action, Task
-from ..worlds.episode import ALOFT_EVERY, Carry, Execution
+from ..worlds.episode import Carry, Execution
 from ..worlds.state import WorldState
-from ..worlds.tip_step import CALM, RETREAT_LEAST
+from ..worlds.tip_step import carry_and_release
 from ..worlds.worlds import Worlds
 from .descent import Descent
 from .gradients import LANES, gradients_for, loss_and_gradients
@@ -114,15 +114,7 @@ class WayPoints:
         moving = self._followed(jobs, paths)
         if not moving:
             return {}
-        runs = rollout(
-            worlds.solver,
-            moving,
-            paths={slot: paths[slot] for slot in moving},
-            least=RETREAT_LEAST,
-            most={slot: float(paths[slot].times[-1]) + worlds.rest_limit for slot in moving},
-            calm_after=CALM,
-            record=ALOFT_EVERY if worlds.task.looks_aloft else 0.0,
-        )
+        runs = carry_and_release(worlds, {slot: paths[slot] for slot in moving})
         ran: dict[int, Ran] = {}
         for slot in moving:
             episode = worlds.episodes[slot]

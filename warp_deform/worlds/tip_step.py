@@ -7,17 +7,17 @@ from typing import Protocol
 
 from ..robots.arm import Robot
 from ..robots.primitive import Motion, Outcome, approach
-from ..rollout.rollouts import rollout
+from ..rollout.rollouts import GripPath, Rollout, rollout
 from ..tasks.task import Task
 from ..xpbd.fused_xpbd import FusedXPBD
 from .episode import ALOFT_EVERY, Carry, Execution, RunningEpisode
 
-__all__ = ["CALM", "RETREAT_LEAST", "ActingWorlds", "lead_down", "tip_step"]
+__all__ = ["ActingWorlds", "carry_and_release", "lead_down", "tip_step"]
 
-CALM = 0.2
+_CALM = 0.2
 """After a release, speeds stay under `calm_speed` for so long [s]: what the released bead's links
 and the beads under it had stored is dissipated instead of flinging it."""
-RETREAT_LEAST = 0.3
+_RETREAT_LEAST = 0.3
 """A world runs at least so long after a release, while the tip retreats [s]."""
 
 
@@ -51,19 +51,26 @@ def tip_step(worlds: ActingWorlds, executions: Mapping[int, Execution], record: 
     moving = worlds.reachable(executions, motions)
     if not moving:
         return
-    runs = rollout(
-        worlds.solver,
-        moving,
-        paths={slot: paths[slot] for slot in moving},
-        least=RETREAT_LEAST,
-        most={slot: float(paths[slot].times[-1]) + worlds.rest_limit for slot in moving},
-        calm_after=CALM,
-        record=record or (ALOFT_EVERY if worlds.task.looks_aloft else 0.0),
-    )
+    runs = carry_and_release(worlds, {slot: paths[slot] for slot in moving}, record)
     for slot in moving:
         executions[slot].placed(runs[slot], carries[slot], paths[slot])
         worlds.episodes[slot].at_rest = runs[slot].at_rest
         worlds.episodes[slot].tip = motions[slot].way_points[-1]
+
+
+def carry_and_release(
+    worlds: ActingWorlds, paths: Mapping[int, GripPath], record: float = 0.0
+) -> dict[int, Rollout]:
+    """Lead what is held along a path in every slot, let it go, and let the worlds come to rest."""
+    return rollout(
+        worlds.solver,
+        list(paths),
+        paths=paths,
+        least=_RETREAT_LEAST,
+        most={slot: float(path.times[-1]) + worlds.rest_limit for slot, path in paths.items()},
+        calm_after=_CALM,
+        record=record or (ALOFT_EVERY if worlds.task.looks_aloft else 0.0),
+    )
 
 
 def lead_down(

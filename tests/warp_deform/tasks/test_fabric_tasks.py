@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 from fixtures.cloth_scenes import edge_ratios, edges_of, piercing
+from fixtures.states_at_rest import objects, state_at_rest
 
 from warp_deform.objects import cloth_sheet
-from warp_deform.rendering.drawables import Drawables
 from warp_deform.rendering.pixels import BOUNDS
-from warp_deform.rendering.topdown import TopDown
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.fabric_cover import FabricCover
 from warp_deform.tasks.fabric_flat import FabricFlat, FabricFlatNotarget
@@ -39,13 +37,6 @@ def start(cls: Callable[[], Task], seed: int = 0) -> tuple:
     return task, task.sample(rng, REACH), rng
 
 
-@cache
-def objects(cls: type[Task]) -> tuple:
-    import newton
-
-    return cls().add_objects(newton.ModelBuilder())
-
-
 ONE = PastAction(np.zeros(7), Outcome.PLACED, held=0)
 
 
@@ -57,20 +48,7 @@ def snapshot(
     actions: int = 0,
 ) -> Snapshot:
     """State at rest with the fabric at `points`, rendered."""
-    points = np.asarray(layout.particle_q if points is None else points, np.float32)
-    body_q = np.asarray(layout.body_q if body_q is None else body_q, np.float32)
-    items = objects(next(c for c in FABRICS if type(task) is c))
-    drawables = Drawables.of(task.drawn(layout, items))
-    return Snapshot(
-        particle_q=points,
-        particle_qd=np.zeros_like(points),
-        body_q=body_q,
-        body_qd=np.zeros((len(body_q), 6)),
-        segments=drawables.segments,
-        render=lambda: TopDown().render(drawables, points, body_q),
-        objects=items,
-        history=(ONE,) * actions,
-    )
+    return state_at_rest(task, layout, points, body_q, (ONE,) * actions)
 
 
 def on_square(task: FabricFlat, layout: Layout, shift: float = 0.0) -> np.ndarray:
