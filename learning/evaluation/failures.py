@@ -69,7 +69,8 @@ def failure(
 ) -> str | None:
     """Which of `FAILURES` an episode is that has just ended in a slot; None if it was solved.
 
-    openings: what `bag_opening` said at the start and after every action
+    Args:
+        openings: what `bag_opening` said at the start and after every action
     """
     if run.ended == SOLVED:
         return None
@@ -100,7 +101,9 @@ def took_nothing(outcomes: Sequence[str]) -> bool:
 def closed(openings: Sequence[float], counts: Sequence[bool]) -> bool:
     """Whether an action that counts closed the opening for the rest of the episode.
 
-    openings: T + 1 shares of the full opening; counts: T, False for a carry, which closes any bag
+    Args:
+        openings: shares of the full opening (T + 1,)
+        counts: whether each action counts (T,); False for a carry, which closes any bag
     """
     return any(
         counted and openings[t] - max(openings[t + 1 :]) >= _CLOSED

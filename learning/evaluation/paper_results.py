@@ -16,9 +16,11 @@ SUCCESS, PARTIAL_SCORE = "success", "mean partial score"
 
 @dataclass(frozen=True)
 class PaperResults:
-    """The paper's table. measures: `SUCCESS` or `PARTIAL_SCORE` by task
+    """The paper's table.
 
-    values [%]: by task, agent, number of demonstrations
+    Attributes:
+        measures: `SUCCESS` or `PARTIAL_SCORE` by task
+        values: by task, agent, number of demonstrations [%]
     """
 
     source: str

@@ -24,9 +24,11 @@ __all__ = ["Measures", "PlayedEpisode", "goal_distance", "play_policy"]
 
 @dataclass(frozen=True)
 class PlayedEpisode:
-    """One episode. score: at its end, 0 if its physics cannot be trusted; reason: why it ended.
+    """What came of one episode.
 
     Attributes:
+        score: at its end, 0 if its physics cannot be trusted
+        reason: why it ended
         failure: which of `failures.FAILURES` it is; None if solved
         goal_l2: for goal-conditioned tasks, `goal_distance` at the start and after every action
         enclosed: `Worlds.enclosed` at the end, whether the bag keeps its items; None also if the

@@ -135,7 +135,11 @@ def trained_steps(run: RunFolder) -> int:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Episodes for one process. weights: hash of the snapshot's file"""
+    """Episodes for one process.
+
+    Attributes:
+        weights: hash of the snapshot's file
+    """
 
     snapshot: Path
     weights: str
@@ -166,7 +170,8 @@ class _Results:
 
     A file's name is that of all that its episodes depend on, not of how many were played.
 
-    by: versions of the packages that played; None for those in force
+    Args:
+        by: versions of the packages that played; None for those in force
     """
 
     def __init__(

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from .paper_results import partial_credit
-from .play import Played
+from .play import PlayedEpisode
 
 __all__ = ["Evaluation", "best", "measure", "summarise", "wilson"]
 
@@ -25,7 +25,7 @@ class Evaluation:
     """A snapshot's episodes in the order of their seeds, and what they amount to."""
 
     step: int
-    episodes: tuple[Played, ...]
+    episodes: tuple[PlayedEpisode, ...]
     summary: dict[str, Any]
 
 
@@ -38,7 +38,7 @@ def best(evaluations: Sequence[Evaluation], *, task: str) -> Evaluation:
     return max(evaluations, key=rank)
 
 
-def summarise(episodes: Sequence[Played], *, task: str) -> dict[str, Any]:
+def summarise(episodes: Sequence[PlayedEpisode], *, task: str) -> dict[str, Any]:
     """Numbers that episodes amount to.
 
     n_episodes, n_success, pc_success [%], pc_success_ci95: Wilson's interval [%], mean_score in

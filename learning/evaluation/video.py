@@ -47,7 +47,8 @@ _PICK, _PLACE, _ARROW = (255, 255, 255), (0, 230, 255), (255, 225, 0)
 class HeatMaps:
     """Probabilities (320, 160) float32 of the network pixel that holds each camera pixel.
 
-    place: given the pick that was taken; of the rotations the most probable
+    Attributes:
+        place: given the pick that was taken; of the rotations the most probable
     """
 
     pick: np.ndarray
@@ -58,7 +59,8 @@ class HeatMaps:
 class Sight:
     """What was seen in a state: pictures (320, 160, 3) uint8, and what the network made of them.
 
-    heat: None in the last state, where nothing is done, and for agents that have none
+    Attributes:
+        heat: None in the last state, where nothing is done, and for agents that have none
     """
 
     color: np.ndarray
@@ -198,8 +200,11 @@ def draw(
 ) -> np.ndarray:
     """One frame (H, W, 3) uint8.
 
-    action: (7,) what was done, if anything; lines: title and state; maps: whether there is room for
-    heat maps, so that all frames of an episode have one size; grid: the task's, of the pictures
+    Args:
+        action: what was done (7,), if anything
+        lines: title and state
+        maps: whether there is room for heat maps, so that all frames of an episode have one size
+        grid: the task's, of the pictures
     """
     plain = _enlarge(sight.color, _SCALE)
     ends = None if action is None else _ends(action, grid)

@@ -10,7 +10,8 @@ __all__ = ["RunningStatistics"]
 class RunningStatistics:
     """Statistics over rows that come in batches, as LeRobot lists them.
 
-    shape: of a mean; its components are the rows' columns
+    Args:
+        shape: of a mean; its components are the rows' columns
 
     Source: Chan, Golub and LeVeque, "Algorithms for computing the sample variance", 1983.
     """

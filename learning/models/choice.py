@@ -23,7 +23,13 @@ _NEAR = 2
 
 
 class Choice(NamedTuple):
-    """pick, place: (2,) int64 row and column [network pixels]; rotation: index of the place's."""
+    """Where to pick and place.
+
+    Attributes:
+        pick: row and column (2,) int64 [network pixels]
+        rotation: index of the place's
+        place: row and column (2,) int64 [network pixels]
+    """
 
     pick: Tensor
     rotation: int
@@ -33,12 +39,13 @@ class Choice(NamedTuple):
 def choose(heat: Tensor, place_logits: Callable[[Tensor], Tensor], *, picks: int) -> Choice:
     """The best pick of several, and its most probable place.
 
-    heat: (H, W) pick logits on the CPU; -inf where nothing is to be picked, not everywhere
-    place_logits: of a pick (2,) the place logits (R, H, W) on the CPU
-    picks: how many may be weighed; 1 takes the most probable pick
-
     Probabilities of places are 1 at most, so picks that are less probable than the best one so far
     is worth are not looked at: where the network is sure, one is enough.
+
+    Args:
+        heat: pick logits (H, W) on the CPU; -inf where nothing is to be picked, not everywhere
+        place_logits: of a pick (2,) the place logits (R, H, W) on the CPU
+        picks: how many may be weighed; 1 takes the most probable pick
     """
     everything = torch.logsumexp(heat.flatten(), 0)
     left, columns = heat.clone(), heat.shape[1]

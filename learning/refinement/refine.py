@@ -291,7 +291,8 @@ def _better(
 ) -> bool:
     """Whether an episode takes the place of the original.
 
-    enclosed: whether its bag keeps its items, see `Task.enclosed`; None where there are none
+    Args:
+        enclosed: whether its bag keeps its items, see `Task.enclosed`; None where there are none
     """
     if len(run.rows) != len(run.actions) + 1:
         return False  # the physics failed

@@ -211,7 +211,11 @@ def _recorded(worlds: Worlds, recording: Recording, seed: int) -> list[tuple[Wor
 
 
 def _written(bent: Bent, action: Action, state_hash: str) -> dict[str, Any]:
-    """What is written about an action. state_hash: of the state before it"""
+    """What is written about an action.
+
+    Args:
+        state_hash: of the state before it
+    """
     path = None
     if bent.path is not None:
         path = {

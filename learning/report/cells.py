@@ -47,7 +47,12 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class RunResult:
-    """An evaluated run. info: `eval_info.json`; settings: `run.json`."""
+    """An evaluated run.
+
+    Attributes:
+        info: what `eval_info.json` says
+        settings: what `run.json` says
+    """
 
     path: Path
     task: str

@@ -45,7 +45,11 @@ def markdown_text(
     *,
     made: Sequence[Mapping[str, Any]] = (),
 ) -> str:
-    """The whole report; made: what `report_origins.origin` says of every run."""
+    """The whole report.
+
+    Args:
+        made: what `origins.origin` says of every run
+    """
     parts = ["# Results"]
     for variant, rows in compared(cells, paper).items():
         parts += [f"## Beside the paper's: {variant}", _markdown(rows)]

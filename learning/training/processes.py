@@ -24,7 +24,9 @@ limit is 10 or 30 minutes. When a process fails, torchrun ends the others at onc
 class Process(NamedTuple):
     """This process among those that train together.
 
-    rank: 0 for the one that writes; world: their number
+    Attributes:
+        rank: 0 for the one that writes
+        world: their number
     """
 
     rank: int

@@ -33,7 +33,11 @@ _DECIDING = ("warp-deform", "warp-lang", "newton", "numpy", "torch")
 
 @dataclass(frozen=True)
 class Attempt:
-    """How the episode of a seed ended. reason: "solved", or why not."""
+    """How the episode of a seed ended.
+
+    Attributes:
+        reason: "solved", or why not
+    """
 
     seed: int
     success: bool

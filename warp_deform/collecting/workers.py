@@ -77,11 +77,14 @@ class Workers:
             for result in workers.run(function, chunks):
                 ...
 
-    count: processes; None takes the cluster's cores, or one process without a cluster
     `function` is an iterator of results and is importable from its module. Tasks that the user
     registered travel along: by their module's name, or as they are where they stand in a script.
-    ray: address of a Ray cluster ("auto" for the one this machine belongs to). Functions and chunks
-    travel by joblib, files do not: a cluster needs a folder that all its machines share.
+    Functions and chunks travel to a cluster, files do not: it needs a folder that all its machines
+    share.
+
+    Args:
+        count: processes; None takes the cluster's cores, or one process without a cluster
+        ray: address of a Ray cluster ("auto" for the one this machine belongs to)
 
     Raises:
         InputError: Ray is asked for and not installed, or its cluster does not answer.

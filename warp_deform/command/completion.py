@@ -26,7 +26,8 @@ complete -o default -F _warp_deform warp-deform
 def completion_script(words: Mapping[str, Sequence[str]]) -> str:
     """A script for the shell that completes verbs, and after a verb its words; else file names.
 
-    words: by verb its flags, and names that it takes
+    Args:
+        words: by verb its flags, and names that it takes
     """
     cases = "\n".join(
         f'            {verb}) words="{" ".join(each)}" ;;' for verb, each in words.items()

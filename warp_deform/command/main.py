@@ -44,7 +44,8 @@ Config = TypeVar("Config", bound=_Dataclass)
 class Verb(NamedTuple):
     """Where a verb's function stands, "module:function", and what it does in a few words.
 
-    kept: what an interruption leaves, and what to do then; empty where there is nothing to say
+    Attributes:
+        kept: what an interruption leaves, and what to do then; empty where there is nothing to say
     """
 
     target: str

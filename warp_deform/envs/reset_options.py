@@ -39,8 +39,10 @@ def check_options(options: Mapping[str, Any] | None, *known: str) -> Mapping[str
 def goal_for(task: Task, given: GoalOption, *, seed: int) -> Goal:
     """The goal that an episode with this seed is given.
 
-    given: a goal; an episode file, whose last state is the goal; or a folder of them, of which the
-        one number `seed` modulo their count is taken, so seeds 10,000 to 10,019 go through 20 goals
+    Args:
+        given: a goal; an episode file, whose last state is the goal; or a folder of them, of which
+            the one number `seed` modulo their count is taken, so seeds 10,000 to 10,019 go through
+            20 goals
 
     Raises:
         InputError: the task takes no goal, or this one is another task's.

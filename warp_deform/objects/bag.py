@@ -215,8 +215,11 @@ def add_bag_mesh(
     """Add a container of any shape: a `surface` (see `add_cloth_mesh`) with an opening.
 
     Of `config`, radius and cut do not count; all edges are structural; the opening's vertices
-    become beads. opening: a vertex on the boundary loop that is the opening; None where the surface
-    has one loop.
+    become beads.
+
+    Args:
+        opening: a vertex on the boundary loop that is the opening; None where the surface has one
+            loop
 
     Raises:
         InputError: the surface is not one that can be a bag, by name; it has no boundary; it has

@@ -137,8 +137,11 @@ def cloth_sheet(
 ) -> np.ndarray:
     """Positions (rows * columns, 3) [m] of a flat sheet; number `columns * row + column`.
 
-    Columns run along x and rows along y before the turn by `yaw` [rad]. height [m]: None lies on
-    the table.
+    Columns run along x and rows along y before the turn by `yaw`.
+
+    Args:
+        yaw: turn about the centre [rad]
+        height: of the sheet [m]; None lies on the table
     """
     row, column = np.divmod(np.arange(config.rows * config.columns), config.columns)
     x = (column - (config.columns - 1) / 2) * config.spacing

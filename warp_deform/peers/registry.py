@@ -50,9 +50,10 @@ def time_peer(
 ) -> PeerTiming:
     """CPU cost of `scene` in "pybullet", "newton-vbd" and so on.
 
-    scene: one of `PEER_SCENES`, or one of `SOFT_SCENES` for a peer in `SOFT_PEERS`
-    seconds: simulated time of one measurement [s]; None: 1 s, or the whole play of a soft scene
-    repeats: number of starts; of soft scenes three at most are played
+    Args:
+        scene: one of `PEER_SCENES`, or one of `SOFT_SCENES` for a peer in `SOFT_PEERS`
+        seconds: simulated time of one measurement [s]; None: 1 s, or the whole play of a soft scene
+        repeats: number of starts; of soft scenes three at most are played
 
     Raises:
         InputError: an argument is unknown or out of range, or PyBullet is not installed.

@@ -138,7 +138,8 @@ def _scale(config: SearchConfig) -> np.ndarray:
 class _Around:
     """Actions from one state, tried and drawn around one another.
 
-    keep: whether outlooks hold the state afterwards
+    Args:
+        keep: whether outlooks hold the state afterwards
     """
 
     def __init__(

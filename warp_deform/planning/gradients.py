@@ -85,7 +85,9 @@ class _Ends:
 class _Leg:
     """One differentiated action of some slots.
 
-    particles (W, P, 3), bodies (W, B, 7): where it ends
+    Attributes:
+        particles: where it ends (W, P, 3) [m]
+        bodies: likewise (W, B, 7)
     """
 
     slots: list[int]

@@ -204,8 +204,11 @@ class WayPoints:
 class _Bend:
     """How numbers make a path: waypoints (n, 3) of the carry [m], then the place's shift (2,) [m].
 
-    base: the straight path; first, last: its knots where the carry begins and ends
-    start: the numbers (3 n + 2,) of the straight path
+    Attributes:
+        base: the straight path
+        first: its knot where the carry begins
+        last: its knot where the carry ends
+        start: the numbers (3 n + 2,) of the straight path
     """
 
     base: GripPath

@@ -13,8 +13,10 @@ __all__ = ["Caption", "annotate"]
 class Caption:
     """Text at the upper left of frames, a picture at their upper right.
 
-    rows: of a frame; lines: one below the other, the first one larger (task, then action and score,
-    say); inset: (h, w, 3) uint8, drawn at 45 % of the frame's height
+    Args:
+        rows: of a frame
+        lines: one below the other, the first one larger (task, then action and score, say)
+        inset: picture (h, w, 3) uint8, drawn at 45 % of the frame's height
     """
 
     def __init__(

@@ -28,17 +28,23 @@ LINK_SHARE = 0.5  # radius of a rod between beads, as a share of the bead's
 class Drawables:
     """Spheres, boxes, sheets and flat marks of one world, with a segmentation id and a colour each.
 
-    sphere_particle (S,) int32: which particle is a sphere's centre
-    sphere_radius (S,) float32 [m]; sphere_segment (S,) int32
-    box_body (B,) int32: which body a box moves with; box_pose (B, 7) float32: centre [m] and
-        quat_xyzw of the box in the body's frame; box_half (B, 3) float32 [m];
-        box_segment (B,) int32
-    quad_corners (Q, 4, 3) float32 [m], fixed in the world; quad_segment (Q,) int32
-    triangle_particle (T, 3) int32: corners of two-sided sheets; triangle_segment (T,) int32
-    link_particle (L, 2) int32: beads that scenes (not the top-down pictures) join by a thin rod;
-        link_radius (L,) float32 [m]; link_segment (L,) int32: whose colour the rod takes
-    palette (256, 3) uint8: colour of each segmentation id
-    segments: for every argument of `of`, in its order, the ids it got
+    Attributes:
+        sphere_particle: which particle is a sphere's centre (S,) int32
+        sphere_radius: (S,) float32 [m]
+        sphere_segment: (S,) int32
+        box_body: which body a box moves with (B,) int32
+        box_pose: centre [m] and quat_xyzw of the box in the body's frame (B, 7) float32
+        box_half: half sides (B, 3) float32 [m]
+        box_segment: (B,) int32
+        quad_corners: of marks that are fixed in the world (Q, 4, 3) float32 [m]
+        quad_segment: (Q,) int32
+        triangle_particle: corners of two-sided sheets (T, 3) int32
+        triangle_segment: (T,) int32
+        link_particle: beads that scenes (not the top-down pictures) join by a thin rod (L, 2) int32
+        link_radius: (L,) float32 [m]
+        link_segment: whose colour the rod takes (L,) int32
+        palette: colour of each segmentation id (256, 3) uint8
+        segments: for every argument of `of`, in its order, the ids it got
     """
 
     sphere_particle: np.ndarray

@@ -179,7 +179,10 @@ class HostArray:
 class Mesh:
     """A rigid triangle mesh in its own frame.
 
-    vertices (V, 3) [m]; faces (F, 3); rgb: colour, 0 to 255
+    Attributes:
+        vertices: (V, 3) [m]
+        faces: (F, 3)
+        rgb: colour, 0 to 255
     """
 
     vertices: np.ndarray

@@ -135,8 +135,10 @@ def spread_peaks(
 class OccluderBuffer:
     """A view from high up, whose size is a multiple of the tile's, and what it sees.
 
-    spread: cells around its own, at most a tile of them, that a look can reach
-    seen: what a shader reads
+    `seen` is what a shader reads.
+
+    Args:
+        spread: cells around its own, at most a tile of them, that a look can reach
     """
 
     def __init__(self, camera: Camera, *, spread: int, links: bool, device: wp.Device) -> None:
@@ -198,7 +200,8 @@ def lamp_limit(at: wp.vec3):
 def lit_share(depths: wp.array2d(dtype=float), nearest: wp.array2d(dtype=float), at: wp.vec3):
     """Share of the lamp's light that arrives: a soft-edged box filter over its z-buffer.
 
-    at: `lamp_sample` of the point
+    Args:
+        at: `lamp_sample` of the point
     """
     if at[0] < 0.0:
         return 1.0
@@ -277,7 +280,9 @@ def open_share(
 ):
     """Share of the ambient light that nearby things leave to a point, from the heights around it.
 
-    at: `above_sample` of the point; reach: `tap_reach` there
+    Args:
+        at: `above_sample` of the point
+        reach: `tap_reach` there
     """
     if at[0] < 0.0:
         return 1.0

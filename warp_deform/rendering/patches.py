@@ -100,7 +100,8 @@ def find_stale(
 ):
     """One thread a patch: whether it is to be shaded again; if so, its looks are forgotten.
 
-    tiles: where the picture's own z-buffer changed, one a patch
+    Args:
+        tiles: where the picture's own z-buffer changed, one a patch
     """
     i, j = wp.tid()
     patch = i * tiles.shape[1] + j

@@ -119,7 +119,9 @@ def root_slope(view: View, slope: float):
 def narrowed(slope: float, root: float, span: wp.vec2):
     """Part of the columns `span` where an edge function may not be negative, one more at its root.
 
-    slope: how it changes along the row; root: the column where it is 0
+    Args:
+        slope: how it changes along the row
+        root: the column where it is 0
     """
     if slope > 1.0e-9:
         return wp.vec2(wp.max(span[0], root - 1.0), span[1])
@@ -292,7 +294,7 @@ def raster_spheres(
     first: int,
     buffer: wp.array2d(dtype=wp.int64),
 ):
-    """One thread a sphere; `first`: primitives before the spheres."""
+    """One thread a sphere; `first` primitives come before the spheres."""
     s = wp.tid()
     window = windows[first + s]
     if not touches(window, side, tiles):

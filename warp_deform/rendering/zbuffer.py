@@ -52,7 +52,10 @@ def mark_changes(
 ):
     """One thread a primitive: keep its window, and mark tiles where it changed.
 
-    spheres and links: primitives before them; everything: windows are unknown, and tiles marked
+    Args:
+        spheres: primitives before them
+        links: primitives before them
+        everything: windows are unknown, and tiles marked
     """
     i = wp.tid()
     if everything == 0:
@@ -96,9 +99,13 @@ def empty(
 class ZBuffer:
     """What a view sees of a geometry, sample by sample.
 
-    view: from where; side: samples along a tile's side; links: whether rods are drawn
-    keys (rows, columns) int64; tiles: 1 where the last drawing changed something
-    everything: whether it was drawn whole
+    `keys` (rows, columns) int64 say what is seen; `tiles` are 1 where the last drawing changed
+    something, and `everything` says whether it was drawn whole.
+
+    Args:
+        view: from where
+        side: samples along a tile's side
+        links: whether rods are drawn
     """
 
     def __init__(self, view: View, *, side: int, links: bool, device: wp.Device) -> None:

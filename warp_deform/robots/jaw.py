@@ -254,7 +254,8 @@ class Jaw:
     ) -> float:
         """Move beads out of the fingers' way, or pin those under them; returns their force [N].
 
-        before: numbers of the beads that were pinned so far
+        Args:
+            before: numbers of the beads that were pinned so far
         """
         config, r, force = self.config, self._radius, 0.0
         half_x, half_y = config.pad_length / 2, config.thickness / 2

@@ -91,7 +91,10 @@ def check_fields(config: Any, allowed: Mapping[str, Interval]) -> None:
 def real_array(
     values: Any, shape: tuple[int, ...], *, name: str, finite: bool = False
 ) -> np.ndarray:
-    """`values` as a new float64 array of this shape; finite: all of them have to be.
+    """`values` as a new float64 array of this shape.
+
+    Args:
+        finite: whether all of them have to be
 
     Raises:
         InputError: another shape, or no real numbers: text, objects, truth or complex values.

@@ -21,9 +21,10 @@ _HERE = Path(__file__).resolve()
 class Revision:
     """What runs.
 
-    version: of the package
-    commit: 40 hexadecimal digits; None where the package lies in no checkout, or git is missing
-    dirty: whether tracked files differ from the commit; None without one
+    Attributes:
+        version: of the package
+        commit: 40 hexadecimal digits; None where the package lies in no checkout, or git is missing
+        dirty: whether tracked files differ from the commit; None without one
     """
 
     version: str

@@ -183,7 +183,11 @@ class CableMaskGoal(Task):
     def action(self, q: np.ndarray, targets: np.ndarray, bead: int) -> Action:
         """Action (7,) that takes `bead`, or one near the end, of a chain `q` to its target.
 
-        q, targets: (90, 2) [m]. The hand does not turn on the way, as with the benchmark's cables.
+        The hand does not turn on the way, as with the benchmark's cables.
+
+        Args:
+            q: centres of the beads (90, 2) [m]
+            targets: where they are to lie (90, 2) [m]
         """
         bead = min(max(bead, _ENDS), self.cable.beads - 1 - _ENDS)
         yaw = wrap_half_turn(_tangent(q, bead))
@@ -192,7 +196,8 @@ class CableMaskGoal(Task):
     def graspable(self, particle_q: np.ndarray, action: Action) -> bool:
         """Whether the open fingers of an action come down on foam, about a single strand.
 
-        particle_q: (90, 3) [m]
+        Args:
+            particle_q: (90, 3) [m]
         """
         jaw, r = self.jaw, self.cable.radius
         tip = np.array([*action[:2], jaw.grasp_m, action[2]])

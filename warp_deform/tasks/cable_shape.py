@@ -139,7 +139,8 @@ class CableShape(Task):
     ) -> Iterator[tuple[int, Action]]:
         """Visible beads and how to move each onto its own target, the farthest from it first.
 
-        turned: the last bead's target is the first
+        Args:
+            turned: the last bead's target is the first
         """
         targets = layout.targets[::-1] if turned else layout.targets
         distances = np.linalg.norm(

@@ -32,8 +32,9 @@ def curved_chain(
 ) -> np.ndarray:
     """Bead centres (n, 3) [m] along a random smooth curve within the rectangle less its margin.
 
-    bend: how strongly it turns; 0 is a straight line, at 4 most curves make a full turn
-    lone: whether the chain must not come near itself
+    Args:
+        bend: how strongly it turns; 0 is a straight line, at 4 most curves make a full turn
+        lone: whether the chain must not come near itself
 
     Raises:
         WarpDeformError: no such curve fits.

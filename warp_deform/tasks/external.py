@@ -79,8 +79,10 @@ def load_offered(name: str) -> type[Task] | None:
 def import_tasks(module: str) -> None:
     """Import a module that the user names, so that it may register its tasks.
 
-    module: a dotted name, found as Python finds it or in the present folder, or the path of a file
-        that ends with .py. Its folder is added to Python's path, where worker processes look, too.
+    Args:
+        module: a dotted name, found as Python finds it or in the present folder, or the path of a
+            file that ends with .py. Its folder is added to Python's path, where worker processes
+            look, too.
 
     Raises:
         InputError: there is no such module, or it cannot be imported.

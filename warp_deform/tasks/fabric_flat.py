@@ -43,11 +43,12 @@ _CYCLES = (np.arange(4) + np.arange(4)[:, None]) % 4
 class FabricFlat(Task):
     """A fabric of 0.2 m has to cover 0.85 of a square of its size that is drawn on the table.
 
-    folded: start with a corner of the fabric turned over, a variant that the paper has not
-
     Deliberate differences from the original: the demonstrator pulls a corner, which is one cell
     inwards, to where it lies in a flat fabric on the square, not to the square's own corner and
     3 cm beyond; the original's fabric stretches by that much, this one would be dragged off.
+
+    Args:
+        folded: start with a corner of the fabric turned over, a variant that the paper has not
     """
 
     name = "fabric-flat"

@@ -37,8 +37,10 @@ def square_mask(pose: np.ndarray, side: float) -> np.ndarray:
 def fold_corner(points: np.ndarray, corner: int, depth: float, gap: float) -> np.ndarray:
     """The flat sheet `points` (P, 3) [m] with a corner turned over onto it.
 
-    corner: particle at it; depth: of the fold line from it, towards the sheet's centre [m];
-    gap: between the two layers [m], less where the sheet bends
+    Args:
+        corner: particle at it
+        depth: of the fold line from it, towards the sheet's centre [m]
+        gap: between the two layers [m], less where the sheet bends
     """
     points = np.array(points, dtype=float)
     xy = points[:, :2]

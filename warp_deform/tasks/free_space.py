@@ -48,12 +48,13 @@ def first_that_fits(draw: Callable[[], T], *, tries: int = 50) -> T:
 class FreeSpace:
     """Table pixels that are free and within reach. Values never change: `occupy_*` return new ones.
 
-    reach: least and largest horizontal distance from the robot's base [m]; None = everywhere
-    occupied: (320, 160) bool, pixels that something covers
-
         space = FreeSpace(reach=(0.2, 0.9))
         space = space.occupy_disc((0.5, 0.0), 0.1)
         x, y, yaw = space.sample(rng, 0.04, 0.04)
+
+    Attributes:
+        reach: least and largest horizontal distance from the robot's base [m]; None = everywhere
+        occupied: pixels that something covers (320, 160) bool
     """
 
     reach: tuple[float, float] | None = None

@@ -26,10 +26,11 @@ class Aloft:
 class PastAction:
     """One action of an episode and what came of it.
 
-    action (7,) as in `task.Action`
-    held: number, among the world's objects, of what the tip carried; None where it carried nothing
-    aloft: the world while what was held hung highest; None where nothing was carried, or the task
-        does not ask for it (`Task.looks_aloft`)
+    Attributes:
+        action: (7,) as in `task.Action`
+        held: number, among the world's objects, of what the tip carried; None for nothing
+        aloft: the world while what was held hung highest; None where nothing was carried, or the
+            task does not ask for it (`Task.looks_aloft`)
     """
 
     action: np.ndarray

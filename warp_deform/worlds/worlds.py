@@ -225,7 +225,7 @@ class Worlds:
         return {s: self.as_goal(s, kind="constructed") for s in trusted}
 
     def as_goal(self, slot: int, *, kind: str) -> Goal:
-        """The present state of a slot as a goal; kind: "constructed" or "demonstrated"."""
+        """The present state of a slot as a goal; `kind` is "constructed" or "demonstrated"."""
         snapshot = self.episodes[slot].snapshot
         targets = self.task.goal_targets(self.episodes[slot].layout, snapshot)
         images = snapshot.images
