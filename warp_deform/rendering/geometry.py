@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,9 +15,9 @@ import warp as wp
 
 from ..errors import InputError
 from .drawables import Drawables
-from .normals import crease_normals
+from .meshes import BOX_FACES, Mesh
 
-__all__ = ["MESH_MATERIAL", "Geometry", "HostArray", "Mesh", "Scene", "box_mesh"]
+__all__ = ["MESH_MATERIAL", "Geometry", "HostArray", "Scene"]
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -27,10 +25,6 @@ MESH_MATERIAL = 256
 """Materials below this are segmentation ids; those from here on are the meshes', in their order."""
 
 _STATES = itertools.count()
-# corners of a box in units of its half sides, and its faces, outwards
-_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-_FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-                   [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
 
 
 @wp.struct
@@ -175,43 +169,6 @@ class HostArray:
         return self.mirror.copy() if self._shared else self.array.numpy()
 
 
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """A rigid triangle mesh in its own frame.
-
-    Attributes:
-        vertices: (V, 3) [m]
-        faces: (F, 3)
-        rgb: colour, 0 to 255
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    rgb: tuple[int, int, int]
-
-    @cached_property
-    def normals(self) -> np.ndarray:
-        """Shading normals (F, 3, 3)."""
-        return crease_normals(self.vertices, self.faces)
-
-    @cached_property
-    def closed(self) -> bool:
-        """Whether the faces enclose a volume and look outwards: no back of one can be seen."""
-        _, names = np.unique(self.vertices, axis=0, return_inverse=True)
-        corners = names.reshape(-1)[self.faces]
-        edges = np.concatenate([corners[:, [k, (k + 1) % 3]] for k in range(3)])
-        forth = np.unique(edges, axis=0, return_counts=True)
-        back = np.unique(edges[:, ::-1], axis=0, return_counts=True)
-        a, b, c = np.moveaxis(np.asarray(self.vertices, float)[self.faces], 1, 0)
-        volume = np.einsum("ij,ij", a, np.cross(b, c))
-        return all(map(np.array_equal, forth, back)) and bool(volume > 0)
-
-
-def box_mesh(size: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (8, 3) [m] and faces (12, 3) of a box around the origin."""
-    return _CORNERS * np.float32(0.5) * np.array(size, np.float32), _FACES.copy()
-
-
 class Geometry:
     """Arrays of one `Drawables` and a list of meshes, for states of a given size.
 
@@ -245,7 +202,7 @@ class Geometry:
         triangles = np.concatenate(
             [
                 d.triangle_particle,
-                (first_box + 8 * np.arange(boxes)[:, None, None] + _FACES).reshape(-1, 3),
+                (first_box + 8 * np.arange(boxes)[:, None, None] + BOX_FACES).reshape(-1, 3),
                 (first_mark + 4 * np.arange(marks)[:, None, None] + marks_of).reshape(-1, 3),
                 *(start + m.faces for start, m in zip(starts, meshes, strict=False)),
             ]

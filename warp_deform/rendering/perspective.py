@@ -13,7 +13,8 @@ import warp as wp
 from ..errors import InputError
 from .camera import Camera, look_at
 from .drawables import Drawables
-from .geometry import Geometry, HostArray, Mesh
+from .geometry import Geometry, HostArray
+from .meshes import Mesh
 from .occlusion import ABOVE_SPREAD, LAMP_SPREAD, OccluderBuffer, Occluders
 from .patches import LOOKS, PATCH, find_stale
 from .pinhole import view_of

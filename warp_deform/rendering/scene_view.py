@@ -10,7 +10,7 @@ import numpy as np
 from ..objects.colors import BLUE, TABLE, Color
 from .camera import Camera, look_at
 from .drawables import Drawables
-from .geometry import box_mesh
+from .meshes import box_mesh
 from .perspective import Perspective, RobotLink
 from .pixels import BOUNDS
 from .shading import Look

@@ -11,7 +11,7 @@ from fixtures.drawable_samples import scene as sample_scene
 from warp_deform.errors import InputError
 from warp_deform.rendering.camera import Camera, look_at, paper_cameras
 from warp_deform.rendering.fusion import fuse
-from warp_deform.rendering.geometry import box_mesh
+from warp_deform.rendering.meshes import box_mesh
 from warp_deform.rendering.normals import crease_normals
 from warp_deform.rendering.perspective import Perspective
 from warp_deform.rendering.pixels import PIXEL_SIZE

@@ -11,7 +11,7 @@ from fixtures.drawable_samples import NO_BODIES, NO_PARTICLES, drawables
 
 from warp_deform.collecting.workers import single_threaded
 from warp_deform.rendering.camera import look_at
-from warp_deform.rendering.geometry import Mesh, box_mesh
+from warp_deform.rendering.meshes import Mesh, box_mesh
 from warp_deform.rendering.perspective import Perspective
 from warp_deform.rendering.scene_view import STUDIO, ArmMeshes, SceneView
 from warp_deform.tasks.registry import task as find_task

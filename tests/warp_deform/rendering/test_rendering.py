@@ -11,7 +11,7 @@ from fixtures.drawable_samples import scene as sample_scene
 from scipy.spatial.transform import Rotation
 
 from warp_deform.errors import InputError
-from warp_deform.rendering.geometry import box_mesh
+from warp_deform.rendering.meshes import box_mesh
 from warp_deform.rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world, world_to_pixel
 from warp_deform.rendering.topdown import TopDown
 
