@@ -81,7 +81,7 @@ class WatchValues:
 
     def problems(self, world: int, limits: GuardLimits) -> tuple[Problem, ...]:
         """The guards that these values violate."""
-        found = []
+        problems = []
         for bad, kind, value, limit in (
             (self.nonfinite, ProblemKind.NONFINITE, float("nan"), 0.0),
             (self.stretch > limits.stretch, ProblemKind.STRETCH, self.stretch, limits.stretch),
@@ -107,8 +107,8 @@ class WatchValues:
             ),
         ):
             if bad:
-                found.append(Problem(kind, world, value, limit))
-        return tuple(found)
+                problems.append(Problem(kind, world, value, limit))
+        return tuple(problems)
 
 
 class PhysicsError(WarpDeformError):

@@ -14,7 +14,7 @@ from typing import Any
 import warp as wp
 
 from ..lanes.structures import structures
-from .rigid_body import rigid
+from .rigid_body import rigid_body
 
 __all__ = ["AHEAD", "GIVEN_BACK", "PASSES", "VISIT", "body_contact"]
 
@@ -40,7 +40,7 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
     """
     t = structures(scalar, lanes)
     S, R3, M33, Bodies, Contacts = t.S, t.R3, t.M33, t.Bodies, t.Contacts
-    body = rigid(scalar, lanes)
+    body = rigid_body(scalar, lanes)
     turned, moved = body.turned, body.moved
 
     @wp.func
@@ -73,12 +73,20 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
 
     @wp.func
     def list_contact(
-        c: int, a: int, b: int, pa: R3, pb: R3, n: R3, mu: S, push: S, bodies: Bodies,
+        c: int,
+        a: int,
+        b: int,
+        pa: R3,
+        pb: R3,
+        n: R3,
+        mu: S,
+        max_recovery: S,
+        bodies: Bodies,
         contacts: Contacts,
-    ):  # fmt: skip
+    ):
         """Contact c: point pb of body b stays ahead of point pa of body a (-1: the table) along n.
 
-        Of an overlap that the substep began with, a share is given back, at most `push`.
+        Of an overlap that the substep began with, a share is given back, at most `max_recovery`.
         """
         contacts.a[c] = a
         contacts.b[c] = b
@@ -99,12 +107,13 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
         contacts.u[c] = u
         contacts.v[c] = v
         contacts.weights[c] = R3(
-            pair_weight(c, n, bodies, contacts), pair_weight(c, u, bodies, contacts),
+            pair_weight(c, n, bodies, contacts),
+            pair_weight(c, u, bodies, contacts),
             pair_weight(c, v, bodies, contacts),
-        )  # fmt: skip
+        )
         overlap = wp.max(-before, S(0.0))
-        kept = wp.max(overlap - push, overlap * S(1.0 - GIVEN_BACK))
-        contacts.steps[c] = R3(gap + kept, wp.dot(slip, u), wp.dot(slip, v))
+        remaining = wp.max(overlap - max_recovery, overlap * S(1.0 - GIVEN_BACK))
+        contacts.steps[c] = R3(gap + remaining, wp.dot(slip, u), wp.dot(slip, v))
         contacts.impulse[c] = R3()
         contacts.mu[c] = mu
 
@@ -223,6 +232,10 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
         return done
 
     return SimpleNamespace(
-        begin_body=begin_body, list_contact=list_contact, share_load=share_load,
-        relative=relative, solve_contacts=solve_contacts, end_body=end_body,
-    )  # fmt: skip
+        begin_body=begin_body,
+        list_contact=list_contact,
+        share_load=share_load,
+        relative=relative,
+        solve_contacts=solve_contacts,
+        end_body=end_body,
+    )

@@ -15,7 +15,7 @@ from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from ..lanes.tape import Kind
 from .body_contact import GIVEN_BACK, VISIT, body_contact
-from .rigid_body import rigid
+from .rigid_body import rigid_body
 
 __all__ = ["body_contact_adjoint"]
 
@@ -31,7 +31,7 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
     Bodies, Contacts, BodyAdjoint, Adjoint = t.Bodies, t.Contacts, t.BodyAdjoint, t.Adjoint
     count_one = lane_access(scalar, lanes).count_one
-    turned = rigid(scalar, lanes).turned
+    turned = rigid_body(scalar, lanes).turned
     relative = body_contact(scalar, lanes, True).relative
     TINY = 1.0e-36 if scalar is wp.float32 else 1.0e-200
 
@@ -40,26 +40,26 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
 
     @wp.func
-    def corrected(q: Q, dr: R3, g: Q) -> S:
+    def pose_loss(q: Q, dr: R3, g: Q) -> S:
         return dot4(g, turned(q, dr))
 
     @wp.func
     def sweep_end_body(b: int, start_q: Q, bodies: Bodies, ba: BodyAdjoint):
-        gq, gr, _g = wp.grad(corrected)(start_q, bodies.dr[b], ba.q[b])
+        gq, gr, _g = wp.grad(pose_loss)(start_q, bodies.dr[b], ba.q[b])
         ba.q[b] = gq
         ba.dx[b] = ba.x[b]
         ba.dr[b] = gr
         ba.spread[b] = M33()
 
     @wp.func
-    def spread_of(q: Q, inverse: M33, g: M33) -> S:
+    def spread_loss(q: Q, inverse: M33, g: M33) -> S:
         turn = wp.quat_to_matrix(q)
         return wp.ddot(g, turn * inverse * wp.transpose(turn))
 
     @wp.func
     def sweep_spread(b: int, bodies: Bodies, ba: BodyAdjoint):
         if bodies.w[b] > S(0.0):
-            gq, _i, _g = wp.grad(spread_of)(bodies.q[b], bodies.inverse_inertia[b], ba.spread[b])
+            gq, _i, _g = wp.grad(spread_loss)(bodies.q[b], bodies.inverse_inertia[b], ba.spread[b])
             ba.q[b] = ba.q[b] + gq
 
     @wp.func
@@ -187,9 +187,17 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def sweep_visits(
-        start: int, end: int, passes: int, log: int, lane: int, counts: int, bodies: Bodies,
-        contacts: Contacts, ba: BodyAdjoint, adj: Adjoint,
-    ):  # fmt: skip
+        start: int,
+        end: int,
+        passes: int,
+        log: int,
+        lane: int,
+        counts: int,
+        bodies: Bodies,
+        contacts: Contacts,
+        ba: BodyAdjoint,
+        adj: Adjoint,
+    ):
         for c in range(start, end):
             held = contacts.impulse[c]
             if held[0] > S(0.0):
@@ -213,9 +221,9 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
                 sweep_visit(c, at, bodies, contacts, ba)
 
     @wp.func
-    def guess(
+    def first_guess_loss(
         s: R3, total: S, mu: S, sharing: S, n: R3, u: R3, v: R3, gi: R3, g: R3
-    ) -> S:  # fmt: skip
+    ) -> S:
         part = S(1.0) / (total * sharing)
         normal = wp.max(-s[0], S(0.0)) * part
         fu = -s[1] * part
@@ -225,8 +233,8 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         share = S(1.0)
         if f2 > budget * budget:
             share = budget / wp.sqrt(wp.max(f2, S(TINY)))
-        push = n * normal + u * (fu * share) + v * (fv * share)
-        return wp.dot(g, push) + gi[0] * normal + (gi[1] * fu + gi[2] * fv) * share
+        impulse = n * normal + u * (fu * share) + v * (fv * share)
+        return wp.dot(g, impulse) + gi[0] * normal + (gi[1] * fu + gi[2] * fv) * share
 
     @wp.func
     def step_of(x: R3, q: Q, xp: R3, qp: Q, r: R3):
@@ -234,21 +242,84 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return x + wp.quat_rotate(q, local) - (xp + wp.quat_rotate(qp, local))
 
     @wp.func
-    def weights_of(w: S, spread: M33, r: R3, n: R3, u: R3, v: R3, g: R3):
+    def weights_loss(w: S, spread: M33, r: R3, n: R3, u: R3, v: R3, g: R3):
         rn = wp.cross(r, n)
         ru = wp.cross(r, u)
         rv = wp.cross(r, v)
         return (
-            g[0] * (w + wp.dot(rn, spread * rn)) + g[1] * (w + wp.dot(ru, spread * ru))
+            g[0] * (w + wp.dot(rn, spread * rn))
+            + g[1] * (w + wp.dot(ru, spread * ru))
             + g[2] * (w + wp.dot(rv, spread * rv))
-        )  # fmt: skip
+        )
+
+    @wp.struct
+    class ListedBody:
+        """A body when a contact is listed, and the contact's point on it."""
+
+        point: R3
+        x: R3
+        q: Q
+        xp: R3
+        qp: Q
+        w: S
+        spread: M33
+
+    @wp.struct
+    class ByContact:
+        """Derivatives of the loss by what `list_contact` makes of two points and a normal."""
+
+        ra: R3
+        rb: R3
+        normal: R3
+        u: R3
+        v: R3
+        weights: R3
+        steps: R3
 
     @wp.func
-    def listed(
-        two: S, push: S, n: R3, pa: R3, xa: R3, qa: Q, xpa: R3, qpa: Q, wa: S, sa: M33, pb: R3,
-        xb: R3, qb: Q, xpb: R3, qpb: Q, wb: S, sb: M33, gra: R3, grb: R3, gn: R3, gu: R3, gv: R3,
-        gw: R3, gs: R3,
-    ) -> S:  # fmt: skip
+    def listed_body(b: int, point: R3, bodies: Bodies):
+        body = ListedBody()
+        body.point = point
+        body.x = bodies.x[b]
+        body.q = bodies.q[b]
+        body.xp = bodies.xp[b]
+        body.qp = bodies.qp[b]
+        body.w = bodies.w[b]
+        body.spread = bodies.spread[b]
+        return body
+
+    @wp.func
+    def add_to_body(b: int, g: ListedBody, bodies: Bodies, ba: BodyAdjoint):
+        ba.x[b] = ba.x[b] + g.x
+        ba.q[b] = ba.q[b] + g.q
+        ba.xp[b] = ba.xp[b] + g.xp
+        ba.qp[b] = ba.qp[b] + g.qp
+        add_mass(b, g.w, bodies, ba)
+        ba.spread[b] = ba.spread[b] + g.spread
+
+    @wp.func
+    def listing_loss(
+        a: ListedBody, b: ListedBody, two: S, max_recovery: S, n: R3, by: ByContact
+    ) -> S:
+        """The derivatives `by` the contact times what `list_contact` notes of it; `two`: 1, or 0
+        where a is the table.
+        """
+        pa = a.point
+        xa = a.x
+        qa = a.q
+        xpa = a.xp
+        qpa = a.qp
+        wa = a.w
+        sa = a.spread
+        pb = b.point
+        xb = b.x
+        qb = b.q
+        xpb = b.xp
+        qpb = b.qp
+        wb = b.w
+        sb = b.spread
+        gs = by.steps
+        gw = by.weights
         rb = pb - xb
         ra = pa - xa
         slip = step_of(xb, qb, xpb, qpb, rb) - step_of(xa, qa, xpa, qpa, ra) * two
@@ -259,15 +330,16 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         v = wp.cross(n, u)
         gap = wp.dot(pb - pa, n)
         overlap = wp.max(wp.dot(slip, n) - gap, S(0.0))
-        kept = wp.max(overlap - push, overlap * S(1.0 - GIVEN_BACK))
-        total = gs[0] * (gap + kept) + gs[1] * wp.dot(slip, u) + gs[2] * wp.dot(slip, v)
-        total += weights_of(wb, sb, rb, n, u, v, gw) + weights_of(wa, sa, ra, n, u, v, gw) * two
-        total += wp.dot(gra, ra) * two + wp.dot(grb, rb)
-        return total + wp.dot(gn, n) + wp.dot(gu, u) + wp.dot(gv, v)
+        remaining = wp.max(overlap - max_recovery, overlap * S(1.0 - GIVEN_BACK))
+        total = gs[0] * (gap + remaining) + gs[1] * wp.dot(slip, u) + gs[2] * wp.dot(slip, v)
+        total += weights_loss(wb, sb, rb, n, u, v, gw) + weights_loss(wa, sa, ra, n, u, v, gw) * two
+        total += wp.dot(by.ra, ra) * two + wp.dot(by.rb, rb)
+        return total + wp.dot(by.normal, n) + wp.dot(by.u, u) + wp.dot(by.v, v)
 
     @wp.func
-    def sweep_listed(c: int, pa: R3, pb: R3, push: S, bodies: Bodies, contacts: Contacts,
-                     ba: BodyAdjoint):  # fmt: skip
+    def sweep_listed(
+        c: int, pa: R3, pb: R3, max_recovery: S, bodies: Bodies, contacts: Contacts, ba: BodyAdjoint
+    ):
         """Takes contact c back to its points and its normal; returns the derivatives by these."""
         a = contacts.a[c]
         b = contacts.b[c]
@@ -282,10 +354,8 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         if a >= 0:
             total += bodies.w[a]
             two = S(1.0)
-        g = sweep_apply(
-            c, n * impulse[0] + u * impulse[1] + v * impulse[2], bodies, contacts, ba
-        )  # fmt: skip
-        gs, g_total, g_mu, _s, gn, gu, gv, _gi, _g = wp.grad(guess)(
+        g = sweep_apply(c, n * impulse[0] + u * impulse[1] + v * impulse[2], bodies, contacts, ba)
+        gs, g_total, g_mu, _s, gn, gu, gv, _gi, _g = wp.grad(first_guess_loss)(
             s, total, contacts.mu[c], S(code[3]), n, u, v, ba.impulse[c], g
         )
         ba.mu[c] = ba.mu[c] + g_mu
@@ -294,31 +364,26 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         if a >= 0:
             add_mass(a, g_total, bodies, ba)
             oa = a
-        (
-            _two, _push, hn, hpa, gxa, gqa, gxpa, gqpa, gwa, gsa, hpb, gxb, gqb, gxpb, gqpb, gwb,
-            gsb, _a, _b, _c, _d, _e, _f, _h,
-        ) = wp.grad(listed)(
-            two, push, n, pa, bodies.x[oa], bodies.q[oa], bodies.xp[oa], bodies.qp[oa],
-            bodies.w[oa], bodies.spread[oa], pb, bodies.x[b], bodies.q[b], bodies.xp[b],
-            bodies.qp[b], bodies.w[b], bodies.spread[b], ba.ra[c], ba.rb[c], ba.normal[c] + gn,
-            ba.across_u[c] + gu, ba.across_v[c] + gv, ba.weights[c], ba.steps[c] + gs,
-        )  # fmt: skip
-        ba.x[b] = ba.x[b] + gxb
-        ba.q[b] = ba.q[b] + gqb
-        ba.xp[b] = ba.xp[b] + gxpb
-        ba.qp[b] = ba.qp[b] + gqpb
-        add_mass(b, gwb, bodies, ba)
-        ba.spread[b] = ba.spread[b] + gsb
+        by = ByContact()
+        by.ra = ba.ra[c]
+        by.rb = ba.rb[c]
+        by.normal = ba.normal[c] + gn
+        by.u = ba.across_u[c] + gu
+        by.v = ba.across_v[c] + gv
+        by.weights = ba.weights[c]
+        by.steps = ba.steps[c] + gs
+        ga, gb, _two, _recovery, g_normal, _by = wp.grad(listing_loss)(
+            listed_body(oa, pa, bodies), listed_body(b, pb, bodies), two, max_recovery, n, by
+        )
+        add_to_body(b, gb, bodies, ba)
         if a >= 0:
-            ba.x[a] = ba.x[a] + gxa
-            ba.q[a] = ba.q[a] + gqa
-            ba.xp[a] = ba.xp[a] + gxpa
-            ba.qp[a] = ba.qp[a] + gqpa
-            add_mass(a, gwa, bodies, ba)
-            ba.spread[a] = ba.spread[a] + gsa
-        return hpa, hpb, hn
+            add_to_body(a, ga, bodies, ba)
+        return ga.point, gb.point, g_normal
 
     return SimpleNamespace(
-        sweep_end_body=sweep_end_body, sweep_spread=sweep_spread, sweep_visits=sweep_visits,
-        sweep_listed=sweep_listed, clear_contacts=clear_contacts,
-    )  # fmt: skip
+        sweep_end_body=sweep_end_body,
+        sweep_spread=sweep_spread,
+        sweep_visits=sweep_visits,
+        sweep_listed=sweep_listed,
+        clear_contacts=clear_contacts,
+    )

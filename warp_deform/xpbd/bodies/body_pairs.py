@@ -31,9 +31,16 @@ def body_pairs(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
 
     @wp.func
     def list_pairs(
-        g: int, lane: int, k: int, push: S, top: Topology, shapes: Shapes, group: Group,
-        bodies: Bodies, contacts: Contacts,
-    ):  # fmt: skip
+        g: int,
+        lane: int,
+        k: int,
+        max_recovery: S,
+        top: Topology,
+        shapes: Shapes,
+        group: Group,
+        bodies: Bodies,
+        contacts: Contacts,
+    ):
         count = top.body_count[k]
         b0 = group.body_start[g] + lane * count
         first = group.shape_start[g] + lane * top.shape_count[k]
@@ -49,10 +56,12 @@ def body_pairs(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
                 b = b0 + shapes.body[sb]
                 if a != b and bodies.w[a] + bodies.w[b] > S(0.0):
                     mu = mv[lane] * wp.min(shapes.friction[sa], shapes.friction[sb])
-                    c = list_boxes(c, sa, a, sb, b, mu, push, shapes, bodies, contacts)
+                    c = list_boxes(c, sa, a, sb, b, mu, max_recovery, shapes, bodies, contacts)
         for b in range(count):
             if bodies.w[b0 + b] > S(0.0):
-                c = list_table(c, b0 + b, b, first, last, tv[lane], push, shapes, bodies, contacts)
+                c = list_table(
+                    c, b0 + b, b, first, last, tv[lane], max_recovery, shapes, bodies, contacts
+                )
         return c
 
     return SimpleNamespace(list_pairs=list_pairs)

@@ -34,14 +34,31 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     contact, box = body_contact(scalar, lanes, noted), box_axes(scalar, lanes)
     list_contact, share_load = contact.list_contact, contact.share_load
     center, axes, column, reach, candidate = (
-        box.center, box.axes, box.column, box.reach, box.candidate
-    )  # fmt: skip
+        box.center,
+        box.axes,
+        box.column,
+        box.reach,
+        box.candidate,
+    )
 
     @wp.func
     def list_face(
-        c: int, a: int, b: int, axis: int, n: R3, ca: R3, aa: M33, ha: R3, cb: R3, ab: M33, hb: R3,
-        mu: S, push: S, bodies: Bodies, contacts: Contacts,
-    ):  # fmt: skip
+        c: int,
+        a: int,
+        b: int,
+        axis: int,
+        n: R3,
+        ca: R3,
+        aa: M33,
+        ha: R3,
+        cb: R3,
+        ab: M33,
+        hb: R3,
+        mu: S,
+        max_recovery: S,
+        bodies: Bodies,
+        contacts: Contacts,
+    ):
         """Contacts between the face of box a with outward normal n (its axis `axis`) and the side
         of box b that faces it: the corners of their common area. Returns the next number.
         """
@@ -99,7 +116,9 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
                         at = p + d * wp.where(end == 0, lo, hi)
                         gap = wp.dot(at, n) - face
                         if gap < S(AHEAD):
-                            list_contact(c, a, b, at - n * gap, at, n, mu, push, bodies, contacts)
+                            list_contact(
+                                c, a, b, at - n * gap, at, n, mu, max_recovery, bodies, contacts
+                            )
                             if wp.static(noted):
                                 contacts.code[c] = wp.vec4i(axis, k, edge * 4 + end, 0)
                             c += 1
@@ -111,7 +130,7 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
             ):
                 gap = wp.dot(side - q, m) / wp.dot(m, n)
                 if gap < S(AHEAD):
-                    list_contact(c, a, b, q, q + n * gap, n, mu, push, bodies, contacts)
+                    list_contact(c, a, b, q, q + n * gap, n, mu, max_recovery, bodies, contacts)
                     if wp.static(noted):
                         contacts.code[c] = wp.vec4i(axis, k, edge * 4 + 2, 0)
                     c += 1
@@ -119,9 +138,17 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
 
     @wp.func
     def list_boxes(
-        c: int, sa: int, a: int, sb: int, b: int, mu: S, push: S, shapes: Shapes, bodies: Bodies,
+        c: int,
+        sa: int,
+        a: int,
+        sb: int,
+        b: int,
+        mu: S,
+        max_recovery: S,
+        shapes: Shapes,
+        bodies: Bodies,
         contacts: Contacts,
-    ):  # fmt: skip
+    ):
         start = int(c)
         ha = shapes.half[sa]
         hb = shapes.half[sb]
@@ -151,13 +178,40 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
             if least > S(0.0) and kind >= 0:
                 if kind < 3:
                     c = list_face(
-                        c, a, b, kind, normal, ca, aa, ha, cb, ab, hb, mu, push, bodies, contacts
+                        c,
+                        a,
+                        b,
+                        kind,
+                        normal,
+                        ca,
+                        aa,
+                        ha,
+                        cb,
+                        ab,
+                        hb,
+                        mu,
+                        max_recovery,
+                        bodies,
+                        contacts,
                     )
                 elif kind < 6:
                     c = list_face(
-                        c, b, a, kind - 3, -normal, cb, ab, hb, ca, aa, ha, mu, push, bodies,
+                        c,
+                        b,
+                        a,
+                        kind - 3,
+                        -normal,
+                        cb,
+                        ab,
+                        hb,
+                        ca,
+                        aa,
+                        ha,
+                        mu,
+                        max_recovery,
+                        bodies,
                         contacts,
-                    )  # fmt: skip
+                    )
                 else:
                     ea = (kind - 6) // 3
                     eb = (kind - 6) % 3
@@ -177,7 +231,7 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
                     sv = (uv * wp.dot(w, u) - wp.dot(w, v)) / bottom
                     pa += u * su
                     pb += v * sv
-                    list_contact(c, a, b, pa, pb, normal, mu, push, bodies, contacts)
+                    list_contact(c, a, b, pa, pb, normal, mu, max_recovery, bodies, contacts)
                     if wp.static(noted):
                         contacts.code[c] = wp.vec4i(ea, eb, 16, 0)
                     c += 1

@@ -26,16 +26,37 @@ def box_box_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     def column(m: M33, k: int):
         return R3(m[0, k], m[1, k], m[2, k])
 
+    @wp.struct
+    class Box:
+        """Pose of a body, and one of its boxes."""
+
+        x: R3
+        q: Q
+        center: R3
+        rotation: Q
+        half: R3
+
     @wp.func
-    def points(
-        xa: R3, qa: Q, xb: R3, qb: Q, ra: Q, rb: Q, oa: R3, ob: R3, ha: R3, hb: R3, how: int,
-        axis: int, k: int,
-    ):  # fmt: skip
-        """Rows: point of a, point of b, normal."""
-        ca = xa + wp.quat_rotate(qa, oa)
-        cb = xb + wp.quat_rotate(qb, ob)
-        aa = wp.quat_to_matrix(qa * ra)
-        ab = wp.quat_to_matrix(qb * rb)
+    def box_of(b: int, shape: int, shapes: Shapes, bodies: Bodies):
+        box = Box()
+        box.x = bodies.x[b]
+        box.q = bodies.q[b]
+        box.center = shapes.center[shape]
+        box.rotation = shapes.rotation[shape]
+        box.half = shapes.half[shape]
+        return box
+
+    @wp.func
+    def points(a: Box, b: Box, how: int, axis: int, k: int):
+        """Point of a, point of b, normal."""
+        qa = a.q
+        qb = b.q
+        ha = a.half
+        hb = b.half
+        ca = a.x + wp.quat_rotate(qa, a.center)
+        cb = b.x + wp.quat_rotate(qb, b.center)
+        aa = wp.quat_to_matrix(qa * a.rotation)
+        ab = wp.quat_to_matrix(qb * b.rotation)
         n = R3()
         pa = R3()
         pb = R3()
@@ -99,28 +120,36 @@ def box_box_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return pa, pb, n
 
     @wp.func
-    def along(
-        xa: R3, qa: Q, xb: R3, qb: Q, ra: Q, rb: Q, oa: R3, ob: R3, ha: R3, hb: R3, how: int,
-        axis: int, k: int, ga: R3, gb: R3, gn: R3,
-    ) -> S:  # fmt: skip
-        pa, pb, n = points(xa, qa, xb, qb, ra, rb, oa, ob, ha, hb, how, axis, k)
+    def points_loss(a: Box, b: Box, how: int, axis: int, k: int, ga: R3, gb: R3, gn: R3) -> S:
+        """The derivatives ga, gb, gn by both points and the normal times these."""
+        pa, pb, n = points(a, b, how, axis, k)
         return wp.dot(ga, pa) + wp.dot(gb, pb) + wp.dot(gn, n)
 
     @wp.func
     def sweep_boxes(
-        a: int, b: int, code: wp.vec4i, ga: R3, gb: R3, gn: R3, shapes: Shapes, bodies: Bodies,
+        a: int,
+        b: int,
+        code: wp.vec4i,
+        ga: R3,
+        gb: R3,
+        gn: R3,
+        shapes: Shapes,
+        bodies: Bodies,
         ba: BodyAdjoint,
-    ):  # fmt: skip
-        sa = code[0]
-        sb = code[1]
-        gxa, gqa, gxb, gqb, _a, _b, _c, _d, _e, _f, _g, _h, _i, _j, _k, _l = wp.grad(along)(
-            bodies.x[a], bodies.q[a], bodies.x[b], bodies.q[b], shapes.rotation[sa],
-            shapes.rotation[sb], shapes.center[sa], shapes.center[sb], shapes.half[sa],
-            shapes.half[sb], code[2] // 16, (code[2] // 4) % 4, code[2] % 4, ga, gb, gn,
-        )  # fmt: skip
-        ba.x[a] = ba.x[a] + gxa
-        ba.q[a] = ba.q[a] + gqa
-        ba.x[b] = ba.x[b] + gxb
-        ba.q[b] = ba.q[b] + gqb
+    ):
+        by_a, by_b, _how, _axis, _k, _ga, _gb, _gn = wp.grad(points_loss)(
+            box_of(a, code[0], shapes, bodies),
+            box_of(b, code[1], shapes, bodies),
+            code[2] // 16,
+            (code[2] // 4) % 4,
+            code[2] % 4,
+            ga,
+            gb,
+            gn,
+        )
+        ba.x[a] = ba.x[a] + by_a.x
+        ba.q[a] = ba.q[a] + by_a.q
+        ba.x[b] = ba.x[b] + by_b.x
+        ba.q[b] = ba.q[b] + by_b.q
 
     return SimpleNamespace(sweep_boxes=sweep_boxes)

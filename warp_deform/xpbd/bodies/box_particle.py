@@ -9,7 +9,7 @@ import warp as wp
 from ..contact.friction import friction
 from ..lanes.algebra import add, mul, sub  # noqa: F401  (operators are found by name)
 from ..lanes.structures import structures
-from .rigid_body import rigid
+from .rigid_body import rigid_body
 
 __all__ = ["box_particle"]
 
@@ -33,8 +33,8 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
     t = structures(scalar, lanes)
     S, R3 = t.S, t.R3
     Shapes, Particles, Bodies = t.Shapes, t.Particles, t.Bodies
-    body = rigid(scalar, lanes)
-    response, push_body, moved = body.response, body.push_body, body.moved
+    body = rigid_body(scalar, lanes)
+    response, apply_impulse, moved = body.response, body.apply_impulse, body.moved
     coulomb_scalar = friction(scalar, lanes).coulomb_scalar
 
     @wp.func
@@ -58,10 +58,18 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def project_box_particle(
-        i: int, lane: int, radius: S, shape: int, b: int, mu: S, push: S, q: Particles,
-        shapes: Shapes, bodies: Bodies,
-    ):  # fmt: skip
-        px = q.x[i]
+        i: int,
+        lane: int,
+        radius: S,
+        shape: int,
+        b: int,
+        mu: S,
+        max_recovery: S,
+        particles: Particles,
+        shapes: Shapes,
+        bodies: Bodies,
+    ):
+        px = particles.x[i]
         p = R3(px.x[lane], px.y[lane], px.z[lane])
         h = shapes.half[shape]
         # the particle in the box's own frame
@@ -89,11 +97,11 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
             local = shapes.center[shape] + wp.quat_rotate(shapes.rotation[shape], near)
             r = wp.quat_rotate(bodies.q[b], local)
             n = wp.quat_rotate(bodies.q[b], wp.quat_rotate(shapes.rotation[shape], n))
-            po = q.xp[i]
+            po = particles.xp[i]
             step = p - R3(po.x[lane], po.y[lane], po.z[lane]) - moved(b, bodies, local)
             approach = wp.dot(step, n)
-            depth = wp.min(radius - gap, wp.max(push - approach, S(0.0)))
-            wv = q.w[i]
+            depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
+            wv = particles.w[i]
             wi = wv[lane]
             yields = wi * stands(p[2], radius, n[2])
             across = wi + response(b, bodies, r, n)
@@ -107,8 +115,8 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
                 px.x[lane] = px.x[lane] + given[0]
                 px.y[lane] = px.y[lane] + given[1]
                 px.z[lane] = px.z[lane] + given[2]
-                q.x[i] = px
-                push_body(b, bodies, r, drag - along)
+                particles.x[i] = px
+                apply_impulse(b, bodies, r, drag - along)
             bodies.touching[b] = bodies.touching[b] + 1
             bodies.support[b] = bodies.support[b] + 1
 

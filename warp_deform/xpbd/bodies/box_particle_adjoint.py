@@ -9,10 +9,9 @@ import warp as wp
 from ..lanes.algebra import add, mul, sub  # noqa: F401  (operators are found by name)
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
-from ..lanes.tape import Kind
+from ..lanes.tape import Kind, tape
 from .box_particle import box_particle
-from .rigid_body import rigid
-from .rigid_body_adjoint import rigid_adjoint
+from .rigid_body import rigid_body
 
 __all__ = ["box_particle_adjoint"]
 
@@ -35,25 +34,74 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     get, put, get_mass, put_scalar = access.get, access.put, access.get_mass, access.put_scalar
     stands = box_particle(scalar, lanes).stands
     project_box_particle = box_particle(scalar, lanes).project_box_particle
-    turned = rigid(scalar, lanes).turned
-    poses = rigid_adjoint(scalar, lanes)
-    push_pose, position, quaternion = poses.push_pose, poses.position, poses.quaternion
+    turned = rigid_body(scalar, lanes).turned
+    tape_ = tape(scalar, lanes)
+    record_pose, position, quaternion = tape_.record_pose, tape_.position, tape_.quaternion
     TINY = 1.0e-36 if scalar is wp.float32 else 1.0e-200
+
+    @wp.struct
+    class ParticleValue:
+        """A particle before the contact."""
+
+        x: R3
+        xp: R3
+        w: S
+
+    @wp.struct
+    class BodyValue:
+        """A body before the contact."""
+
+        x: R3
+        q: Q
+        xp: R3
+        qp: Q
+        w: S
+        inverse_inertia: M33  # in its own frame, 0 while it is held
+
+    @wp.struct
+    class BoxValue:
+        """A box in the frame of its body."""
+
+        center: R3
+        rotation: Q
+        half: R3
+
+    @wp.func
+    def taped_body(at: int, b: int, bodies: Bodies, tape: Tape):
+        """Body b with the pose on the tape."""
+        body = BodyValue()
+        body.x = position(at, tape)
+        body.q = quaternion(at + 3, tape)
+        body.xp = bodies.xp[b]
+        body.qp = bodies.qp[b]
+        body.w = bodies.w[b]
+        body.inverse_inertia = M33()
+        if body.w > S(0.0):
+            body.inverse_inertia = bodies.inverse_inertia[b]
+        return body
+
+    @wp.func
+    def box_value(shape: int, shapes: Shapes):
+        box = BoxValue()
+        box.center = shapes.center[shape]
+        box.rotation = shapes.rotation[shape]
+        box.half = shapes.half[shape]
+        return box
 
     @wp.func
     def stick_share(moved2: S, budget: S):
-        """`coulomb_scalar` in a form with a slope at 0."""
+        """`coulomb_scalar` in a form that has a derivative at 0."""
         square = budget * budget
         return budget / wp.sqrt(wp.sqrt(wp.max(moved2 * moved2 + square * square, S(TINY))))
 
     @wp.func
-    def resists(w: S, inverse: M33, q: Q, r: R3, n: R3):
+    def response_of(w: S, inverse: M33, q: Q, r: R3, n: R3):
         rn = wp.quat_rotate_inv(q, wp.cross(r, n))
         return w + wp.dot(rn, inverse * rn)
 
     @wp.func
-    def pushed(x: R3, q: Q, w: S, inverse: M33, r: R3, impulse: R3, gx: R3, gq: Q):
-        """`push_body`, along the derivatives gx, gq."""
+    def impulse_loss(x: R3, q: Q, w: S, inverse: M33, r: R3, impulse: R3, gx: R3, gq: Q):
+        """The derivatives gx, gq times the pose that `apply_impulse` leaves."""
         arm = wp.quat_rotate_inv(q, wp.cross(r, impulse))
         to = turned(q, wp.quat_rotate(q, inverse * arm))
         return wp.dot(gx, x + impulse * w) + (
@@ -61,10 +109,33 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         )
 
     @wp.func
-    def met(
-        p: R3, po: R3, wi: S, x: R3, q: Q, xp: R3, qp: Q, w: S, mu: S, inverse: M33, center: R3,
-        rotation: Q, h: R3, radius: S, push: S, yielding: S, gp: R3, gx: R3, gq: Q,
-    ) -> S:  # fmt: skip
+    def contact_loss(
+        particle: ParticleValue,
+        body: BodyValue,
+        box: BoxValue,
+        mu: S,
+        radius: S,
+        max_recovery: S,
+        yielding: S,
+        by_particle: R3,
+        by_x: R3,
+        by_q: Q,
+    ) -> S:
+        """The derivatives `by_...` of the loss times what the contact leaves: `wp.grad` of this
+        takes the contact back.
+        """
+        p = particle.x
+        po = particle.xp
+        wi = particle.w
+        x = body.x
+        q = body.q
+        xp = body.xp
+        qp = body.qp
+        w = body.w
+        inverse = body.inverse_inertia
+        center = box.center
+        rotation = box.rotation
+        h = box.half
         away = wp.quat_rotate_inv(q, p - x) - center
         at = wp.quat_rotate_inv(rotation, away)
         near = R3(
@@ -91,28 +162,40 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         m = wp.quat_rotate(q, wp.quat_rotate(rotation, n))
         step = p - po - (x + r - (xp + wp.quat_rotate(qp, local)))
         approach = wp.dot(step, m)
-        depth = wp.min(radius - gap, wp.max(push - approach, S(0.0)))
-        body = resists(w, inverse, q, r, m)
-        across = wi + body
-        total = wi * yielding + body
+        depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
+        response = response_of(w, inverse, q, r, m)
+        across = wi + response
+        total = wi * yielding + response
         slip = step - m * approach
         budget = depth * mu * across / total
         along = m * (depth / total)
         drag = slip * (stick_share(wp.dot(slip, slip), budget) / across)
         end = p + along * (wi * yielding) - drag * wi
-        return wp.dot(gp, end) + pushed(x, q, w, inverse, r, drag - along, gx, gq)
+        return wp.dot(by_particle, end) + impulse_loss(
+            x, q, w, inverse, r, drag - along, by_x, by_q
+        )
 
     @wp.func
     def record_box_particle(
-        at: int, i: int, lane: int, radius: S, shape: int, b: int, mu: S, push: S, q: Particles,
-        shapes: Shapes, bodies: Bodies, tape: Tape,
-    ):  # fmt: skip
+        at: int,
+        i: int,
+        lane: int,
+        radius: S,
+        shape: int,
+        b: int,
+        mu: S,
+        max_recovery: S,
+        particles: Particles,
+        shapes: Shapes,
+        bodies: Bodies,
+        tape: Tape,
+    ):
         before = bodies.touching[b]
-        p = q.x[i]
-        o = q.xp[i]
+        p = particles.x[i]
+        o = particles.xp[i]
         x = bodies.x[b]
         turn = bodies.q[b]
-        project_box_particle(i, lane, radius, shape, b, mu, push, q, shapes, bodies)
+        project_box_particle(i, lane, radius, shape, b, mu, max_recovery, particles, shapes, bodies)
         hit = bodies.touching[b] > before
         if hit:
             tape.s[at] = p.x[lane]
@@ -121,20 +204,18 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             tape.s[at + 3] = o.x[lane]
             tape.s[at + 4] = o.y[lane]
             tape.s[at + 5] = o.z[lane]
-            push_pose(at + 6, x, turn, tape)
+            record_pose(at + 6, x, turn, tape)
         return hit
 
     @wp.func
-    def add_to_body(
-        b: int, w: S, gx: R3, gq: Q, gxp: R3, gqp: Q, gw: S, ba: BodyAdjoint
-    ):  # fmt: skip
-        """gx, gq take the place of what was there: a push leaves the rest of a pose as it was."""
-        ba.x[b] = gx
-        ba.q[b] = gq
-        ba.xp[b] = ba.xp[b] + gxp
-        ba.qp[b] = ba.qp[b] + gqp
+    def add_to_body(b: int, w: S, g: BodyValue, ba: BodyAdjoint):
+        """g.x, g.q take the place of what was there: they include what the contact left alone."""
+        ba.x[b] = g.x
+        ba.q[b] = g.q
+        ba.xp[b] = ba.xp[b] + g.xp
+        ba.qp[b] = ba.qp[b] + g.qp
         if w > S(0.0):
-            ba.w[b] = ba.w[b] + gw
+            ba.w[b] = ba.w[b] + g.w
 
     @wp.func
     def add_mass(i: int, lane: int, w: S, g: S, adj: Adjoint):
@@ -143,28 +224,39 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def sweep_box_particle(
-        at: int, i: int, lane: int, radius: S, shape: int, b: int, mu: S, push: S, counts: int,
-        shapes: Shapes, bodies: Bodies, tape: Tape, ba: BodyAdjoint, adj: Adjoint,
-    ):  # fmt: skip
+        at: int,
+        i: int,
+        lane: int,
+        radius: S,
+        shape: int,
+        b: int,
+        mu: S,
+        max_recovery: S,
+        counts: int,
+        shapes: Shapes,
+        bodies: Bodies,
+        tape: Tape,
+        ba: BodyAdjoint,
+        adj: Adjoint,
+    ):
         by_mu = S(0.0)
-        p = position(at, tape)
-        x = position(at + 6, tape)
-        q = quaternion(at + 9, tape)
-        wi = get_mass(adj.w_flat, i, lane)
+        particle = ParticleValue()
+        particle.x = position(at, tape)
+        particle.xp = position(at + 3, tape)
+        particle.w = get_mass(adj.w_flat, i, lane)
+        body = taped_body(at + 6, b, bodies, tape)
+        box = box_value(shape, shapes)
         kind = counts + wp.static(int(Kind.BOX_PARTICLE))
         count_one(kind, lane, adj)
-        inverse = M33()
-        if bodies.w[b] > S(0.0):
-            inverse = bodies.inverse_inertia[b]
-        center = shapes.center[shape]
-        rotation = shapes.rotation[shape]
-        h = shapes.half[shape]
+        h = box.half
         # which way the box pushes decides whether the table carries the particle
-        inside = wp.quat_rotate_inv(rotation, wp.quat_rotate_inv(q, p - x) - center)
+        away = wp.quat_rotate_inv(body.q, particle.x - body.x) - box.center
+        inside = wp.quat_rotate_inv(box.rotation, away)
         near = R3(
-            wp.clamp(inside[0], -h[0], h[0]), wp.clamp(inside[1], -h[1], h[1]),
+            wp.clamp(inside[0], -h[0], h[0]),
+            wp.clamp(inside[1], -h[1], h[1]),
             wp.clamp(inside[2], -h[2], h[2]),
-        )  # fmt: skip
+        )
         n = inside - near
         if wp.length(n) > S(1.0e-8):
             n = n / wp.length(n)
@@ -177,26 +269,41 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
                 n = R3(wp.sign(inside[0]), S(0.0), S(0.0))
             elif oy >= oz:
                 n = R3(S(0.0), wp.sign(inside[1]), S(0.0))
-        down = wp.quat_rotate(q, wp.quat_rotate(rotation, n))[2]
-        yielding = stands(p[2], radius, down)
-        if wi * yielding + bodies.w[b] > S(0.0):
+        down = wp.quat_rotate(body.q, wp.quat_rotate(box.rotation, n))[2]
+        yielding = stands(particle.x[2], radius, down)
+        if particle.w * yielding + bodies.w[b] > S(0.0):
             rub = shapes.friction[shape]
-            (
-                gp, gpo, gwi, gx, gq, gxp, gqp, gw, g_mu, _i, _c, _r, _h, _ra, _pu, _y, _g, _gx, _gq
-            ) = wp.grad(met)(
-                p, position(at + 3, tape), wi, x, q, bodies.xp[b], bodies.qp[b], bodies.w[b],
-                mu * rub, inverse, center, rotation, h, radius, push, yielding,
-                get(adj.x_flat, i, lane), ba.x[b], ba.q[b],
-            )  # fmt: skip
-            put(adj.x_flat, i, lane, gp)
-            put(adj.xp_flat, i, lane, get(adj.xp_flat, i, lane) + gpo)
-            add_mass(i, lane, wi, gwi, adj)
-            add_to_body(b, bodies.w[b], gx, gq, gxp, gqp, gw, ba)
+            g, g_body, _box, g_mu, _radius, _recovery, _yielding, _p, _x, _q = wp.grad(
+                contact_loss
+            )(
+                particle,
+                body,
+                box,
+                mu * rub,
+                radius,
+                max_recovery,
+                yielding,
+                get(adj.x_flat, i, lane),
+                ba.x[b],
+                ba.q[b],
+            )
+            put(adj.x_flat, i, lane, g.x)
+            put(adj.xp_flat, i, lane, get(adj.xp_flat, i, lane) + g.xp)
+            add_mass(i, lane, particle.w, g.w, adj)
+            add_to_body(b, body.w, g_body, ba)
             by_mu = g_mu * rub
         return by_mu
 
     return SimpleNamespace(
-        record_box_particle=record_box_particle, sweep_box_particle=sweep_box_particle,
-        stick_share=stick_share, resists=resists, pushed=pushed, add_to_body=add_to_body,
+        record_box_particle=record_box_particle,
+        sweep_box_particle=sweep_box_particle,
+        stick_share=stick_share,
+        response_of=response_of,
+        impulse_loss=impulse_loss,
+        BodyValue=BodyValue,
+        BoxValue=BoxValue,
+        taped_body=taped_body,
+        box_value=box_value,
+        add_to_body=add_to_body,
         add_mass=add_mass,
-    )  # fmt: skip
+    )

@@ -28,17 +28,23 @@ def box_table(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     def corner(shape: int, c: int, shapes: Shapes):
         """Corner c (0..7) of a shape in the body's frame [m]."""
         h = shapes.half[shape]
-        sign = R3(
-            S(2.0) * S(c & 1) - S(1.0), S((c & 2) - 1), S(2.0) * S((c & 4) >> 2) - S(1.0)
-        )  # fmt: skip
+        sign = R3(S(2.0) * S(c & 1) - S(1.0), S((c & 2) - 1), S(2.0) * S((c & 4) >> 2) - S(1.0))
         at = wp.quat_rotate(shapes.rotation[shape], wp.cw_mul(h, sign))
         return shapes.center[shape] + at
 
     @wp.func
     def list_table(
-        c: int, b: int, local: int, first: int, last: int, mu: S, push: S, shapes: Shapes,
-        bodies: Bodies, contacts: Contacts,
-    ):  # fmt: skip
+        c: int,
+        b: int,
+        local: int,
+        first: int,
+        last: int,
+        mu: S,
+        max_recovery: S,
+        shapes: Shapes,
+        bodies: Bodies,
+        contacts: Contacts,
+    ):
         start = int(c)
         up = R3(S(0.0), S(0.0), S(1.0))
         for shape in range(first, last):
@@ -48,7 +54,9 @@ def box_table(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
                     if p[2] < S(AHEAD):
                         foot = R3(p[0], p[1], S(0.0))
                         table_mu = mu * shapes.friction[shape]
-                        list_contact(c, -1, b, foot, p, up, table_mu, push, bodies, contacts)
+                        list_contact(
+                            c, -1, b, foot, p, up, table_mu, max_recovery, bodies, contacts
+                        )
                         if wp.static(noted):
                             contacts.code[c] = wp.vec4i(-1, shape, k, 0)
                         c += 1

@@ -17,7 +17,7 @@ from ..contact.friction import friction
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from .box_particle import box_particle
-from .rigid_body import rigid
+from .rigid_body import rigid_body
 
 __all__ = ["box_triangle"]
 
@@ -36,8 +36,8 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
     S, R3, L = t.S, t.R3, t.L
     Shapes, Bodies, Topology = t.Shapes, t.Bodies, t.Topology
     Sheets, Cells = t.Sheets, t.Cells
-    body = rigid(scalar, lanes)
-    response, push_body, moved = body.response, body.push_body, body.moved
+    body = rigid_body(scalar, lanes)
+    response, apply_impulse, moved = body.response, body.apply_impulse, body.moved
     coulomb_scalar = friction(scalar, lanes).coulomb_scalar
     access = lane_access(scalar, lanes)
     get, put, get_mass = access.get, access.put, access.get_mass
@@ -69,9 +69,15 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
         }}
         return f;""")
     def next_near(
-        triangle: wp.array(dtype=wp.vec3i), x: wp.array(dtype=S), f: int, end: int, p0: int,
-        lane: int, m: R3, wide: S,
-    ) -> int: ...  # fmt: skip
+        triangle: wp.array(dtype=wp.vec3i),
+        x: wp.array(dtype=S),
+        f: int,
+        end: int,
+        p0: int,
+        lane: int,
+        m: R3,
+        wide: S,
+    ) -> int: ...
 
     @wp.func
     def corner_towards(h: R3, n: R3):
@@ -134,9 +140,21 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def project_box_triangle(
-        f: int, lane: int, p0: int, radii: int, shape: int, b: int, center: R3, mu: S, push: S,
-        top: Topology, shapes: Shapes, bodies: Bodies, sheets: Sheets, cells: Cells,
-    ):  # fmt: skip
+        f: int,
+        lane: int,
+        p0: int,
+        radii: int,
+        shape: int,
+        b: int,
+        center: R3,
+        mu: S,
+        max_recovery: S,
+        top: Topology,
+        shapes: Shapes,
+        bodies: Bodies,
+        sheets: Sheets,
+        cells: Cells,
+    ):
         """Returns whether the two met, which may have moved the box."""
         met = bool(False)
         tri = sheets.triangle[f]
@@ -197,7 +215,7 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
                 step += (xb - get(cells.xp, ib, lane)) * u[1]
                 step += (xc - get(cells.xp, ic, lane)) * u[2]
                 approach = wp.dot(step, n)
-                depth = wp.min(radius - gap, wp.max(push - approach, S(0.0)))
+                depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
                 wa = get_mass(cells.w, ia, lane)
                 wb = get_mass(cells.w, ib, lane)
                 wc = get_mass(cells.w, ic, lane)
@@ -217,7 +235,7 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
                     put(cells.x, ia, lane, xa + (along * ya - drag * wa) * u[0])
                     put(cells.x, ib, lane, xb + (along * yb - drag * wb) * u[1])
                     put(cells.x, ic, lane, xc + (along * yc - drag * wc) * u[2])
-                    push_body(b, bodies, r, drag - along)
+                    apply_impulse(b, bodies, r, drag - along)
                 bodies.touching[b] = bodies.touching[b] + 1
                 bodies.support[b] = bodies.support[b] + 1
                 met = True
@@ -225,20 +243,48 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def project_box_triangles(
-        lane: int, k: int, p0: int, radii: int, shape: int, b: int, wide: S, mu: S, push: S,
-        top: Topology, shapes: Shapes, bodies: Bodies, sheets: Sheets, cells: Cells,
-    ):  # fmt: skip
+        lane: int,
+        k: int,
+        p0: int,
+        radii: int,
+        shape: int,
+        b: int,
+        wide: S,
+        mu: S,
+        max_recovery: S,
+        top: Topology,
+        shapes: Shapes,
+        bodies: Bodies,
+        sheets: Sheets,
+        cells: Cells,
+    ):
         center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
         end = sheets.first[k + 1]
         f = next_near(sheets.triangle, cells.x, sheets.first[k], end, p0, lane, center, wide)
         while f < end:
             if project_box_triangle(
-                f, lane, p0, radii, shape, b, center, mu, push, top, shapes, bodies, sheets, cells
+                f,
+                lane,
+                p0,
+                radii,
+                shape,
+                b,
+                center,
+                mu,
+                max_recovery,
+                top,
+                shapes,
+                bodies,
+                sheets,
+                cells,
             ):
                 center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
             f = next_near(sheets.triangle, cells.x, f + 1, end, p0, lane, center, wide)
 
     return SimpleNamespace(
-        project_box_triangles=project_box_triangles, project_box_triangle=project_box_triangle,
-        separate=separate, corner_towards=corner_towards, next_near=next_near,
-    )  # fmt: skip
+        project_box_triangles=project_box_triangles,
+        project_box_triangle=project_box_triangle,
+        separate=separate,
+        corner_towards=corner_towards,
+        next_near=next_near,
+    )

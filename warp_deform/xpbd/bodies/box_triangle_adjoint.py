@@ -9,11 +9,10 @@ import warp as wp
 from ..contact.closest_point import closest_point
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
-from ..lanes.tape import BODY_WORDS, BOX_TRIANGLE_SCALARS, Kind
+from ..lanes.tape import BODY_WORDS, BOX_TRIANGLE_SCALARS, Kind, tape
 from .box_particle import box_particle
 from .box_particle_adjoint import box_particle_adjoint
 from .box_triangle import box_triangle
-from .rigid_body_adjoint import rigid_adjoint
 
 __all__ = ["box_triangle_adjoint"]
 
@@ -28,7 +27,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     of the triangle; depth limited by the overlap or by `recovery`; corners that the table carries.
     """
     t = structures(scalar, lanes)
-    S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
+    S, R3, Q = t.S, t.R3, t.Q
     Shapes, Bodies, Topology = t.Shapes, t.Bodies, t.Topology
     Sheets, Cells, Tape = t.Sheets, t.Cells, t.Tape
     Adjoint, BodyAdjoint = t.Adjoint, t.BodyAdjoint
@@ -41,39 +40,94 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     separate, corner_towards = solve.separate, solve.corner_towards
     project_box_triangle, next_near = solve.project_box_triangle, solve.next_near
     particle_ = box_particle_adjoint(scalar, lanes)
-    stick_share, resists, pushed = particle_.stick_share, particle_.resists, particle_.pushed
+    stick_share, response_of = particle_.stick_share, particle_.response_of
+    impulse_loss = particle_.impulse_loss
+    BodyValue, BoxValue = particle_.BodyValue, particle_.BoxValue
+    taped_body, box_value = particle_.taped_body, particle_.box_value
     add_to_body, add_mass = particle_.add_to_body, particle_.add_mass
-    poses = rigid_adjoint(scalar, lanes)
-    push_pose, position, quaternion = poses.push_pose, poses.position, poses.quaternion
+    tape_ = tape(scalar, lanes)
+    record_pose, position = tape_.record_pose, tape_.position
+
+    @wp.struct
+    class Corners:
+        """A triangle's corners before the contact, where they began the substep, inverse masses."""
+
+        a: R3
+        b: R3
+        c: R3
+        a_start: R3
+        b_start: R3
+        c_start: R3
+        wa: S
+        wb: S
+        wc: S
+
+    @wp.struct
+    class AfterContact:
+        """Derivatives of the loss by the corners and the pose after the contact."""
+
+        a: R3
+        b: R3
+        c: R3
+        x: R3
+        q: Q
 
     @wp.func
     def record_box_triangles(
-        word: int, at: int, lane: int, k: int, p0: int, radii: int, shape: int, number: int, b: int,
-        wide: S, mu: S, push: S, top: Topology, shapes: Shapes, bodies: Bodies, sheets: Sheets,
-        cells: Cells, tape: Tape,
-    ):  # fmt: skip
-        found = int(0)
+        word: int,
+        at: int,
+        lane: int,
+        k: int,
+        p0: int,
+        radii: int,
+        shape: int,
+        number: int,
+        b: int,
+        wide: S,
+        mu: S,
+        max_recovery: S,
+        top: Topology,
+        shapes: Shapes,
+        bodies: Bodies,
+        sheets: Sheets,
+        cells: Cells,
+        tape: Tape,
+    ):
+        count = int(0)
         center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
         end = sheets.first[k + 1]
         f = next_near(sheets.triangle, cells.x, sheets.first[k], end, p0, lane, center, wide)
         while f < end:
             tri = sheets.triangle[f]
             # what does not meet the box is overwritten by the next one
-            s = at + found * wp.static(BOX_TRIANGLE_SCALARS)
+            s = at + count * wp.static(BOX_TRIANGLE_SCALARS)
             for corner in range(3):
                 x = get(cells.x, p0 + tri[corner], lane)
                 for axis in range(3):
                     tape.s[s + 3 * corner + axis] = x[axis]
-            push_pose(s + 9, bodies.x[b], bodies.q[b], tape)
+            record_pose(s + 9, bodies.x[b], bodies.q[b], tape)
             if project_box_triangle(
-                f, lane, p0, radii, shape, b, center, mu, push, top, shapes, bodies, sheets, cells
+                f,
+                lane,
+                p0,
+                radii,
+                shape,
+                b,
+                center,
+                mu,
+                max_recovery,
+                top,
+                shapes,
+                bodies,
+                sheets,
+                cells,
             ):
                 center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
-                tape.k[word + found * wp.static(BODY_WORDS)] = -1 - f
-                tape.k[word + found * wp.static(BODY_WORDS) + 1] = number
-                found += 1
+                tape.k[word + count * wp.static(BODY_WORDS)] = -1 - f
+                tape.k[word + count * wp.static(BODY_WORDS) + 1] = number
+                count += 1
             f = next_near(sheets.triangle, cells.x, f + 1, end, p0, lane, center, wide)
-        return found
+        return count
 
     @wp.func
     def axis_of(kind: int, a: R3, e: R3, c: R3):
@@ -108,9 +162,10 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     def weights_and_point(kind: int, n: R3, from_: R3, way: R3, a: R3, e: R3, c: R3, h: R3):
         """Weights of the corners and the box's point, before the two slide beside each other."""
         near = R3(
-            wp.where(n[0] < S(0.0), -h[0], h[0]), wp.where(n[1] < S(0.0), -h[1], h[1]),
+            wp.where(n[0] < S(0.0), -h[0], h[0]),
+            wp.where(n[1] < S(0.0), -h[1], h[1]),
             wp.where(n[2] < S(0.0), -h[2], h[2]),
-        )  # fmt: skip
+        )
         u = R3()
         point = near
         if kind == 1:
@@ -144,11 +199,39 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return on - at, at
 
     @wp.func
-    def met(
-        xa: R3, xb: R3, xc: R3, oa: R3, ob: R3, oc: R3, wa: S, wb: S, wc: S, x: R3, q: Q, xp: R3,
-        qp: Q, w: S, mu: S, inverse: M33, center: R3, rotation: Q, h: R3, radius: S, push: S,
-        kind: int, apart: int, yielding: R3, ga: R3, gb: R3, gc: R3, gx: R3, gq: Q,
-    ) -> S:  # fmt: skip
+    def contact_loss(
+        corners: Corners,
+        body: BodyValue,
+        box: BoxValue,
+        mu: S,
+        radius: S,
+        max_recovery: S,
+        kind: int,
+        apart: int,
+        yielding: R3,
+        after: AfterContact,
+    ) -> S:
+        """The derivatives `after` the contact times what it leaves: `wp.grad` of this takes it
+        back.
+        """
+        xa = corners.a
+        xb = corners.b
+        xc = corners.c
+        oa = corners.a_start
+        ob = corners.b_start
+        oc = corners.c_start
+        wa = corners.wa
+        wb = corners.wb
+        wc = corners.wc
+        x = body.x
+        q = body.q
+        xp = body.xp
+        qp = body.qp
+        w = body.w
+        inverse = body.inverse_inertia
+        center = box.center
+        rotation = box.rotation
+        h = box.half
         turn = q * rotation
         middle = x + wp.quat_rotate(q, center)
         a = wp.quat_rotate_inv(turn, xa - middle)
@@ -158,9 +241,10 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         u, point = weights_and_point(kind, m, from_, way, a, e, c, h)
         off, at = beside(a, e, c, u, h)
         corner = R3(
-            wp.where(m[0] < S(0.0), -h[0], h[0]), wp.where(m[1] < S(0.0), -h[1], h[1]),
+            wp.where(m[0] < S(0.0), -h[0], h[0]),
+            wp.where(m[1] < S(0.0), -h[1], h[1]),
             wp.where(m[2] < S(0.0), -h[2], h[2]),
-        )  # fmt: skip
+        )
         gap = wp.dot(m, from_ - corner)
         n = m
         near = point
@@ -174,28 +258,43 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         step = (xa - oa) * u[0] + (xb - ob) * u[1] + (xc - oc) * u[2]
         slid = step - (x + r - (xp + wp.quat_rotate(qp, local)))
         approach = wp.dot(slid, out)
-        depth = wp.min(radius - gap, wp.max(push - approach, S(0.0)))
-        body = resists(w, inverse, q, r, out)
+        depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
+        response = response_of(w, inverse, q, r, out)
         ya = wa * yielding[0]
         yb = wb * yielding[1]
         yc = wc * yielding[2]
-        total = ya * u[0] * u[0] + yb * u[1] * u[1] + yc * u[2] * u[2] + body
-        across = wa * u[0] * u[0] + wb * u[1] * u[1] + wc * u[2] * u[2] + body
+        total = ya * u[0] * u[0] + yb * u[1] * u[1] + yc * u[2] * u[2] + response
+        across = wa * u[0] * u[0] + wb * u[1] * u[1] + wc * u[2] * u[2] + response
         slip = slid - out * approach
         budget = depth * mu * across / total
         along = out * (depth / total)
         drag = slip * (stick_share(wp.dot(slip, slip), budget) / across)
-        ends = wp.dot(ga, xa + (along * ya - drag * wa) * u[0])
-        ends += wp.dot(gb, xb + (along * yb - drag * wb) * u[1])
-        ends += wp.dot(gc, xc + (along * yc - drag * wc) * u[2])
-        return ends + pushed(x, q, w, inverse, r, drag - along, gx, gq)
+        ends = wp.dot(after.a, xa + (along * ya - drag * wa) * u[0])
+        ends += wp.dot(after.b, xb + (along * yb - drag * wb) * u[1])
+        ends += wp.dot(after.c, xc + (along * yc - drag * wc) * u[2])
+        return ends + impulse_loss(x, q, w, inverse, r, drag - along, after.x, after.q)
 
     @wp.func
     def sweep_box_triangle(
-        at: int, face: int, finished: int, lane: int, p0: int, radii: int, shape: int, b: int,
-        mu: S, push: S, counts: int, top: Topology, shapes: Shapes, bodies: Bodies, sheets: Sheets,
-        tape: Tape, ba: BodyAdjoint, adj: Adjoint,
-    ):  # fmt: skip
+        at: int,
+        face: int,
+        finished: int,
+        lane: int,
+        p0: int,
+        radii: int,
+        shape: int,
+        b: int,
+        mu: S,
+        max_recovery: S,
+        counts: int,
+        top: Topology,
+        shapes: Shapes,
+        bodies: Bodies,
+        sheets: Sheets,
+        tape: Tape,
+        ba: BodyAdjoint,
+        adj: Adjoint,
+    ):
         by_mu = S(0.0)
         tri = sheets.triangle[face]
         ia = p0 + tri[0]
@@ -204,20 +303,15 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         xa = position(at, tape)
         xb = position(at + 3, tape)
         xc = position(at + 6, tape)
-        x = position(at + 9, tape)
-        q = quaternion(at + 12, tape)
+        body = taped_body(at + 9, b, bodies, tape)
+        box = box_value(shape, shapes)
+        h = box.half
         kind = counts + wp.static(int(Kind.BOX_TRIANGLE))
         count_one(kind, lane, adj)
-        inverse = M33()
-        if bodies.w[b] > S(0.0):
-            inverse = bodies.inverse_inertia[b]
-        center = shapes.center[shape]
-        rotation = shapes.rotation[shape]
-        h = shapes.half[shape]
         radius = top.radius[radii + tri[0]]
         # the branch that the forward pass took
-        turn = q * rotation
-        middle = x + wp.quat_rotate(q, center)
+        turn = body.q * box.rotation
+        middle = body.x + wp.quat_rotate(body.q, box.center)
         a = wp.quat_rotate_inv(turn, xa - middle)
         e = wp.quat_rotate_inv(turn, xb - middle)
         c = wp.quat_rotate_inv(turn, xc - middle)
@@ -259,29 +353,37 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             stands(xc[2], top.radius[radii + tri[2]], down),
         )
         given = wa * yielding[0] * u[0] + wb * yielding[1] * u[1] + wc * yielding[2] * u[2]
-        if given + bodies.w[b] > S(0.0):
+        if given + body.w > S(0.0):
             rub = shapes.friction[shape]
-            (
-                ga, gb, gc, goa, gob, goc, gwa, gwb, gwc, gx, gq, gxp, gqp, gw, g_mu, _i, _c, _r,
-                _h, _ra, _pu, _k, _ap, _y, _ga, _gb, _gc, _gx, _gq,
-            ) = wp.grad(met)(
-                xa, xb, xc, get(tape.x_flat, finished + 3 * tri[0] + 1, lane),
-                get(tape.x_flat, finished + 3 * tri[1] + 1, lane),
-                get(tape.x_flat, finished + 3 * tri[2] + 1, lane), wa, wb, wc, x, q, bodies.xp[b],
-                bodies.qp[b], bodies.w[b], mu * rub, inverse, center, rotation, h, radius, push,
-                which, apart, yielding, get(adj.x_flat, ia, lane), get(adj.x_flat, ib, lane),
-                get(adj.x_flat, ic, lane), ba.x[b], ba.q[b],
-            )  # fmt: skip
-            put(adj.x_flat, ia, lane, ga)
-            put(adj.x_flat, ib, lane, gb)
-            put(adj.x_flat, ic, lane, gc)
-            put(adj.xp_flat, ia, lane, get(adj.xp_flat, ia, lane) + goa)
-            put(adj.xp_flat, ib, lane, get(adj.xp_flat, ib, lane) + gob)
-            put(adj.xp_flat, ic, lane, get(adj.xp_flat, ic, lane) + goc)
-            add_mass(ia, lane, wa, gwa, adj)
-            add_mass(ib, lane, wb, gwb, adj)
-            add_mass(ic, lane, wc, gwc, adj)
-            add_to_body(b, bodies.w[b], gx, gq, gxp, gqp, gw, ba)
+            corners = Corners()
+            corners.a = xa
+            corners.b = xb
+            corners.c = xc
+            corners.a_start = get(tape.x_flat, finished + 3 * tri[0] + 1, lane)
+            corners.b_start = get(tape.x_flat, finished + 3 * tri[1] + 1, lane)
+            corners.c_start = get(tape.x_flat, finished + 3 * tri[2] + 1, lane)
+            corners.wa = wa
+            corners.wb = wb
+            corners.wc = wc
+            after = AfterContact()
+            after.a = get(adj.x_flat, ia, lane)
+            after.b = get(adj.x_flat, ib, lane)
+            after.c = get(adj.x_flat, ic, lane)
+            after.x = ba.x[b]
+            after.q = ba.q[b]
+            g, g_body, _box, g_mu, _radius, _recovery, _kind, _apart, _yielding, _after = wp.grad(
+                contact_loss
+            )(corners, body, box, mu * rub, radius, max_recovery, which, apart, yielding, after)
+            put(adj.x_flat, ia, lane, g.a)
+            put(adj.x_flat, ib, lane, g.b)
+            put(adj.x_flat, ic, lane, g.c)
+            put(adj.xp_flat, ia, lane, get(adj.xp_flat, ia, lane) + g.a_start)
+            put(adj.xp_flat, ib, lane, get(adj.xp_flat, ib, lane) + g.b_start)
+            put(adj.xp_flat, ic, lane, get(adj.xp_flat, ic, lane) + g.c_start)
+            add_mass(ia, lane, wa, g.wa, adj)
+            add_mass(ib, lane, wb, g.wb, adj)
+            add_mass(ic, lane, wc, g.wc, adj)
+            add_to_body(b, body.w, g_body, ba)
             by_mu = g_mu * rub
         return by_mu
 

@@ -13,7 +13,7 @@ import warp as wp
 
 from ..lanes.structures import structures
 
-__all__ = ["rigid"]
+__all__ = ["rigid_body"]
 
 SLEEP_SPEED = 0.004
 """A supported body slower than this [m/s] stays where it is: without it, the order in which the
@@ -24,8 +24,8 @@ SLEEP_TURN = 0.05
 
 
 @functools.cache
-def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`predict_body`, `push_body`, `finish_body` and what they share."""
+def rigid_body(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`predict_body`, `apply_impulse`, `finish_body` and what they share."""
     t = structures(scalar, lanes)
     S, R3, Q, Bodies = t.S, t.R3, t.Q, t.Bodies
 
@@ -50,7 +50,7 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
         return bodies.w[b] + wp.dot(rn, inverse_inertia(b, bodies, rn))
 
     @wp.func
-    def push_body(b: int, bodies: Bodies, r: R3, impulse: R3):
+    def apply_impulse(b: int, bodies: Bodies, r: R3, impulse: R3):
         """Apply a positional impulse [kg m] at offset r from the centre of mass."""
         if bodies.w[b] > S(0.0):
             rotation = inverse_inertia(b, bodies, wp.cross(r, impulse))
@@ -69,38 +69,38 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
         return bodies.inverse_inertia[b] * wp.cross(omega, bodies.inertia[b] * omega)
 
     @wp.func
-    def predict_body(b: int, dt: S, kept: S, gravity: R3, bodies: Bodies):
+    def predict_body(b: int, dt: S, damping_factor: S, gravity: R3, bodies: Bodies):
         x = bodies.x[b]
         q = bodies.q[b]
         bodies.xp[b] = x
         bodies.qp[b] = q
         if bodies.w[b] > S(0.0):
-            bodies.x[b] = x + (bodies.v[b] + gravity * dt) * (dt * kept)
+            bodies.x[b] = x + (bodies.v[b] + gravity * dt) * (dt * damping_factor)
             omega = wp.quat_rotate_inv(q, bodies.omega[b])
             # Euler's equations by the midpoint rule: one Euler step would feed energy in
             half = omega - spin_down(b, omega, bodies) * (S(0.5) * dt)
             omega = omega - spin_down(b, half, bodies) * dt
-            bodies.q[b] = turned(q, wp.quat_rotate(q, omega) * (dt * kept))
+            bodies.q[b] = turned(q, wp.quat_rotate(q, omega) * (dt * damping_factor))
 
     @wp.func
-    def stepped_body(b: int, dt: S, kept: S, gravity: R3, bodies: Bodies):
+    def stepped_body(b: int, dt: S, damping_factor: S, gravity: R3, bodies: Bodies):
         """Step of the centre of mass, exact far from the origin (see `table_contact`) [m]."""
         step = R3()
         if bodies.w[b] > S(0.0):
-            step = (bodies.v[b] + gravity * dt) * (dt * kept)
+            step = (bodies.v[b] + gravity * dt) * (dt * damping_factor)
         return step + (bodies.x[b] - (bodies.xp[b] + step))
 
     @wp.func
     def finish_body(
-        b: int, dt: S, kept: S, gravity: R3, fastest: S, drowsy: S, bodies: Bodies
-    ):  # fmt: skip
+        b: int, dt: S, damping_factor: S, gravity: R3, fastest: S, drowsy: S, bodies: Bodies
+    ):
         """Velocities from the substep; returns the squared step of the centre of mass [m^2], with
         the turning counted at 2 cm from it.
 
         drowsy: factor on the speeds of sleep; above 1 (late in a world of fabrics, where light
         layers under a box give way for ever) a sleeper loses its velocity as well.
         """
-        d = stepped_body(b, dt, kept, gravity, bodies)
+        d = stepped_body(b, dt, damping_factor, gravity, bodies)
         # the inverse of `turned`, which turns by twice the arc tangent of half the vector's length
         turn = bodies.q[b] * wp.quat_inverse(bodies.qp[b])
         rotation = R3(turn[0], turn[1], turn[2]) * (S(2.0) / turn[3])
@@ -119,6 +119,11 @@ def rigid(scalar: Any, lanes: int) -> SimpleNamespace:
         return wp.dot(d, d) + wp.dot(rotation, rotation) * S(4.0e-4)
 
     return SimpleNamespace(
-        turned=turned, response=response, push_body=push_body, moved=moved,
-        predict_body=predict_body, stepped_body=stepped_body, finish_body=finish_body,
-    )  # fmt: skip
+        turned=turned,
+        response=response,
+        apply_impulse=apply_impulse,
+        moved=moved,
+        predict_body=predict_body,
+        stepped_body=stepped_body,
+        finish_body=finish_body,
+    )

@@ -1,4 +1,4 @@
-"""Adjoint of the motion of rigid bodies, see `rigid`.
+"""Adjoint of the motion of rigid bodies, see `rigid_body`.
 
 Derivatives by a quaternion are those by its four numbers: what a function does is differentiated as
 it is computed. Scalar functions without state are differentiated by `wp.grad`. They say again what
@@ -14,17 +14,17 @@ import warp as wp
 
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
-from ..lanes.tape import BODY_SCALARS, Kind
-from .rigid_body import SLEEP_SPEED, SLEEP_TURN, rigid
+from ..lanes.tape import Kind, tape
+from .rigid_body import SLEEP_SPEED, SLEEP_TURN, rigid_body
 
-__all__ = ["rigid_adjoint"]
+__all__ = ["rigid_body_adjoint"]
 
 AWAKE, STAYS, STOPS = 0, 1, 2
 """A sleeping body stays where it was; late in a world of fabrics it loses its velocity as well."""
 
 
 @functools.cache
-def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+def rigid_body_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     """`record_body` leaves pose, old pose and twist on the tape just before `finish_body` and
     returns whether the body falls asleep; `load_body` brings them back, `sweep_finish_body` and
     `sweep_predict_body` take a body's end and beginning of a substep back.
@@ -32,30 +32,24 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     t = structures(scalar, lanes)
     S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
     Bodies, Tape, Adjoint, BodyAdjoint = t.Bodies, t.Tape, t.Adjoint, t.BodyAdjoint
+    tape_ = tape(scalar, lanes)
+    record_pose, position, quaternion = tape_.record_pose, tape_.position, tape_.quaternion
     count_one = lane_access(scalar, lanes).count_one
-    turned, stepped_body = rigid(scalar, lanes).turned, rigid(scalar, lanes).stepped_body
-
-    @wp.func
-    def push_pose(at: int, x: R3, q: Q, tape: Tape):
-        for k in range(3):
-            tape.s[at + k] = x[k]
-        for k in range(4):
-            tape.s[at + 3 + k] = q[k]
-
-    @wp.func
-    def position(at: int, tape: Tape):
-        return R3(tape.s[at], tape.s[at + 1], tape.s[at + 2])
-
-    @wp.func
-    def quaternion(at: int, tape: Tape):
-        return Q(tape.s[at], tape.s[at + 1], tape.s[at + 2], tape.s[at + 3])
+    turned, stepped_body = rigid_body(scalar, lanes).turned, rigid_body(scalar, lanes).stepped_body
 
     @wp.func
     def record_body(
-        at: int, b: int, dt: S, kept: S, gravity: R3, drowsy: S, bodies: Bodies, tape: Tape
-    ):  # fmt: skip
-        push_pose(at, bodies.x[b], bodies.q[b], tape)
-        push_pose(at + 7, bodies.xp[b], bodies.qp[b], tape)
+        at: int,
+        b: int,
+        dt: S,
+        damping_factor: S,
+        gravity: R3,
+        drowsy: S,
+        bodies: Bodies,
+        tape: Tape,
+    ):
+        record_pose(at, bodies.x[b], bodies.q[b], tape)
+        record_pose(at + 7, bodies.xp[b], bodies.qp[b], tape)
         v = bodies.v[b]
         omega = bodies.omega[b]
         for k in range(3):
@@ -63,7 +57,7 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             tape.s[at + 17 + k] = omega[k]
         tape.s[at + 20] = bodies.w[b]
         state = int(AWAKE)
-        d = stepped_body(b, dt, kept, gravity, bodies)
+        d = stepped_body(b, dt, damping_factor, gravity, bodies)
         turn = bodies.q[b] * wp.quat_inverse(bodies.qp[b])
         rotation = R3(turn[0], turn[1], turn[2]) * (S(2.0) / turn[3])
         if bodies.w[b] > S(0.0) and bodies.support[b] >= 3:
@@ -83,9 +77,7 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         bodies.w[b] = tape.s[at + 20]
 
     @wp.func
-    def velocities(
-        x: R3, q: Q, xp: R3, qp: Q, dt: S, fastest: S, moves: S, gv: R3, go: R3
-    ) -> S:  # fmt: skip
+    def velocity_loss(x: R3, q: Q, xp: R3, qp: Q, dt: S, fastest: S, moves: S, gv: R3, go: R3) -> S:
         d = (x - xp) * moves
         turn = q * Q(-qp[0], -qp[1], -qp[2], qp[3])
         rotation = R3(turn[0], turn[1], turn[2]) * (S(2.0) / turn[3]) * moves
@@ -94,9 +86,16 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def sweep_finish_body(
-        b: int, lane: int, state: int, dt: S, fastest: S, counts: int, bodies: Bodies,
-        ba: BodyAdjoint, adj: Adjoint,
-    ):  # fmt: skip
+        b: int,
+        lane: int,
+        state: int,
+        dt: S,
+        fastest: S,
+        counts: int,
+        bodies: Bodies,
+        ba: BodyAdjoint,
+        adj: Adjoint,
+    ):
         moves = S(1.0)
         kind = int(-1)
         if state > 0:
@@ -111,10 +110,17 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             kind = counts + wp.static(int(Kind.BODY_CLAMP))
         if kind >= 0:
             count_one(kind, lane, adj)
-        gx, gq, gxp, gqp, _dt, _fastest, _moves, _gv, _go = wp.grad(velocities)(
-            bodies.x[b], bodies.q[b], bodies.xp[b], bodies.qp[b], dt, fastest, moves, ba.v[b],
+        gx, gq, gxp, gqp, _dt, _fastest, _moves, _gv, _go = wp.grad(velocity_loss)(
+            bodies.x[b],
+            bodies.q[b],
+            bodies.xp[b],
+            bodies.qp[b],
+            dt,
+            fastest,
+            moves,
+            ba.v[b],
             ba.omega[b],
-        )  # fmt: skip
+        )
         ba.x[b] = ba.x[b] + gx
         ba.q[b] = ba.q[b] + gq
         ba.xp[b] = ba.xp[b] + gxp
@@ -123,44 +129,65 @@ def rigid_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         ba.omega[b] = R3()
 
     @wp.func
-    def predicted(
-        x: R3, q: Q, v: R3, omega: R3, dt: S, kept: S, gravity: R3, tensor: M33, inverse: M33,
-        gx: R3, gq: Q,
-    ) -> S:  # fmt: skip
-        to = x + (v + gravity * dt) * (dt * kept)
+    def prediction_loss(
+        x: R3,
+        q: Q,
+        v: R3,
+        omega: R3,
+        dt: S,
+        damping_factor: S,
+        gravity: R3,
+        tensor: M33,
+        inverse: M33,
+        gx: R3,
+        gq: Q,
+    ) -> S:
+        to = x + (v + gravity * dt) * (dt * damping_factor)
         spin = wp.quat_rotate_inv(q, omega)
         half = spin - inverse * wp.cross(spin, tensor * spin) * (S(0.5) * dt)
         late = spin - inverse * wp.cross(half, tensor * half) * dt
-        turn = turned(q, wp.quat_rotate(q, late) * (dt * kept))
+        turn = turned(q, wp.quat_rotate(q, late) * (dt * damping_factor))
         return wp.dot(gx, to) + (
             gq[0] * turn[0] + gq[1] * turn[1] + gq[2] * turn[2] + gq[3] * turn[3]
         )
 
     @wp.func
-    def sweep_predict_body(b: int, dt: S, kept: S, gravity: R3, bodies: Bodies, ba: BodyAdjoint):
-        """Returns the derivative by the share of velocity that is kept."""
-        by_kept = S(0.0)
+    def sweep_predict_body(
+        b: int, dt: S, damping_factor: S, gravity: R3, bodies: Bodies, ba: BodyAdjoint
+    ):
+        """Returns the derivative by the share of velocity that is damping_factor."""
+        by_damping = S(0.0)
         gxp = ba.xp[b]
         gqp = ba.qp[b]
         if bodies.w[b] > S(0.0):
-            gx, gq, gv, go, _dt, gk, _g, _t, _i, _gx, _gq = wp.grad(predicted)(
-                bodies.xp[b], bodies.qp[b], bodies.v[b], bodies.omega[b], dt, kept, gravity,
-                bodies.inertia[b], bodies.inverse_inertia[b], ba.x[b], ba.q[b],
-            )  # fmt: skip
+            gx, gq, gv, go, _dt, gk, _g, _t, _i, _gx, _gq = wp.grad(prediction_loss)(
+                bodies.xp[b],
+                bodies.qp[b],
+                bodies.v[b],
+                bodies.omega[b],
+                dt,
+                damping_factor,
+                gravity,
+                bodies.inertia[b],
+                bodies.inverse_inertia[b],
+                ba.x[b],
+                ba.q[b],
+            )
             ba.x[b] = gxp + gx
             ba.q[b] = gqp + gq
             ba.v[b] = ba.v[b] + gv
             ba.omega[b] = ba.omega[b] + go
-            by_kept = gk
+            by_damping = gk
         else:
             ba.x[b] = ba.x[b] + gxp
             ba.q[b] = ba.q[b] + gqp
         ba.xp[b] = R3()
         ba.qp[b] = Q(S(0.0), S(0.0), S(0.0), S(0.0))
-        return by_kept
+        return by_damping
 
     return SimpleNamespace(
-        push_pose=push_pose, position=position, quaternion=quaternion, record_body=record_body,
-        load_body=load_body, sweep_finish_body=sweep_finish_body,
-        sweep_predict_body=sweep_predict_body, BODY_SCALARS=BODY_SCALARS,
-    )  # fmt: skip
+        record_body=record_body,
+        load_body=load_body,
+        sweep_finish_body=sweep_finish_body,
+        sweep_predict_body=sweep_predict_body,
+    )

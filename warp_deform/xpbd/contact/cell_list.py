@@ -33,7 +33,8 @@ SOON = 0.4
 
 @functools.cache
 def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`common_step(p0, n, dt, q)`, `moved_since(p0, n, drift, q, cells)` and `list_triangles(...)`.
+    """`common_step(p0, n, dt, particles)`, `moved_since(p0, n, drift, particles, cells)`
+    and `list_triangles(...)`.
 
     `common_step` is what all particles do in this substep, along each axis the step of the slowest,
     or 0 where they do not go the same way. Summed up it is the `drift`, with which the frame of the
@@ -54,14 +55,14 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
     barycentric = closest_point(scalar, lanes).barycentric
 
     @wp.func
-    def common_step(p0: int, n: int, dt: S, q: Particles):
-        low = q.v[p0]
+    def common_step(p0: int, n: int, dt: S, particles: Particles):
+        low = particles.v[p0]
         high = low
         zero = V(S(0.0))
         i = p0 + 1
         alike = bool(True)
         while alike and i < p0 + n:
-            v = q.v[i]
+            v = particles.v[i]
             low = V3(wp.min(low.x, v.x), wp.min(low.y, v.y), wp.min(low.z, v.z))
             high = V3(wp.max(high.x, v.x), wp.max(high.y, v.y), wp.max(high.z, v.z))
             apart = wp.max(wp.max(low.x, zero - high.x), wp.max(low.y, zero - high.y))
@@ -69,30 +70,38 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
             i += 1
         return (
             V3(
-                wp.max(low.x, wp.min(high.x, zero)), wp.max(low.y, wp.min(high.y, zero)),
+                wp.max(low.x, wp.min(high.x, zero)),
+                wp.max(low.y, wp.min(high.y, zero)),
                 wp.max(low.z, wp.min(high.z, zero)),
             )
             * dt
-        )  # fmt: skip
+        )
 
     @wp.func
-    def moved_since(p0: int, n: int, drift: V3, q: Particles, cells: Cells):
+    def moved_since(p0: int, n: int, drift: V3, particles: Particles, cells: Cells):
         worst = V(S(0.0))
         for i in range(p0, p0 + n):
-            d = q.x[i] - drift - cells.xr[i]
+            d = particles.x[i] - drift - cells.xr[i]
             slack = cells.slack[i]
             worst = wp.max(worst, dot(d, d) - mul(slack, slack))
         return worst
 
     @wp.func
-    def point(p: V4):
+    def xyz(p: V4):
         return R3(p[0], p[1], p[2])
 
     @wp.func
     def follow(
-        lane: int, p0: int, count: int, links: int, most: S, anew: bool, drift: R3, common: R3,
+        lane: int,
+        p0: int,
+        count: int,
+        links: int,
+        most: S,
+        anew: bool,
+        drift: R3,
+        common: R3,
         cells: Cells,
-    ):  # fmt: skip
+    ):
         """Moves the references of particles that have gone far, and renews their slack.
 
         That is `most` [m] at most. Returns the lower and the upper corner of the box around those,
@@ -104,7 +113,7 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         for i in range(count):
             now = get(cells.x, p0 + i, lane)
             x = now - drift
-            d = x - point(cells.place[links + i])
+            d = x - xyz(cells.place[links + i])
             slack = get_mass(cells.slack_flat, p0 + i, lane)
             moved = int(0)
             # those that would have to follow soon come along
@@ -130,17 +139,17 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def drop_moved(start: int, count: int, links: int, sheets: Sheets, cells: Cells):
         """Takes pairs with a moved particle off the list; returns how many are left."""
-        kept = int(0)
+        remaining = int(0)
         for at in range(start, start + count):
             i = cells.particle[at]
             f = cells.face[at]
             tri = sheets.triangle[f]
             if cells.moved[links + i] + moved_corners(links, tri, cells) == 0:
-                cells.particle[start + kept] = i
-                cells.face[start + kept] = f
-                cells.gap[start + kept] = cells.gap[at]
-                kept += 1
-        return kept
+                cells.particle[start + remaining] = i
+                cells.face[start + remaining] = f
+                cells.gap[start + remaining] = cells.gap[at]
+                remaining += 1
+        return remaining
 
     @wp.func
     def exempt(f: int, tri: wp.vec3i, base: int, links: int, sheets: Sheets, cells: Cells):
@@ -152,9 +161,18 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def list_triangles(
-        g: int, lane: int, k: int, p0: int, margin: S, anew: bool, drift: V3, common: V3,
-        top: Topology, sheets: Sheets, cells: Cells,
-    ):  # fmt: skip
+        g: int,
+        lane: int,
+        k: int,
+        p0: int,
+        margin: S,
+        anew: bool,
+        drift: V3,
+        common: V3,
+        top: Topology,
+        sheets: Sheets,
+        cells: Cells,
+    ):
         count = top.particle_count[k]
         base = top.particle_start[k]
         grid = sheets.grid[k]
@@ -179,7 +197,7 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
             tri = sheets.triangle[f]
             if moved_corners(links, tri, cells) > 0:
                 for corner in range(3):
-                    x = point(cells.place[links + tri[corner]])
+                    x = xyz(cells.place[links + tri[corner]])
                     low = wp.min(low, x)
                     high = wp.max(high, x)
         wide = S(2.0) * (sheets.widest[k] + loosest)
@@ -189,18 +207,28 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         low1 = low[1]
         inverse = S(grid) / wp.max(wp.max(high[0] - low0, high[1] - low1), S(grid) * sheets.cell[k])
         sort_cells(
-            heads, grid, links, count, low, high, inverse, cells.place, cells.moved, cells.head,
-            cells.key, cells.sorted,
-        )  # fmt: skip
+            heads,
+            grid,
+            links,
+            count,
+            low,
+            high,
+            inverse,
+            cells.place,
+            cells.moved,
+            cells.head,
+            cells.key,
+            cells.sorted,
+        )
         left_out = int(0)
         for f in range(sheets.first[k], sheets.first[k + 1]):
             tri = sheets.triangle[f]
             a4 = cells.place[links + tri[0]]
             b4 = cells.place[links + tri[1]]
             c4 = cells.place[links + tri[2]]
-            a = point(a4)
-            b = point(b4)
-            c = point(c4)
+            a = xyz(a4)
+            b = xyz(b4)
+            c = xyz(c4)
             slack = wp.max(a4[3], wp.max(b4[3], c4[3]))
             thick = sheets.skin[base + tri[0]]
             wide = thick + sheets.widest[k] + slack + loosest
@@ -210,10 +238,13 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
             m2 = wp.length_sq(m)
             moved = moved_corners(links, tri, cells)
             if moved > 0 or (
-                low[2] < far[2] and high[2] > near[2]
-                and low[0] < far[0] and high[0] > near[0]
-                and low[1] < far[1] and high[1] > near[1]
-            ):  # fmt: skip
+                low[2] < far[2]
+                and high[2] > near[2]
+                and low[0] < far[0]
+                and high[0] > near[0]
+                and low[1] < far[1]
+                and high[1] > near[1]
+            ):
                 # what has not moved either is listed with an unmoved triangle already
                 least = wp.where(moved > 0, -count, 0)
                 stamped = bool(False)
@@ -236,7 +267,7 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
                                 i = -1 - i
                             if cells.stamp[links + i] != f + 1:
                                 p4 = cells.sorted[hit]
-                                p = point(p4)
+                                p = xyz(p4)
                                 gap = sheets.skin[base + i] + thick
                                 reach = gap + slack + p4[3]
                                 # distance from the plane, before anything dear

@@ -22,7 +22,7 @@ RUN = 31
 def cell_sort(scalar: Any, lanes: int) -> SimpleNamespace:
     """`sort_cells(...)`, `cell_of(x, low, inverse, grid)`: row or column of a coordinate.
 
-    `sort_cells` takes points `point[links:links + count]` in the box from `low` to `high`, with
+    `sort_cells` takes points `points[links:links + count]` in the box from `low` to `high`, with
     cells of side 1 / inverse from `low` on. Cell c = row * grid + column holds the points
     `links + head[heads + c]` to `links + head[heads + c + 1]` of `sorted`, and of `key` their
     numbers n, as -1 - n where `moved[links + n]` is 0.
@@ -42,20 +42,33 @@ def cell_sort(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def inside(p: V4, low: R3, high: R3):
         return (
-            p[0] >= low[0] and p[0] <= high[0] and p[1] >= low[1] and p[1] <= high[1]
-            and p[2] >= low[2] and p[2] <= high[2]
-        )  # fmt: skip
+            p[0] >= low[0]
+            and p[0] <= high[0]
+            and p[1] >= low[1]
+            and p[1] <= high[1]
+            and p[2] >= low[2]
+            and p[2] <= high[2]
+        )
 
     @wp.func
     def sort_cells(
-        heads: int, grid: int, links: int, count: int, low: R3, high: R3, inverse: S,
-        point: wp.array(dtype=V4), moved: wp.array(dtype=int), head: wp.array(dtype=int),
-        key: wp.array(dtype=int), sorted: wp.array(dtype=V4),
-    ):  # fmt: skip
+        heads: int,
+        grid: int,
+        links: int,
+        count: int,
+        low: R3,
+        high: R3,
+        inverse: S,
+        points: wp.array(dtype=V4),
+        moved: wp.array(dtype=int),
+        head: wp.array(dtype=int),
+        key: wp.array(dtype=int),
+        sorted: wp.array(dtype=V4),
+    ):
         for at in range(grid * grid + 1):
             head[heads + at] = 0
         for n in range(count):
-            p = point[links + n]
+            p = points[links + n]
             if inside(p, low, high):
                 row = cell_of(p[0], low[0], inverse, grid)
                 at = heads + row * grid + cell_of(p[1], low[1], inverse, grid)
@@ -66,7 +79,7 @@ def cell_sort(scalar: Any, lanes: int) -> SimpleNamespace:
             end += head[heads + at]
             head[heads + at] = end
         for n in range(count):
-            p = point[links + n]
+            p = points[links + n]
             if inside(p, low, high):
                 row = cell_of(p[0], low[0], inverse, grid)
                 at = heads + row * grid + cell_of(p[1], low[1], inverse, grid)
@@ -90,7 +103,7 @@ def cell_sort(scalar: Any, lanes: int) -> SimpleNamespace:
         return (int)hits;""")
     def hits_in_ball(
         x: wp.array(dtype=V4), key: wp.array(dtype=int), at: int, end: int, b: V4, below: int
-    ) -> int: ...  # fmt: skip
+    ) -> int: ...
 
     on_device, on_host = "return __ffs(hits) - 1;", "return __builtin_ctz((unsigned)hits);"
 
@@ -109,9 +122,12 @@ def cell_sort(scalar: Any, lanes: int) -> SimpleNamespace:
         return (int)hits;""")
     def hits_in_box(
         x: wp.array(dtype=V4), key: wp.array(dtype=int), at: int, end: int, l: R3, h: R3, least: int
-    ) -> int: ...  # fmt: skip
+    ) -> int: ...
 
     return SimpleNamespace(
-        cell_of=cell_of, sort_cells=sort_cells, first_hit=first_hit, hits_in_ball=hits_in_ball,
+        cell_of=cell_of,
+        sort_cells=sort_cells,
+        first_hit=first_hit,
+        hits_in_ball=hits_in_ball,
         hits_in_box=hits_in_box,
-    )  # fmt: skip
+    )

@@ -53,17 +53,17 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         ur = wp.dot(u, r)
         vr = wp.dot(v, r)
         rest = uu * vv - uv * uv
-        s = S(0.0)
+        along_ab = S(0.0)
         if rest > S(1.0e-6) * uu * vv:
-            s = wp.clamp((uv * vr - ur * vv) / rest, S(0.0), S(1.0))
-        q = (uv * s + vr) / vv
-        if q < S(0.0):
-            q = S(0.0)
-            s = wp.clamp(-ur / uu, S(0.0), S(1.0))
-        elif q > S(1.0):
-            q = S(1.0)
-            s = wp.clamp((uv - ur) / uu, S(0.0), S(1.0))
-        return R2(s, q)
+            along_ab = wp.clamp((uv * vr - ur * vv) / rest, S(0.0), S(1.0))
+        along_cd = (uv * along_ab + vr) / vv
+        if along_cd < S(0.0):
+            along_cd = S(0.0)
+            along_ab = wp.clamp(-ur / uu, S(0.0), S(1.0))
+        elif along_cd > S(1.0):
+            along_cd = S(1.0)
+            along_ab = wp.clamp((uv - ur) / uu, S(0.0), S(1.0))
+        return R2(along_ab, along_cd)
 
     @wp.func
     def touching_distance(base: int, e: wp.vec2i, f: wp.vec2i, thick: S, sheets: Sheets):
@@ -80,13 +80,11 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         return h
 
     @wp.func
-    def point(p: V4):
+    def xyz(p: V4):
         return R3(p[0], p[1], p[2])
 
     @wp.func
-    def meeting(
-        base: int, places: int, e: wp.vec2i, f: wp.vec2i, sheets: Sheets, cells: Cells
-    ):  # fmt: skip
+    def meeting(base: int, places: int, e: wp.vec2i, f: wp.vec2i, sheets: Sheets, cells: Cells):
         """Signed distance at which two edges touch, 0 where they are too far apart to be listed."""
         gap = S(0.0)
         if e[0] != f[0] and e[0] != f[1] and e[1] != f[0] and e[1] != f[1]:
@@ -94,10 +92,10 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             b4 = cells.place[places + e[1]]
             c4 = cells.place[places + f[0]]
             d4 = cells.place[places + f[1]]
-            a = point(a4)
-            b = point(b4)
-            c = point(c4)
-            d = point(d4)
+            a = xyz(a4)
+            b = xyz(b4)
+            c = xyz(c4)
+            d = xyz(d4)
             h = S(0.5) * (sheets.edge_gap[base + e[0]] + sheets.edge_gap[base + f[0]])
             far = h + wp.max(a4[3], b4[3]) + wp.max(c4[3], d4[3])
             # most are apart along the line between their middles, which is cheap to see
@@ -116,19 +114,21 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def drop_moved(start: int, count: int, links: int, sheets: Sheets, cells: Cells):
         """Takes pairs with a moved end off the list; returns how many are left."""
-        kept = int(0)
+        remaining = int(0)
         for at in range(start, start + count):
             e = sheets.edge[cells.edge_a[at]]
             f = sheets.edge[cells.edge_b[at]]
             if (
-                cells.moved[links + e[0]] + cells.moved[links + e[1]]
-                + cells.moved[links + f[0]] + cells.moved[links + f[1]]
-            ) == 0:  # fmt: skip
-                cells.edge_a[start + kept] = cells.edge_a[at]
-                cells.edge_b[start + kept] = cells.edge_b[at]
-                cells.edge_gap[start + kept] = cells.edge_gap[at]
-                kept += 1
-        return kept
+                cells.moved[links + e[0]]
+                + cells.moved[links + e[1]]
+                + cells.moved[links + f[0]]
+                + cells.moved[links + f[1]]
+            ) == 0:
+                cells.edge_a[start + remaining] = cells.edge_a[at]
+                cells.edge_b[start + remaining] = cells.edge_b[at]
+                cells.edge_gap[start + remaining] = cells.edge_gap[at]
+                remaining += 1
+        return remaining
 
     @wp.func
     def list_edges(
@@ -158,8 +158,8 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             if moved > 0:
                 a4 = cells.place[places + e[0]]
                 b4 = cells.place[places + e[1]]
-                middle = (point(a4) + point(b4)) * S(0.5)
-                l = S(0.5) * wp.length(point(b4) - point(a4))
+                middle = (xyz(a4) + xyz(b4)) * S(0.5)
+                l = S(0.5) * wp.length(xyz(b4) - xyz(a4))
                 # what a slack adds to the reach of the edge makes its ball larger
                 ball = V4(middle[0], middle[1], middle[2], l + wp.max(a4[3], b4[3]))
                 cells.edge_ball[links + n] = ball
@@ -173,9 +173,19 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         low1 = low[1]
         inverse = S(grid) / wp.max(wp.max(high[0] - low0, high[1] - low1), S(grid) * sheets.cell[k])
         sort_cells(
-            heads, grid, links, count, low, high, inverse, cells.edge_ball, cells.edge_moved,
-            cells.head, cells.edge_key, cells.edge_sorted,
-        )  # fmt: skip
+            heads,
+            grid,
+            links,
+            count,
+            low,
+            high,
+            inverse,
+            cells.edge_ball,
+            cells.edge_moved,
+            cells.head,
+            cells.edge_key,
+            cells.edge_sorted,
+        )
         left_out = int(0)
         for n in range(count):
             if cells.edge_moved[links + n] > 0:
@@ -211,7 +221,7 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         return left_out
 
     @wp.func
-    def project_edge(k: int, lane: int, p0: int, push: S, sheets: Sheets, cells: Cells):
+    def project_edge(k: int, lane: int, p0: int, max_recovery: S, sheets: Sheets, cells: Cells):
         """One pair; returns whether it moved."""
         acts = bool(False)
         e = sheets.edge[cells.edge_a[k]]
@@ -246,7 +256,7 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
                 moved -= (c - get(cells.xp, p0 + f[0], lane)) * (S(1.0) - v)
                 moved -= (d - get(cells.xp, p0 + f[1], lane)) * v
                 gap = wp.dot(a + (b - a) * u - c - (d - c) * v, n)
-                depth = wp.min(h - gap, wp.max(push - wp.dot(moved, n), S(0.0)))
+                depth = wp.min(h - gap, wp.max(max_recovery - wp.dot(moved, n), S(0.0)))
                 if depth > S(0.0) and w > S(0.0):
                     step = n * (depth / w)
                     put(cells.x, p0 + e[0], lane, a + step * wa)
@@ -257,12 +267,14 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         return acts
 
     @wp.func
-    def project_edges(g: int, lane: int, p0: int, push: S, sheets: Sheets, cells: Cells):
+    def project_edges(g: int, lane: int, p0: int, max_recovery: S, sheets: Sheets, cells: Cells):
         start = cells.list_start[g] + lane * cells.capacity[g]
         for k in range(start, start + cells.edge_count[g * wp.static(L) + lane]):
-            project_edge(k, lane, p0, push, sheets, cells)
+            project_edge(k, lane, p0, max_recovery, sheets, cells)
 
     return SimpleNamespace(
-        list_edges=list_edges, project_edges=project_edges, project_edge=project_edge,
+        list_edges=list_edges,
+        project_edges=project_edges,
+        project_edge=project_edge,
         nearest=nearest,
-    )  # fmt: skip
+    )

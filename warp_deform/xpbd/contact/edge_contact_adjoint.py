@@ -8,7 +8,7 @@ import warp as wp
 
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
-from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind
+from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind, tape
 from .closest_point import closest_point_adjoint
 from .edge_contact import edge_contact
 from .triangle_contact_adjoint import triangle_contact_adjoint
@@ -35,14 +35,22 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     nearest, project_edge = edges_.nearest, edges_.project_edge
     along_two = closest_point_adjoint(scalar, lanes).along_two
     tri_ = triangle_contact_adjoint(scalar, lanes)
-    push4, point, add_to, add_mass = tri_.push4, tri_.point, tri_.add_to, tri_.add_mass
+    record_four, add_to, add_mass = tri_.record_four, tri_.add_to, tri_.add_mass
+    position = tape(scalar, lanes).position
 
     @wp.func
     def record_edges(
-        g: int, lane: int, p0: int, at_word: int, at_scalar: int, push: S, sheets: Sheets,
-        cells: Cells, tape: Tape,
-    ):  # fmt: skip
-        found = int(0)
+        g: int,
+        lane: int,
+        p0: int,
+        at_word: int,
+        at_scalar: int,
+        max_recovery: S,
+        sheets: Sheets,
+        cells: Cells,
+        tape: Tape,
+    ):
+        count = int(0)
         start = cells.list_start[g] + lane * cells.capacity[g]
         for k in range(start, start + cells.edge_count[g * wp.static(L) + lane]):
             e = sheets.edge[cells.edge_a[k]]
@@ -51,28 +59,36 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             b = get(cells.x, p0 + e[1], lane)
             c = get(cells.x, p0 + f[0], lane)
             d = get(cells.x, p0 + f[1], lane)
-            acts = project_edge(k, lane, p0, push, sheets, cells)
+            acts = project_edge(k, lane, p0, max_recovery, sheets, cells)
             if acts:
-                word = at_word + found * wp.static(TRIANGLE_WORDS)
+                word = at_word + count * wp.static(TRIANGLE_WORDS)
                 tape.k[word] = cells.edge_a[k]
                 tape.k[word + 1] = cells.edge_b[k]
-                at = at_scalar + found * wp.static(TRIANGLE_SCALARS)
-                push4(at, cells.edge_gap[k], a, b, c, d, tape)
-                found += 1
-        return found
+                at = at_scalar + count * wp.static(TRIANGLE_SCALARS)
+                record_four(at, cells.edge_gap[k], a, b, c, d, tape)
+                count += 1
+        return count
 
     @wp.func
     def sweep_edge(
-        word: int, at: int, finished: int, lane: int, p0: int, push: S, counts: int,
-        sheets: Sheets, tape: Tape, adj: Adjoint,
-    ):  # fmt: skip
+        word: int,
+        at: int,
+        finished: int,
+        lane: int,
+        p0: int,
+        max_recovery: S,
+        counts: int,
+        sheets: Sheets,
+        tape: Tape,
+        adj: Adjoint,
+    ):
         first = sheets.edge[tape.k[word]]
         second = sheets.edge[tape.k[word + 1]]
         signed = tape.s[at]
-        a = point(at + 1, tape)
-        b = point(at + 4, tape)
-        c = point(at + 7, tape)
-        d = point(at + 10, tape)
+        a = position(at + 1, tape)
+        b = position(at + 4, tape)
+        c = position(at + 7, tape)
+        d = position(at + 10, tape)
         ia = p0 + first[0]
         ib = p0 + first[1]
         ic = p0 + second[0]
@@ -103,7 +119,7 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         moved = sa * nu + sb * u - sc * nv - sd * v
         r = a + e * u - c - f * v
         overlap = h - wp.dot(r, n)
-        allowed = wp.max(push - wp.dot(moved, n), S(0.0))
+        allowed = wp.max(max_recovery - wp.dot(moved, n), S(0.0))
         depth = wp.min(overlap, allowed)
         step = n * (depth / w)
 

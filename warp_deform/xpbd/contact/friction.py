@@ -51,8 +51,8 @@ def friction(scalar: Any, lanes: int) -> SimpleNamespace:
 
 @functools.cache
 def friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
-    """The shares of `friction` and their slopes by the budget and by moved2: `coulomb_slopes`,
-    `coulomb_soft_slopes` and their scalar forms.
+    """The shares of `friction` and their derivatives by the budget and by moved2:
+    `coulomb_gradients`, `coulomb_soft_gradients` and their scalar forms.
 
     With d the step, b the budget and h = (d^4 + b^4)^(-1/4) the share is f = b h, so df/db =
     h (d h)^4 and df/d(d^2) = -f d^2 h^4 / 2.
@@ -63,7 +63,7 @@ def friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     TINY = 1.0e-36 if scalar is wp.float32 else 1.0e-200
 
     @wp.func
-    def coulomb_slopes(moved2: V, budget: V):
+    def coulomb_gradients(moved2: V, budget: V):
         square = budget * budget
         fourth = V(S(1.0)) / wp.max(moved2 * moved2 + square * square, V(S(TINY)))
         h = root(root(fourth))
@@ -72,19 +72,19 @@ def friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return share, h * moved2 * turn, share * turn * S(-0.5)
 
     @wp.func
-    def coulomb_soft_slopes(moved2: V, budget: V):
+    def coulomb_soft_gradients(moved2: V, budget: V):
         inverse = V(S(1.0)) / wp.max(root(moved2 + budget * budget), V(S(1.0e-12)))
         cube = inverse * inverse * inverse
         return budget * inverse, moved2 * cube, budget * cube * S(-0.5)
 
     @wp.func
-    def coulomb_soft_scalar_slopes(moved2: S, budget: S):
+    def coulomb_soft_scalar_gradients(moved2: S, budget: S):
         inverse = S(1.0) / wp.max(wp.sqrt(moved2 + budget * budget), S(1.0e-12))
         cube = inverse * inverse * inverse
         return budget * inverse, moved2 * cube, budget * cube * S(-0.5)
 
     @wp.func
-    def coulomb_scalar_slopes(moved2: S, budget: S):
+    def coulomb_scalar_gradients(moved2: S, budget: S):
         square = budget * budget
         fourth = S(1.0) / wp.max(moved2 * moved2 + square * square, S(TINY))
         h = wp.sqrt(wp.sqrt(fourth))
@@ -92,7 +92,8 @@ def friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return budget * h, h * moved2 * turn, budget * h * turn * S(-0.5)
 
     return SimpleNamespace(
-        coulomb_slopes=coulomb_slopes, coulomb_soft_slopes=coulomb_soft_slopes,
-        coulomb_scalar_slopes=coulomb_scalar_slopes,
-        coulomb_soft_scalar_slopes=coulomb_soft_scalar_slopes,
-    )  # fmt: skip
+        coulomb_gradients=coulomb_gradients,
+        coulomb_soft_gradients=coulomb_soft_gradients,
+        coulomb_scalar_gradients=coulomb_scalar_gradients,
+        coulomb_soft_scalar_gradients=coulomb_soft_scalar_gradients,
+    )

@@ -44,26 +44,38 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def list_near(
-        g: int, p0: int, start: int, capacity: int, first: int, last: int, margin: S, stale: V,
-        on: V, q: Particles, pairs: Pairs, near: Near, watch: Watch, count: int,
-    ):  # fmt: skip
+        g: int,
+        p0: int,
+        start: int,
+        capacity: int,
+        first: int,
+        last: int,
+        margin: S,
+        stale: V,
+        on: V,
+        particles: Particles,
+        pairs: Pairs,
+        near: Near,
+        watch: Watch,
+        count: int,
+    ):
         """Lists the group's near pairs anew from `start` on; returns how many.
 
         Lanes that are not stale keep the pairs of their own last listing.
         """
         for i in range(p0, p0 + count):
-            x = q.x[i]
-            r = q.xr[i]
+            x = particles.x[i]
+            r = particles.xr[i]
             r.x = select(stale, x.x, r.x)
             r.y = select(stale, x.y, r.y)
             r.z = select(stale, x.z, r.z)
-            q.xr[i] = r
+            particles.xr[i] = r
         n = int(0)
         zero = V(S(0.0))
         left_out = zero
         for k in range(first, last):
             ij = pairs.ij[k]
-            d = q.xr[p0 + ij[0]] - q.xr[p0 + ij[1]]
+            d = particles.xr[p0 + ij[0]] - particles.xr[p0 + ij[1]]
             reach = pairs.distance[k] + margin
             l2 = dot(d, d)
             close = less(l2, V(reach * reach)) * on
@@ -78,14 +90,16 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         return n
 
     @wp.func
-    def project_contact(k: int, p0: int, mu: V, push: S, q: Particles, pairs: Pairs, near: Near):
+    def project_contact(
+        k: int, p0: int, mu: V, max_recovery: S, particles: Particles, pairs: Pairs, near: Near
+    ):
         pair = near.pair[k]
         ij = pairs.ij[pair]
         h = pairs.distance[pair]
         i = p0 + ij[0]
         j = p0 + ij[1]
-        xi = q.x[i]
-        xj = q.x[j]
+        xi = particles.x[i]
+        xj = particles.x[j]
         d = xi - xj
         l2 = dot(d, d)
         if any_less(l2, h * h):
@@ -94,31 +108,37 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             tiny = V(S(1.0e-9))
             l = wp.max(root(l2), tiny)
             n = d * (one / l)
-            moved = (xi - q.xp[i]) - (xj - q.xp[j])
+            moved = (xi - particles.xp[i]) - (xj - particles.xp[j])
             approach = dot(moved, n)
             depth = wp.max(V(h) - l, zero) * near.mask[k]
-            depth = wp.min(depth, wp.max(V(push) - approach, zero))
-            wi = q.w[i]
-            wj = q.w[j]
+            depth = wp.min(depth, wp.max(V(max_recovery) - approach, zero))
+            wi = particles.w[i]
+            wj = particles.w[j]
             share = one / wp.max(wi + wj, tiny)
             slip = moved - n * approach
             f = coulomb_soft(dot(slip, slip), depth * mu)
             step = n * (depth * share) - slip * (f * share)
-            q.x[i] = xi + step * wi
-            q.x[j] = xj - step * wj
+            particles.x[i] = xi + step * wi
+            particles.x[j] = xj - step * wj
 
     @wp.func
     def touches(
-        particle: int, lane: int, p0: int, start: int, n: int, q: Particles, pairs: Pairs,
+        particle: int,
+        lane: int,
+        p0: int,
+        start: int,
+        n: int,
+        particles: Particles,
+        pairs: Pairs,
         near: Near,
-    ):  # fmt: skip
+    ):
         """Whether a particle of one lane touches another that it is not exempt from."""
         hit = bool(False)
         for k in range(start, start + n):
             pair = near.pair[k]
             ij = pairs.ij[pair]
             if ij[0] == particle or ij[1] == particle:
-                d = q.x[p0 + ij[0]] - q.x[p0 + ij[1]]
+                d = particles.x[p0 + ij[0]] - particles.x[p0 + ij[1]]
                 h = pairs.distance[pair]
                 l2 = dot(d, d)
                 if near.mask[k][lane] > S(0.0) and l2[lane] < h * h:
@@ -134,41 +154,58 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     its mask on the tape, or returns False where it does not touch. `sweep_contact` takes it back
     and returns the derivative by friction.
 
-    Branches: apart or touching; depth limited by the overlap or by `recovery` (then its slope is
-    that of the approach, or 0 while the pair separates as fast as it may).
+    Branches: apart or touching; depth limited by the overlap or by `recovery` (then its derivative
+    is that of the approach, or 0 while the pair separates as fast as it may).
     """
     t = structures(scalar, lanes)
     S, V, V3 = t.S, t.V, t.V3
     Pairs, Particles, Near, Tape, Adjoint = t.Pairs, t.Particles, t.Near, t.Tape, t.Adjoint
     project_contact = sphere_contact(scalar, lanes).project_contact
-    coulomb_soft_slopes = friction_adjoint(scalar, lanes).coulomb_soft_slopes
+    coulomb_soft_gradients = friction_adjoint(scalar, lanes).coulomb_soft_gradients
 
     @wp.func
     def record_contact(
-        k: int, p0: int, at: int, at_mask: int, mu: V, push: S, q: Particles, pairs: Pairs,
-        near: Near, tape: Tape,
-    ):  # fmt: skip
+        k: int,
+        p0: int,
+        at: int,
+        at_mask: int,
+        mu: V,
+        max_recovery: S,
+        particles: Particles,
+        pairs: Pairs,
+        near: Near,
+        tape: Tape,
+    ):
         pair = near.pair[k]
         ij = pairs.ij[pair]
         h = pairs.distance[pair]
         i = p0 + ij[0]
         j = p0 + ij[1]
-        xi = q.x[i]
-        xj = q.x[j]
+        xi = particles.x[i]
+        xj = particles.x[j]
         d = xi - xj
         touching = any_less(dot(d, d), h * h)
         if touching:
             tape.x[at] = d
-            tape.x[at + 1] = (xi - q.xp[i]) - (xj - q.xp[j])
+            tape.x[at + 1] = (xi - particles.xp[i]) - (xj - particles.xp[j])
             tape.v[at_mask] = near.mask[k]
-            project_contact(k, p0, mu, push, q, pairs, near)
+            project_contact(k, p0, mu, max_recovery, particles, pairs, near)
         return touching
 
     @wp.func
     def sweep_contact(
-        pair: int, p0: int, d: V3, moved: V3, mask: V, mu: V, push: S, pairs: Pairs, counts: int,
-        on: V, adj: Adjoint,
-    ):  # fmt: skip
+        pair: int,
+        p0: int,
+        d: V3,
+        moved: V3,
+        mask: V,
+        mu: V,
+        max_recovery: S,
+        pairs: Pairs,
+        counts: int,
+        on: V,
+        adj: Adjoint,
+    ):
         ij = pairs.ij[pair]
         h = pairs.distance[pair]
         i = p0 + ij[0]
@@ -182,10 +219,10 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         n = d * inverse
         approach = dot(moved, n)
         overlap = wp.max(V(h) - l, zero) * mask
-        allowed = wp.max(V(push) - approach, zero)
+        allowed = wp.max(V(max_recovery) - approach, zero)
         depth = wp.min(overlap, allowed)
         acts = less(zero, depth)
-        slope = zero
+        by_mu = zero
         # many pairs separate as fast as they may, in all lanes
         if any_less(zero - acts, S(0.0)):
             wi = adj.w[i]
@@ -193,7 +230,7 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             share = one / wp.max(wi + wj, tiny)
             slip = moved - n * approach
             budget = depth * mu
-            f, by_budget, by_slip2 = coulomb_soft_slopes(dot(slip, slip), budget)
+            f, by_budget, by_slip2 = coulomb_soft_gradients(dot(slip, slip), budget)
             slowed = less(allowed, overlap) * acts
             kind = counts + wp.static(int(Kind.CONTACT))
             adj.fired[kind] = adj.fired[kind] + acts * on
@@ -237,7 +274,7 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             given = share * acts
             adj.mass[i] = adj.mass[i] + select(wi, gw + ei * given, zero)
             adj.mass[j] = adj.mass[j] + select(wj, gw - ej * given, zero)
-            slope = zero - across * share * by_budget * depth
-        return slope
+            by_mu = zero - across * share * by_budget * depth
+        return by_mu
 
     return SimpleNamespace(record_contact=record_contact, sweep_contact=sweep_contact)

@@ -32,24 +32,32 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     coulomb = friction(scalar, lanes).coulomb
 
     @wp.func
-    def predict(i: int, share: V, fall: V3, q: Particles):
-        x = q.x[i]
-        q.xp[i] = x
-        q.x[i] = x + (q.v[i] + fall) * select(q.w[i], share, V(S(0.0)))
+    def predict(i: int, damped_dt: V, fall: V3, particles: Particles):
+        x = particles.x[i]
+        particles.xp[i] = x
+        particles.x[i] = x + (particles.v[i] + fall) * select(particles.w[i], damped_dt, V(S(0.0)))
 
     @wp.func
     def finish(
-        i: int, radius: S, inverse_dt: S, share: V, fall: V3, mu: V, fastest: V, all_on: bool,
-        on: V, q: Particles,
-    ):  # fmt: skip
-        x = q.x[i]
-        o = q.xp[i]
+        i: int,
+        radius: S,
+        inverse_dt: S,
+        damped_dt: V,
+        fall: V3,
+        mu: V,
+        fastest: V,
+        all_on: bool,
+        on: V,
+        particles: Particles,
+    ):
+        x = particles.x[i]
+        o = particles.xp[i]
         zero = V(S(0.0))
         # as `stepped` says, and written out, for what is no longer inlined costs half as much again
-        d = (q.v[i] + fall) * select(q.w[i], share, zero)
+        d = (particles.v[i] + fall) * select(particles.w[i], damped_dt, zero)
         d = d + (x - (o + d))
         if any_less(x.z, radius):
-            depth = select(q.w[i], wp.max(V(radius) - x.z, zero), zero)
+            depth = select(particles.w[i], wp.max(V(radius) - x.z, zero), zero)
             f = coulomb(d.x * d.x + d.y * d.y, depth * mu)
             back = V3(zero - d.x * f, zero - d.y * f, depth)
             x = x + back
@@ -60,18 +68,18 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         if any_less(fastest * fastest - moved2, S(0.0)):
             v = v * wp.min(V(S(1.0)), fastest / wp.max(root(moved2), V(S(1.0e-12))))
         if not all_on:
-            u = q.v[i]
+            u = particles.v[i]
             x = V3(select(on, x.x, o.x), select(on, x.y, o.y), select(on, x.z, o.z))
             v = V3(select(on, v.x, u.x), select(on, v.y, u.y), select(on, v.z, u.z))
             moved2 = moved2 * on
-        q.x[i] = x
-        q.v[i] = v
+        particles.x[i] = x
+        particles.v[i] = v
         return moved2
 
     @wp.func
-    def stepped(x: V3, o: V3, w: V, v: V3, share: V, fall: V3):
+    def stepped(x: V3, o: V3, w: V, v: V3, damped_dt: V, fall: V3):
         """Step from o to x of a particle whose velocity was v before."""
-        d = (v + fall) * select(w, share, V(S(0.0)))
+        d = (v + fall) * select(w, damped_dt, V(S(0.0)))
         return d + (x - (o + d))
 
     return SimpleNamespace(predict=predict, stepped=stepped, finish=finish)
@@ -86,36 +94,64 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
     velocity it finds; with fabrics, dry friction and sleep. Returns the derivatives by friction and
     by the share of velocity that air damping keeps. `sweep_predict` takes back a prediction alone.
 
-    Branches: above or on the table (its push acts on z only, friction across), the speed clamp, and
-    lanes that are frozen. Sticking is the smooth end of friction, no branch.
+    Branches: above or on the table (its correction acts on z only, friction across), the speed
+    clamp, and lanes that are frozen. Sticking is the smooth end of friction, no branch.
     """
     t = structures(scalar, lanes)
     S, V, V3 = t.S, t.V, t.V3
     Particles, Tape, Adjoint = t.Particles, t.Tape, t.Adjoint
     finish, stepped = table_contact(scalar, lanes).finish, table_contact(scalar, lanes).stepped
-    coulomb_slopes = friction_adjoint(scalar, lanes).coulomb_slopes
+    coulomb_gradients = friction_adjoint(scalar, lanes).coulomb_gradients
     sweep_calm = internal_friction_adjoint(scalar, lanes).sweep_calm
 
     @wp.func
     def record_finish(
-        i: int, at: int, at_height: int, radius: S, inverse_dt: S, share: V, fall: V3, mu: V,
-        fastest: V, all_on: bool, on: V, q: Particles, tape: Tape,
-    ):  # fmt: skip
+        i: int,
+        at: int,
+        at_height: int,
+        radius: S,
+        inverse_dt: S,
+        damped_dt: V,
+        fall: V3,
+        mu: V,
+        fastest: V,
+        all_on: bool,
+        on: V,
+        particles: Particles,
+        tape: Tape,
+    ):
         if wp.static(with_sheets):
-            tape.x[at] = q.x[i]
-            tape.x[at + 1] = q.xp[i]
-            tape.x[at + 2] = q.v[i]
+            tape.x[at] = particles.x[i]
+            tape.x[at + 1] = particles.xp[i]
+            tape.x[at + 2] = particles.v[i]
         else:
-            x = q.x[i]
-            tape.x[at] = stepped(x, q.xp[i], q.w[i], q.v[i], share, fall)
+            x = particles.x[i]
+            tape.x[at] = stepped(
+                x, particles.xp[i], particles.w[i], particles.v[i], damped_dt, fall
+            )
             tape.v[at_height] = x.z
-        return finish(i, radius, inverse_dt, share, fall, mu, fastest, all_on, on, q)
+        return finish(i, radius, inverse_dt, damped_dt, fall, mu, fastest, all_on, on, particles)
 
     @wp.func
     def sweep_finish(
-        i: int, d: V3, z: V, radius: S, inverse_dt: S, mu: V, fastest: V, on: V, all_on: bool,
-        again: bool, dt: S, kept: V, fall: V3, dry: S, sleep: V, counts: int, adj: Adjoint,
-    ):  # fmt: skip
+        i: int,
+        d: V3,
+        z: V,
+        radius: S,
+        inverse_dt: S,
+        mu: V,
+        fastest: V,
+        on: V,
+        all_on: bool,
+        again: bool,
+        dt: S,
+        damping_factor: V,
+        fall: V3,
+        dry: S,
+        sleep: V,
+        counts: int,
+        adj: Adjoint,
+    ):
         zero = V(S(0.0))
         one = V(S(1.0))
         w = adj.w[i]
@@ -131,7 +167,7 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
         e = d
         if touches:
             depth = select(w, wp.max(V(radius) - z, zero), zero)
-            share, by_budget, by_d2 = coulomb_slopes(d.x * d.x + d.y * d.y, depth * mu)
+            share, by_budget, by_d2 = coulomb_gradients(d.x * d.x + d.y * d.y, depth * mu)
             e = V3(d.x - d.x * share, d.y - d.y * share, d.z + depth)
         moved2 = dot(e, e)
         slower = one
@@ -143,12 +179,12 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
             bent = over * slower / (l * l)
             kind = counts + wp.static(int(Kind.SPEED_CLAMP))
             adj.fired[kind] = adj.fired[kind] + over * on
-        by_kept = zero
+        by_damping = zero
         if wp.static(not with_sheets):
             if again:
                 free = select(w, V(dt), zero)
-                by_kept = dot(g, e * (slower * inverse_dt) + fall) * free
-                gv = gv + g * (kept * free)
+                by_damping = dot(g, e * (slower * inverse_dt) + fall) * free
+                gv = gv + g * (damping_factor * free)
                 g = g + go
                 go = V3(zero, zero, zero)
         # what is frozen ends where it began
@@ -189,19 +225,21 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
             go = V3(go.x - gx, go.y - gy, go.z)
         adj.x[i] = g
         adj.xp[i] = go
-        return by_mu, by_kept
+        return by_mu, by_damping
 
     @wp.func
-    def sweep_predict(i: int, v: V3, dt: S, kept: V, fall: V3, adj: Adjoint):
+    def sweep_predict(i: int, v: V3, dt: S, damping_factor: V, fall: V3, adj: Adjoint):
         g = adj.x[i]
         zero = V(S(0.0))
         free = select(adj.w[i], V(dt), zero)
-        adj.v[i] = adj.v[i] + g * (kept * free)
+        adj.v[i] = adj.v[i] + g * (damping_factor * free)
         adj.x[i] = g + adj.xp[i]
         adj.xp[i] = V3(zero, zero, zero)
         return dot(g, v + fall) * free
 
     return SimpleNamespace(
-        record_finish=record_finish, sweep_finish=sweep_finish, sweep_predict=sweep_predict,
+        record_finish=record_finish,
+        sweep_finish=sweep_finish,
+        sweep_predict=sweep_predict,
         stepped=stepped,
-    )  # fmt: skip
+    )

@@ -40,7 +40,7 @@ def triangle_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def project_triangle(
-        k: int, lane: int, p0: int, held: int, mu: S, push: S, sheets: Sheets, cells: Cells
+        k: int, lane: int, p0: int, held: int, mu: S, max_recovery: S, sheets: Sheets, cells: Cells
     ):
         """One pair; returns the sum of ACTS where it moved and CARRIES where `held` lies on it."""
         result = int(0)
@@ -87,7 +87,7 @@ def triangle_contact(scalar: Any, lanes: int) -> SimpleNamespace:
                 moved -= (b - get(cells.xp, ib, lane)) * u[1]
                 moved -= (c - get(cells.xp, ic, lane)) * u[2]
                 approach = wp.dot(moved, n)
-                depth = wp.min(depth, wp.max(push - approach, S(0.0)))
+                depth = wp.min(depth, wp.max(max_recovery - approach, S(0.0)))
                 if depth > S(0.0) and w > S(0.0):
                     slip = moved - n * approach
                     budget = depth * mu * sheets.friction[face]
@@ -104,12 +104,12 @@ def triangle_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def project_triangles(
-        g: int, lane: int, p0: int, held: int, mu: S, push: S, sheets: Sheets, cells: Cells
+        g: int, lane: int, p0: int, held: int, mu: S, max_recovery: S, sheets: Sheets, cells: Cells
     ):
         hit = bool(False)
         start = cells.list_start[g] + lane * cells.capacity[g]
         for k in range(start, start + cells.count[g * wp.static(L) + lane]):
-            result = project_triangle(k, lane, p0, held, mu, push, sheets, cells)
+            result = project_triangle(k, lane, p0, held, mu, max_recovery, sheets, cells)
             hit = hit or result >= wp.static(CARRIES)
         return hit
 

@@ -8,7 +8,7 @@ import warp as wp
 
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
-from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind
+from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind, tape
 from .closest_point import closest_point, closest_point_adjoint
 from .friction import friction_adjoint
 from .triangle_contact import ACTS, CARRIES, triangle_contact
@@ -33,10 +33,11 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     barycentric = closest_point(scalar, lanes).barycentric
     sweep_barycentric = closest_point_adjoint(scalar, lanes).sweep_barycentric
     project_triangle = triangle_contact(scalar, lanes).project_triangle
-    soft_slopes = friction_adjoint(scalar, lanes).coulomb_soft_scalar_slopes
+    position = tape(scalar, lanes).position
+    soft_gradients = friction_adjoint(scalar, lanes).coulomb_soft_scalar_gradients
 
     @wp.func
-    def push4(at: int, gap: S, p: R3, a: R3, b: R3, c: R3, tape: Tape):
+    def record_four(at: int, gap: S, p: R3, a: R3, b: R3, c: R3, tape: Tape):
         tape.s[at] = gap
         for axis in range(3):
             tape.s[at + 1 + axis] = p[axis]
@@ -45,13 +46,7 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             tape.s[at + 10 + axis] = c[axis]
 
     @wp.func
-    def point(at: int, tape: Tape):
-        return R3(tape.s[at], tape.s[at + 1], tape.s[at + 2])
-
-    @wp.func
-    def add_to(
-        x: wp.array(dtype=S), xp: wp.array(dtype=S), i: int, lane: int, gx: R3, gp: R3
-    ):  # fmt: skip
+    def add_to(x: wp.array(dtype=S), xp: wp.array(dtype=S), i: int, lane: int, gx: R3, gp: R3):
         put(x, i, lane, get(x, i, lane) + gx)
         put(xp, i, lane, get(xp, i, lane) + gp)
 
@@ -62,11 +57,20 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def record_triangles(
-        g: int, lane: int, p0: int, held: int, at_word: int, at_scalar: int, mu: S, push: S,
-        sheets: Sheets, cells: Cells, tape: Tape,
-    ):  # fmt: skip
+        g: int,
+        lane: int,
+        p0: int,
+        held: int,
+        at_word: int,
+        at_scalar: int,
+        mu: S,
+        max_recovery: S,
+        sheets: Sheets,
+        cells: Cells,
+        tape: Tape,
+    ):
         hit = int(0)
-        found = int(0)
+        count = int(0)
         start = cells.list_start[g] + lane * cells.capacity[g]
         for k in range(start, start + cells.count[g * wp.static(L) + lane]):
             face = cells.face[k]
@@ -76,32 +80,41 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             a = get(cells.x, p0 + tri[0], lane)
             b = get(cells.x, p0 + tri[1], lane)
             c = get(cells.x, p0 + tri[2], lane)
-            result = project_triangle(k, lane, p0, held, mu, push, sheets, cells)
+            result = project_triangle(k, lane, p0, held, mu, max_recovery, sheets, cells)
             if result >= wp.static(CARRIES):
                 hit = 1
             if result % wp.static(CARRIES) == wp.static(ACTS):
-                word = at_word + found * wp.static(TRIANGLE_WORDS)
+                word = at_word + count * wp.static(TRIANGLE_WORDS)
                 tape.k[word] = i
                 tape.k[word + 1] = face
-                push4(
-                    at_scalar + found * wp.static(TRIANGLE_SCALARS), cells.gap[k], p, a, b, c, tape
+                record_four(
+                    at_scalar + count * wp.static(TRIANGLE_SCALARS), cells.gap[k], p, a, b, c, tape
                 )
-                found += 1
-        return 2 * found + hit
+                count += 1
+        return 2 * count + hit
 
     @wp.func
     def sweep_triangle(
-        word: int, at: int, finished: int, lane: int, p0: int, mu: S, push: S, counts: int,
-        sheets: Sheets, tape: Tape, adj: Adjoint,
-    ):  # fmt: skip
+        word: int,
+        at: int,
+        finished: int,
+        lane: int,
+        p0: int,
+        mu: S,
+        max_recovery: S,
+        counts: int,
+        sheets: Sheets,
+        tape: Tape,
+        adj: Adjoint,
+    ):
         local = tape.k[word]
         face = tape.k[word + 1]
         tri = sheets.triangle[face]
         signed = tape.s[at]
-        p = point(at + 1, tape)
-        a = point(at + 4, tape)
-        b = point(at + 7, tape)
-        c = point(at + 10, tape)
+        p = position(at + 1, tape)
+        a = position(at + 4, tape)
+        b = position(at + 7, tape)
+        c = position(at + 10, tape)
         i = p0 + local
         ia = p0 + tri[0]
         ib = p0 + tri[1]
@@ -125,24 +138,24 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         fired = adj.fired[kind]
         fired[lane] = fired[lane] + S(1.0)
         adj.fired[kind] = fired
-        w0 = get_mass(adj.w_flat, i, lane)
+        wi = get_mass(adj.w_flat, i, lane)
         wa = get_mass(adj.w_flat, ia, lane)
         wb = get_mass(adj.w_flat, ib, lane)
         wc = get_mass(adj.w_flat, ic, lane)
-        w = w0 + wa * u[0] * u[0] + wb * u[1] * u[1] + wc * u[2] * u[2]
+        w = wi + wa * u[0] * u[0] + wb * u[1] * u[1] + wc * u[2] * u[2]
         sa = a - get(tape.x_flat, finished + 3 * tri[0] + 1, lane)
         sb = b - get(tape.x_flat, finished + 3 * tri[1] + 1, lane)
         sc = c - get(tape.x_flat, finished + 3 * tri[2] + 1, lane)
         moved = p - get(tape.x_flat, finished + 3 * local + 1, lane)
         moved -= sa * u[0] + sb * u[1] + sc * u[2]
         approach = wp.dot(moved, n)
-        allowed = wp.max(push - approach, S(0.0))
+        allowed = wp.max(max_recovery - approach, S(0.0))
         depth = wp.min(overlap, allowed)
         slip = moved - n * approach
         slip2 = wp.dot(slip, slip)
         rub = mu * sheets.friction[face]
         budget = depth * rub
-        share, by_budget, by_slip2 = soft_slopes(slip2, budget)
+        share, by_budget, by_slip2 = soft_gradients(slip2, budget)
         step = (n * depth - slip * share) / w
 
         gp = get(adj.x_flat, i, lane)
@@ -150,12 +163,12 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         gb = get(adj.x_flat, ib, lane)
         gc = get(adj.x_flat, ic, lane)
         # by the step and by the inverse masses that share it
-        g_step = gp * w0 - ga * (wa * u[0]) - gb * (wb * u[1]) - gc * (wc * u[2])
+        g_step = gp * wi - ga * (wa * u[0]) - gb * (wb * u[1]) - gc * (wc * u[2])
         ya = -wp.dot(ga, step)
         yb = -wp.dot(gb, step)
         yc = -wp.dot(gc, step)
         gw = -wp.dot(g_step, step) / w
-        add_mass(i, lane, w0, wp.dot(gp, step) + gw, adj)
+        add_mass(i, lane, wi, wp.dot(gp, step) + gw, adj)
         add_mass(ia, lane, wa, u[0] * (ya + gw * u[0]), adj)
         add_mass(ib, lane, wb, u[1] * (yb + gw * u[1]), adj)
         add_mass(ic, lane, wc, u[2] * (yc + gw * u[2]), adj)
@@ -199,6 +212,9 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         return g_budget * depth * sheets.friction[face]
 
     return SimpleNamespace(
-        record_triangles=record_triangles, sweep_triangle=sweep_triangle, push4=push4, point=point,
-        add_to=add_to, add_mass=add_mass,
-    )  # fmt: skip
+        record_triangles=record_triangles,
+        sweep_triangle=sweep_triangle,
+        record_four=record_four,
+        add_to=add_to,
+        add_mass=add_mass,
+    )

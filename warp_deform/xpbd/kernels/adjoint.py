@@ -3,8 +3,8 @@
 The sweep meets the constraints in exactly the opposite order of the forward kernel, pops each one's
 inputs from the tape, takes the branch that the forward pass took on these inputs, and adds the
 product of the loss's derivatives with the constraint's Jacobian. Contact lists play no part in it:
-what touched is on the tape. The phases stand in `sweeps` and `sweep_solids`. Source: Griewank,
-Walther, "Evaluating Derivatives", 2008, chapter 3.
+what touched is on the tape. The phases stand in `sweeps`, `sweep_sheets` and
+`sweep_solids`. Source: Griewank, Walther, "Evaluating Derivatives", 2008, chapter 3.
 """
 
 import functools
@@ -13,7 +13,8 @@ from typing import Any
 import warp as wp
 
 from ..lanes.algebra import add, kernel_options, mul, sub  # noqa: F401  (operators by name)
-from .grip import grip_adjoint
+from .grip_adjoint import grip_adjoint
+from .sweep_sheets import sweep_sheets
 from .sweep_solids import sweep_solids
 from .sweeps import sweeps
 
@@ -35,44 +36,47 @@ def adjoint_kernel(
     inverse masses of the state likewise. With `leave`, the prediction of the first substep is left
     to the sweep of the tape before (`pending`), which finds the velocity without a tape.
     """
-    t = sweeps(scalar, lanes, with_bodies, with_sheets, with_edges)
+    t = sweeps(scalar, lanes, with_bodies, with_sheets)
     S, V, span_of, pace_of = t.S, t.V, t.span_of, t.pace_of
     held_again = grip_adjoint(scalar, lanes, with_bodies).held_again
     solids = sweep_solids(scalar, lanes, with_sheets)
     sweep_finished_bodies, sweep_bodies = solids.sweep_finished_bodies, solids.sweep_bodies
     sweep_predicted_bodies = solids.sweep_predicted_bodies
     look_ahead, open_substep = t.look_ahead, t.open_substep
-    sweep_viscosity, sweep_finishes, sweep_fabrics = (
-        t.sweep_viscosity, t.sweep_finishes, t.sweep_fabrics
-    )  # fmt: skip
-    sweep_contacts, sweep_tethers, sweep_springs = (
-        t.sweep_contacts, t.sweep_tethers, t.sweep_springs
-    )  # fmt: skip
-    sweep_grips, sweep_pushes, sweep_predictions = (
-        t.sweep_grips, t.sweep_pushes, t.sweep_predictions
-    )  # fmt: skip
-    Settings, Topology, Springs, Pairs, Shapes = (
-        t.Settings,
-        t.Topology,
-        t.Springs,
-        t.Pairs,
-        t.Shapes,
-    )
+    sweep_finishes, sweep_contacts = t.sweep_finishes, t.sweep_contacts
+    sweep_springs, sweep_grips = t.sweep_springs, t.sweep_grips
+    sweep_pushes, sweep_predictions = t.sweep_pushes, t.sweep_predictions
+    sheets_ = sweep_sheets(scalar, lanes, with_edges)
+    sweep_viscosity, sweep_tethers = sheets_.sweep_viscosity, sheets_.sweep_tethers
+    sweep_fabrics = sheets_.sweep_fabrics
+    Settings, Topology, Springs, Pairs = t.Settings, t.Topology, t.Springs, t.Pairs
+    Shapes = t.Shapes
     Group, Particles, Bodies, Contacts, Grips = t.Group, t.Particles, t.Bodies, t.Contacts, t.Grips
     Sheets, Tape, Adjoint, BodyAdjoint, By = t.Sheets, t.Tape, t.Adjoint, t.BodyAdjoint, t.By
 
     @wp.kernel(module="unique", enable_backward=False, module_options=kernel_options(scalar, lanes))
     def sweep(
-        st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
-        q: Particles, bodies: Bodies, contacts: Contacts, grips: Grips, sheets: Sheets, tape: Tape,
-        adj: Adjoint, ba: BodyAdjoint,
-    ):  # fmt: skip
+        st: Settings,
+        top: Topology,
+        springs: Springs,
+        pairs: Pairs,
+        shapes: Shapes,
+        group: Group,
+        particles: Particles,
+        bodies: Bodies,
+        contacts: Contacts,
+        grips: Grips,
+        sheets: Sheets,
+        tape: Tape,
+        adj: Adjoint,
+        ba: BodyAdjoint,
+    ):
         g = wp.tid()
         at = span_of(g, top, group, sheets)
         pace = pace_of(g, st, group)
         always = look_ahead(at, springs, grips)
         by = By()
-        by.kept = adj.damping[g]
+        by.damping_factor = adj.damping[g]
         by.inverse_dt2 = adj.stiffness[g]
         by.table = adj.table_friction[g]
         by.contact = adj.contact_friction[g]
@@ -102,14 +106,27 @@ def adjoint_kernel(
             # solve
             if wp.static(with_bodies):
                 by, tops = sweep_bodies(
-                    at, pace, now, matters, by, tops, top, shapes, group, bodies, contacts, sheets,
-                    tape, ba, adj,
-                )  # fmt: skip
+                    at,
+                    pace,
+                    now,
+                    matters,
+                    by,
+                    tops,
+                    top,
+                    shapes,
+                    group,
+                    bodies,
+                    contacts,
+                    sheets,
+                    tape,
+                    ba,
+                    adj,
+                )
             if wp.static(with_sheets):
                 by, tops = sweep_fabrics(at, pace, now, by, tops, sheets, tape, adj)
             by, tops = sweep_contacts(at, pace, now, by, tops, pairs, tape, adj)
             if wp.static(with_sheets):
-                tops = sweep_tethers(at, now, tops, q, tape, adj)
+                tops = sweep_tethers(at, now, tops, particles, tape, adj)
             by, tops = sweep_springs(at, pace, now, by, tops, springs, tape, adj)
             # grips
             tops = sweep_grips(at, pace, tops, grips, tape, adj, ba)
@@ -126,7 +143,7 @@ def adjoint_kernel(
                 adj.pending[g] = adj.leave
             if tape.steps[g] > 0 and adj.leave == 0:
                 by = sweep_predictions(at, pace, tops[0] - at.particles, 1, by, tape, adj)
-        adj.damping[g] = by.kept
+        adj.damping[g] = by.damping_factor
         adj.table_friction[g] = by.table
         adj.contact_friction[g] = by.contact
         adj.stiffness[g] = by.inverse_dt2

@@ -12,9 +12,8 @@ from ..bodies.box_particle import box_particle
 from ..bodies.box_particle_adjoint import box_particle_adjoint
 from ..bodies.box_triangle import box_triangle
 from ..bodies.box_triangle_adjoint import box_triangle_adjoint
-from ..bodies.rigid_body_adjoint import rigid_adjoint
 from ..lanes.group_state import group_state
-from ..lanes.tape import BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS
+from ..lanes.tape import BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS, tape
 
 __all__ = ["body_solve"]
 
@@ -38,20 +37,30 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
     list_pairs = body_pairs(scalar, lanes).list_pairs
     record_box_particle = box_particle_adjoint(scalar, lanes).record_box_particle
     record_box_triangles = box_triangle_adjoint(scalar, lanes).record_box_triangles
-    push_pose = rigid_adjoint(scalar, lanes).push_pose
+    record_pose = tape(scalar, lanes).record_pose
     bodies_ = body_contact(scalar, lanes)
     solve_contacts, end_body = bodies_.solve_contacts, bodies_.end_body
 
     @wp.func
     def solve_lane(
-        lane: int, at: Span, pace: Pace, tops: wp.vec4i, top: Topology, shapes: Shapes,
-        group: Group, q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets,
-        cells: Cells, tape: Tape,
-    ):  # fmt: skip
+        lane: int,
+        at: Span,
+        pace: Pace,
+        tops: wp.vec4i,
+        top: Topology,
+        shapes: Shapes,
+        group: Group,
+        particles: Particles,
+        bodies: Bodies,
+        contacts: Contacts,
+        sheets: Sheets,
+        cells: Cells,
+        tape: Tape,
+    ):
         """Contacts of one lane's bodies with particles, each other and the table."""
         g = at.g
         k = at.k
-        push = pace.push
+        max_recovery = pace.max_recovery
         p0 = at.p0
         count = at.bodies
         b0 = at.b0 + lane * count
@@ -71,41 +80,88 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
             for i in range(at.particles):
                 radius = top.radius[radii + i]
                 thickest = wp.max(thickest, radius)
-                x = q.x[p0 + i]
+                x = particles.x[p0 + i]
                 d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
                 if wp.dot(d, d) < (far + radius) * (far + radius):
                     if wp.static(taped):
                         if record_box_particle(
-                            tops[3], p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies,
+                            tops[3],
+                            p0 + i,
+                            lane,
+                            radius,
+                            shape,
+                            b,
+                            mu,
+                            max_recovery,
+                            particles,
+                            shapes,
+                            bodies,
                             tape,
-                        ):  # fmt: skip
+                        ):
                             tape.k[tops[2]] = i
                             tape.k[tops[2] + 1] = shape - first
                             tops[2] += wp.static(BODY_WORDS)
                             tops[3] += wp.static(BOX_PARTICLE_SCALARS)
                     else:
                         project_box_particle(
-                            p0 + i, lane, radius, shape, b, mu, push, q, shapes, bodies
+                            p0 + i,
+                            lane,
+                            radius,
+                            shape,
+                            b,
+                            mu,
+                            max_recovery,
+                            particles,
+                            shapes,
+                            bodies,
                         )
             if wp.static(with_sheets and taped):
-                found = record_box_triangles(
-                    tops[2], tops[3], lane, k, p0, radii, shape, shape - first, b, far + thickest,
-                    mu, push, top, shapes, bodies, sheets, cells, tape,
-                )  # fmt: skip
-                tops[2] += wp.static(BODY_WORDS) * found
-                tops[3] += wp.static(BOX_TRIANGLE_SCALARS) * found
+                touched = record_box_triangles(
+                    tops[2],
+                    tops[3],
+                    lane,
+                    k,
+                    p0,
+                    radii,
+                    shape,
+                    shape - first,
+                    b,
+                    far + thickest,
+                    mu,
+                    max_recovery,
+                    top,
+                    shapes,
+                    bodies,
+                    sheets,
+                    cells,
+                    tape,
+                )
+                tops[2] += wp.static(BODY_WORDS) * touched
+                tops[3] += wp.static(BOX_TRIANGLE_SCALARS) * touched
             elif wp.static(with_sheets):
                 project_box_triangles(
-                    lane, k, p0, radii, shape, b, far + thickest, mu, push, top, shapes, bodies,
-                    sheets, cells,
-                )  # fmt: skip
+                    lane,
+                    k,
+                    p0,
+                    radii,
+                    shape,
+                    b,
+                    far + thickest,
+                    mu,
+                    max_recovery,
+                    top,
+                    shapes,
+                    bodies,
+                    sheets,
+                    cells,
+                )
         if wp.static(taped):
             tape.k[tops[2]] = (tops[2] - mark) // wp.static(BODY_WORDS)
             tops[2] += 1
             for b in range(b0, b0 + count):
-                push_pose(tops[3], bodies.x[b], bodies.q[b], tape)
+                record_pose(tops[3], bodies.x[b], bodies.q[b], tape)
                 tops[3] += 7
-        end = list_pairs(g, lane, k, push, top, shapes, group, bodies, contacts)
+        end = list_pairs(g, lane, k, max_recovery, top, shapes, group, bodies, contacts)
         solve_contacts(group.contact_start[g], end, bodies, contacts)
         for b in range(b0, b0 + count):
             end_body(b, bodies)
@@ -113,16 +169,37 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
 
     @wp.func
     def solve_bodies(
-        at: Span, pace: Pace, run: Run, tops: wp.vec4i, top: Topology, shapes: Shapes,
-        group: Group, q: Particles, bodies: Bodies, contacts: Contacts, sheets: Sheets,
-        cells: Cells, tape: Tape,
-    ):  # fmt: skip
+        at: Span,
+        pace: Pace,
+        run: Run,
+        tops: wp.vec4i,
+        top: Topology,
+        shapes: Shapes,
+        group: Group,
+        particles: Particles,
+        bodies: Bodies,
+        contacts: Contacts,
+        sheets: Sheets,
+        cells: Cells,
+        tape: Tape,
+    ):
         for lane in range(wp.static(L)):
             if run.on[lane] > S(0.0):
                 tops = solve_lane(
-                    lane, at, pace, tops, top, shapes, group, q, bodies, contacts, sheets, cells,
+                    lane,
+                    at,
+                    pace,
+                    tops,
+                    top,
+                    shapes,
+                    group,
+                    particles,
+                    bodies,
+                    contacts,
+                    sheets,
+                    cells,
                     tape,
-                )  # fmt: skip
+                )
         return tops
 
     return SimpleNamespace(solve_bodies=solve_bodies)

@@ -17,8 +17,8 @@ __all__ = ["contact_lists"]
 
 @functools.cache
 def contact_lists(scalar: Any, lanes: int, with_sheets: bool, with_edges: bool) -> SimpleNamespace:
-    """`list_contacts` brings a group's lists up to date and returns its `Run`; `listed` counts the
-    pairs of triangles and edges of all lanes.
+    """`list_contacts` brings a group's lists up to date and returns its `Run`; `count_listed`
+    counts the pairs of triangles and edges of all lanes.
 
     Near pairs are listed for all lanes at once. Triangles are listed lane by lane, in a frame that
     drifts with the world, so that a fall does not make lists stale.
@@ -36,31 +36,61 @@ def contact_lists(scalar: Any, lanes: int, with_sheets: bool, with_edges: bool) 
 
     @wp.func
     def list_contacts(
-        at: Span, pace: Pace, run: Run, st: Settings, top: Topology, group: Group, q: Particles,
-        pairs: Pairs, near: Near, sheets: Sheets, cells: Cells, watch: Watch,
-    ):  # fmt: skip
+        at: Span,
+        pace: Pace,
+        run: Run,
+        st: Settings,
+        top: Topology,
+        group: Group,
+        particles: Particles,
+        pairs: Pairs,
+        near: Near,
+        sheets: Sheets,
+        cells: Cells,
+        watch: Watch,
+    ):
         zero = V(S(0.0))
         if any_less(zero - run.stale, S(0.0)):
             run.near_count = list_near(
-                at.g, at.p0, at.near0, group.near_capacity[at.g], top.pair_start[at.k],
-                top.pair_start[at.k + 1], st.margin, run.stale, run.on, q, pairs, near, watch,
+                at.g,
+                at.p0,
+                at.near0,
+                group.near_capacity[at.g],
+                top.pair_start[at.k],
+                top.pair_start[at.k + 1],
+                st.margin,
+                run.stale,
+                run.on,
+                particles,
+                pairs,
+                near,
+                watch,
                 at.particles,
-            )  # fmt: skip
+            )
             run.travel = select(run.stale, zero, run.travel)
         if wp.static(with_sheets):
             if at.triangles > 0:
-                common = common_step(at.p0, at.particles, pace.dt, q)
+                common = common_step(at.p0, at.particles, pace.dt, particles)
                 run.drift = run.drift + common * run.on
-                far = moved_since(at.p0, at.particles, run.drift, q, cells)
+                far = moved_since(at.p0, at.particles, run.drift, particles, cells)
                 fresh = run.fresh
                 for lane in range(wp.static(L)):
                     if run.on[lane] > S(0.0) and (fresh[lane] < S(0.5) or far[lane] > S(0.0)):
                         anew = fresh[lane] < S(0.5)
                         fresh[lane] = S(1.0)
                         left = list_triangles(
-                            at.g, lane, at.k, at.p0, st.margin, anew, run.drift, common, top,
-                            sheets, cells,
-                        )  # fmt: skip
+                            at.g,
+                            lane,
+                            at.k,
+                            at.p0,
+                            st.margin,
+                            anew,
+                            run.drift,
+                            common,
+                            top,
+                            sheets,
+                            cells,
+                        )
                         if wp.static(with_edges):
                             left += list_edges(at.g, lane, at.k, at.p0, anew, top, sheets, cells)
                         over = watch.overflow[at.g]
@@ -70,13 +100,13 @@ def contact_lists(scalar: Any, lanes: int, with_sheets: bool, with_edges: bool) 
         return run
 
     @wp.func
-    def listed(at: Span, cells: Cells):
+    def count_listed(at: Span, cells: Cells):
         count = int(0)
         if wp.static(with_sheets):
             for lane in range(wp.static(L)):
-                count += cells.count[at.w0 + lane]
+                count += cells.count[at.world0 + lane]
                 if wp.static(with_edges):
-                    count += cells.edge_count[at.w0 + lane]
+                    count += cells.edge_count[at.world0 + lane]
         return count
 
-    return SimpleNamespace(list_contacts=list_contacts, listed=listed)
+    return SimpleNamespace(list_contacts=list_contacts, count_listed=count_listed)

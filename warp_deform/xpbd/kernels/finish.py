@@ -6,8 +6,8 @@ from typing import Any
 
 import warp as wp
 
-from ..bodies.rigid_body import rigid
-from ..bodies.rigid_body_adjoint import rigid_adjoint
+from ..bodies.rigid_body import rigid_body
+from ..bodies.rigid_body_adjoint import rigid_body_adjoint
 from ..contact.table_contact import table_contact, table_contact_adjoint
 from ..lanes.algebra import add, less, mul, root, select, sub  # noqa: F401  (operators by name)
 from ..lanes.group_state import group_state
@@ -36,14 +36,23 @@ def finishes(
         getattr(calms, n) for n in ("sleep_speed", "calm_particle", "damp_spring")
     )
     record_spring = internal_friction_adjoint(scalar, lanes).record_spring
-    finish_body = rigid(scalar, lanes).finish_body
-    record_body = rigid_adjoint(scalar, lanes).record_body
+    finish_body = rigid_body(scalar, lanes).finish_body
+    record_body = rigid_body_adjoint(scalar, lanes).record_body
 
     @wp.func
     def finish_all(
-        at: Span, pace: Pace, run: Run, all_on: bool, tops: wp.vec4i, st: Settings, top: Topology,
-        springs: Springs, q: Particles, bodies: Bodies, tape: Tape,
-    ):  # fmt: skip
+        at: Span,
+        pace: Pace,
+        run: Run,
+        all_on: bool,
+        tops: wp.vec4i,
+        st: Settings,
+        top: Topology,
+        springs: Springs,
+        particles: Particles,
+        bodies: Bodies,
+        tape: Tape,
+    ):
         zero = V(S(0.0))
         one = V(S(1.0))
         dt = pace.dt
@@ -54,9 +63,20 @@ def finishes(
             ended2 = zero
             if wp.static(taped):
                 ended2 = record_finish(
-                    at.p0 + i, tops[0], tops[1], radius, pace.inverse_dt, pace.share, pace.fall,
-                    pace.table_mu, fastest, all_on, run.on, q, tape,
-                )  # fmt: skip
+                    at.p0 + i,
+                    tops[0],
+                    tops[1],
+                    radius,
+                    pace.inverse_dt,
+                    pace.damped_dt,
+                    pace.fall,
+                    pace.table_mu,
+                    fastest,
+                    all_on,
+                    run.on,
+                    particles,
+                    tape,
+                )
                 if wp.static(with_sheets):
                     tops[0] += 3
                 else:
@@ -64,9 +84,17 @@ def finishes(
                     tops[1] += 1
             else:
                 ended2 = finish(
-                    at.p0 + i, radius, pace.inverse_dt, pace.share, pace.fall, pace.table_mu,
-                    fastest, all_on, run.on, q,
-                )  # fmt: skip
+                    at.p0 + i,
+                    radius,
+                    pace.inverse_dt,
+                    pace.damped_dt,
+                    pace.fall,
+                    pace.table_mu,
+                    fastest,
+                    all_on,
+                    run.on,
+                    particles,
+                )
             moved2 = wp.max(moved2, ended2)
         unrest2 = moved2
         drowsy = one
@@ -78,32 +106,48 @@ def finishes(
                 drowsy = sleep_speed(run.free_time, S(1.0), st.sleep_ramp)
                 speed2 = zero
                 for i in range(at.particles):
-                    speed2 = wp.max(speed2, calm_particle(at.p0 + i, st.dry, sleep, run.on, q))
+                    speed2 = wp.max(
+                        speed2, calm_particle(at.p0 + i, st.dry, sleep, run.on, particles)
+                    )
                 unrest2 = speed2 * (dt * dt)
             if st.viscous > S(0.0):
                 for s in range(at.s0, at.s1):
                     if springs.limit[s] > S(0.0):
                         if wp.static(taped):
-                            record_spring(s, at.p0, tops[0], st.viscous, run.on, q, springs, tape)
+                            record_spring(
+                                s, at.p0, tops[0], st.viscous, run.on, particles, springs, tape
+                            )
                             tops[0] += 1
                         else:
-                            damp_spring(s, at.p0, st.viscous, run.on, q, springs)
+                            damp_spring(s, at.p0, st.viscous, run.on, particles, springs)
             run.free_time = (run.free_time + V(dt)) * (one - run.holding)
         if wp.static(with_bodies):
             for lane in range(wp.static(L)):
                 if run.on[lane] > S(0.0):
-                    pull = R3(pace.gravity.x[lane], pace.gravity.y[lane], pace.gravity.z[lane])
+                    gravity = R3(pace.gravity.x[lane], pace.gravity.y[lane], pace.gravity.z[lane])
                     for b in range(at.bodies):
                         body = at.b0 + lane * at.bodies + b
                         if wp.static(taped):
                             tape.k[tops[2]] = record_body(
-                                tops[3], body, dt, pace.kept[lane], pull, drowsy[lane], bodies,
+                                tops[3],
+                                body,
+                                dt,
+                                pace.damping_factor[lane],
+                                gravity,
+                                drowsy[lane],
+                                bodies,
                                 tape,
-                            )  # fmt: skip
+                            )
                             tops[2] += 1
                             tops[3] += wp.static(BODY_SCALARS - 7)
                         m = finish_body(
-                            body, dt, pace.kept[lane], pull, fastest[lane], drowsy[lane], bodies
+                            body,
+                            dt,
+                            pace.damping_factor[lane],
+                            gravity,
+                            fastest[lane],
+                            drowsy[lane],
+                            bodies,
                         )
                         moved2[lane] = wp.max(moved2[lane], m)
                         unrest2[lane] = wp.max(unrest2[lane], m)

@@ -47,10 +47,10 @@ def forward_kernel(
     ends_ = launch_ends(scalar, lanes, with_bodies, with_sheets, taped)
     begin, record_frame, end = ends_.begin, ends_.record_frame, ends_.end
     predictions_ = predictions(scalar, lanes, with_bodies)
-    predict_all, push_all = predictions_.predict_all, predictions_.push_all
+    predict_all, apply_pushes = predictions_.predict_all, predictions_.apply_pushes
     lead_grips = leads(scalar, lanes, with_bodies, with_sheets, taped).lead_grips
     lists_ = contact_lists(scalar, lanes, with_sheets, with_edges)
-    list_contacts, listed = lists_.list_contacts, lists_.listed
+    list_contacts, count_listed = lists_.list_contacts, lists_.count_listed
     solve_particles = particle_solve(scalar, lanes, with_sheets, with_edges, taped).solve_particles
     solve_bodies = body_solve(scalar, lanes, with_sheets, taped).solve_bodies
     finishes_ = finishes(scalar, lanes, with_bodies, with_sheets, taped)
@@ -65,10 +65,22 @@ def forward_kernel(
 
     @wp.kernel(module="unique", enable_backward=False, module_options=kernel_options(scalar, lanes))
     def forward(
-        st: Settings, top: Topology, springs: Springs, pairs: Pairs, shapes: Shapes, group: Group,
-        q: Particles, near: Near, bodies: Bodies, contacts: Contacts, grips: Grips, watch: Watch,
-        sheets: Sheets, cells: Cells, tape: Tape,
-    ):  # fmt: skip
+        st: Settings,
+        top: Topology,
+        springs: Springs,
+        pairs: Pairs,
+        shapes: Shapes,
+        group: Group,
+        particles: Particles,
+        near: Near,
+        bodies: Bodies,
+        contacts: Contacts,
+        grips: Grips,
+        watch: Watch,
+        sheets: Sheets,
+        cells: Cells,
+        tape: Tape,
+    ):
         g = wp.tid()
         zero = V(S(0.0))
         at = span_of(g, top, group, sheets)
@@ -79,9 +91,9 @@ def forward_kernel(
             begins = tape.resume == 0
         run = Run()
         if begins:
-            run = begin(at, group, q, bodies, grips, cells)
+            run = begin(at, group, particles, bodies, grips, cells)
         # the table hides at once that a particle started under it
-        watch_group(at, springs, shapes, group, q, bodies, watch)
+        watch_group(at, springs, shapes, group, particles, bodies, watch)
         tops = wp.vec4i()
         if wp.static(taped):
             tops = tape.first[g]
@@ -89,7 +101,7 @@ def forward_kernel(
                 run = load_state(g, tape)
             if wp.static(not with_sheets):
                 for i in range(at.particles):
-                    tape.x[tops[0]] = q.v[at.p0 + i]
+                    tape.x[tops[0]] = particles.v[at.p0 + i]
                     tops[0] += 1
             tape.steps[g] = -run.substep
             tape.full[g] = 0
@@ -97,41 +109,67 @@ def forward_kernel(
         while run.substep < st.max_steps and any_less(zero - run.on, S(0.0)):
             all_on = not any_less(run.on, S(0.5))
             if st.record_every > 0 and run.substep % wp.max(st.record_every, 1) == 0:
-                record_frame(at, frame, st, q, bodies, watch)
+                record_frame(at, frame, st, particles, bodies, watch)
                 frame += 1
             # predict
-            predict_all(at, pace, run, q, bodies)
+            predict_all(at, pace, run, particles, bodies)
             if run.substep < run.longest_push:
-                push_all(at, pace, run, q, grips)
+                apply_pushes(at, pace, run, particles, grips)
             # grips
             run, tops = lead_grips(
-                at, pace, run, tops, top, group, q, pairs, shapes, near, bodies, grips, cells, tape
+                at,
+                pace,
+                run,
+                tops,
+                top,
+                group,
+                particles,
+                pairs,
+                shapes,
+                near,
+                bodies,
+                grips,
+                cells,
+                tape,
             )
             # contact lists
-            run = list_contacts(at, pace, run, st, top, group, q, pairs, near, sheets, cells, watch)
+            run = list_contacts(
+                at, pace, run, st, top, group, particles, pairs, near, sheets, cells, watch
+            )
             if wp.static(taped):
-                if not has_room(at, run, listed(at, cells), tops, tape):
+                if not has_room(at, run, count_listed(at, cells), tops, tape):
                     tape.full[g] = 1
                     break
             # solve
             tops = solve_particles(
-                at, pace, run, tops, q, springs, pairs, near, grips, sheets, cells, tape
+                at, pace, run, tops, particles, springs, pairs, near, grips, sheets, cells, tape
             )
             if wp.static(with_bodies):
                 tops = solve_bodies(
-                    at, pace, run, tops, top, shapes, group, q, bodies, contacts, sheets, cells,
+                    at,
+                    pace,
+                    run,
+                    tops,
+                    top,
+                    shapes,
+                    group,
+                    particles,
+                    bodies,
+                    contacts,
+                    sheets,
+                    cells,
                     tape,
-                )  # fmt: skip
+                )
             # finish
             run, tops, moved2, unrest2 = finish_all(
-                at, pace, run, all_on, tops, st, top, springs, q, bodies, tape
+                at, pace, run, all_on, tops, st, top, springs, particles, bodies, tape
             )
             run, done = count_substep(pace, run, most, moved2, unrest2, st)
             if run.substep % st.check_every == 0:
-                watch_group(at, springs, shapes, group, q, bodies, watch)
+                watch_group(at, springs, shapes, group, particles, bodies, watch)
             run.on = run.on * (V(S(1.0)) - done)
         # record
-        watch_group(at, springs, shapes, group, q, bodies, watch)
+        watch_group(at, springs, shapes, group, particles, bodies, watch)
         watch.steps[g] = run.steps
         watch.clamped[g] = run.clamped
         ends = bool(True)
@@ -140,6 +178,6 @@ def forward_kernel(
             tape.steps[g] = tape.steps[g] + run.substep
             tape.until[g] = run.substep
             ends = tape.last > 0
-        end(at, run, ends, tops, q, bodies, grips, cells, tape)
+        end(at, run, ends, tops, particles, bodies, grips, cells, tape)
 
     return forward

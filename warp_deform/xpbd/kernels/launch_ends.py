@@ -28,7 +28,9 @@ def launch_ends(
     take, let_go = grip(scalar, lanes).take, grip(scalar, lanes).let_go
 
     @wp.func
-    def begin(at: Span, group: Group, q: Particles, bodies: Bodies, grips: Grips, cells: Cells):
+    def begin(
+        at: Span, group: Group, particles: Particles, bodies: Bodies, grips: Grips, cells: Cells
+    ):
         zero = V(S(0.0))
         run = Run()
         run.on = group.active[at.g]
@@ -47,27 +49,27 @@ def launch_ends(
         holding = zero
         longest = int(0)
         for lane in range(wp.static(L)):
-            w = at.w0 + lane
+            w = at.world0 + lane
             if wp.static(with_sheets):
                 cells.met[w] = 0
             if run.on[lane] > S(0.0):
                 if grips.particle[w] >= 0 or grips.body[w] >= 0:
                     holding[lane] = S(1.0)
-                    take(w, lane, at.p0, at.b0 + lane * at.bodies, q, bodies, grips)
+                    take(w, lane, at.p0, at.b0 + lane * at.bodies, particles, bodies, grips)
                 for p in range(wp.static(MOST_PUSHES)):
-                    push = w * wp.static(MOST_PUSHES) + p
-                    if grips.push[push] >= 0:
-                        longest = wp.max(longest, grips.push_steps[push])
+                    slot = w * wp.static(MOST_PUSHES) + p
+                    if grips.push[slot] >= 0:
+                        longest = wp.max(longest, grips.push_steps[slot])
         run.holding = holding
         run.longest_push = longest
         return run
 
     @wp.func
     def record_frame(
-        at: Span, frame: int, st: Settings, q: Particles, bodies: Bodies, watch: Watch
+        at: Span, frame: int, st: Settings, particles: Particles, bodies: Bodies, watch: Watch
     ):
         for i in range(at.particles):
-            watch.frame_x[frame * st.particle_stride + at.p0 + i] = q.x[at.p0 + i]
+            watch.frame_x[frame * st.particle_stride + at.p0 + i] = particles.x[at.p0 + i]
         if wp.static(with_bodies):
             for b in range(at.bodies * wp.static(L)):
                 row = frame * st.body_stride + at.b0 + b
@@ -76,9 +78,16 @@ def launch_ends(
 
     @wp.func
     def end(
-        at: Span, run: Run, ends: bool, tops: wp.vec4i, q: Particles, bodies: Bodies, grips: Grips,
-        cells: Cells, tape: Tape,
-    ):  # fmt: skip
+        at: Span,
+        run: Run,
+        ends: bool,
+        tops: wp.vec4i,
+        particles: Particles,
+        bodies: Bodies,
+        grips: Grips,
+        cells: Cells,
+        tape: Tape,
+    ):
         """A world cut off while it held something lets go: nothing is held between launches."""
         if wp.static(with_sheets):
             if ends:
@@ -88,14 +97,14 @@ def launch_ends(
             mark = int(tops[2])
         for lane in range(wp.static(L)):
             if ends and run.holding[lane] > S(0.0):
-                w = at.w0 + lane
+                w = at.world0 + lane
                 if wp.static(taped):
                     tape.k[tops[2]] = lane
                     tape.k[tops[2] + 1] = grips.particle[w]
                     if grips.particle[w] < 0:
                         tape.k[tops[2] + 1] = -1 - grips.body[w]
                     tops[2] += 2
-                let_go(w, lane, at.p0, at.b0 + lane * at.bodies, q, bodies, grips)
+                let_go(w, lane, at.p0, at.b0 + lane * at.bodies, particles, bodies, grips)
         if wp.static(taped):
             tape.k[tops[2]] = (tops[2] - mark) // 2
             tops[2] += 1

@@ -9,7 +9,8 @@ import warp as wp
 from ..lanes.algebra import any_less, sub  # noqa: F401  (operators are found by name)
 from ..lanes.group_state import group_state
 from ..lanes.tape import GRIP_WORDS
-from .grip import grip, grip_adjoint
+from .grip import grip
+from .grip_adjoint import grip_adjoint
 
 __all__ = ["leads"]
 
@@ -29,10 +30,21 @@ def leads(
 
     @wp.func
     def lead_grips(
-        at: Span, pace: Pace, run: Run, tops: wp.vec4i, top: Topology, group: Group, q: Particles,
-        pairs: Pairs, shapes: Shapes, near: Near, bodies: Bodies, grips: Grips, cells: Cells,
+        at: Span,
+        pace: Pace,
+        run: Run,
+        tops: wp.vec4i,
+        top: Topology,
+        group: Group,
+        particles: Particles,
+        pairs: Pairs,
+        shapes: Shapes,
+        near: Near,
+        bodies: Bodies,
+        grips: Grips,
+        cells: Cells,
         tape: Tape,
-    ):  # fmt: skip
+    ):
         zero = V(S(0.0))
         if wp.static(taped):
             mark = int(tops[2])
@@ -42,7 +54,7 @@ def leads(
             least = run.least
             for lane in range(wp.static(L)):
                 if holding[lane] > S(0.0) and run.on[lane] > S(0.0):
-                    w = at.w0 + lane
+                    w = at.world0 + lane
                     met = bool(False)
                     if wp.static(with_sheets):
                         met = cells.met[w] > 0
@@ -51,15 +63,25 @@ def leads(
                         knot = grips.knot[w]
                         shift = grips.shift[w]
                     goes_on = follow_path(
-                        lane, met, at, run.near_count, pace.dt, top, q, pairs, shapes, near,
-                        bodies, grips,
-                    )  # fmt: skip
+                        lane,
+                        met,
+                        at,
+                        run.near_count,
+                        pace.dt,
+                        top,
+                        particles,
+                        pairs,
+                        shapes,
+                        near,
+                        bodies,
+                        grips,
+                    )
                     if wp.static(taped):
                         released = wp.where(goes_on, 0, 1)
                         record_grip(tops[2], w, lane, tick, knot, shift, released, grips, tape)
                         tops[2] += wp.static(GRIP_WORDS)
                     if not goes_on:
-                        let_go(w, lane, at.p0, at.b0 + lane * at.bodies, q, bodies, grips)
+                        let_go(w, lane, at.p0, at.b0 + lane * at.bodies, particles, bodies, grips)
                         holding[lane] = S(0.0)
                         after = group.calm_after[at.g]
                         calm[lane] = after[lane]

@@ -12,7 +12,7 @@ from ..contact.edge_contact_adjoint import edge_contact_adjoint
 from ..contact.sphere_contact import sphere_contact, sphere_contact_adjoint
 from ..contact.triangle_contact import triangle_contact
 from ..contact.triangle_contact_adjoint import triangle_contact_adjoint
-from ..lanes.algebra import any_less, sub  # noqa: F401  (operators are found by name)
+from ..lanes.algebra import any_less, sub  # noqa: F401  (operators are acted_count by name)
 from ..lanes.group_state import group_state
 from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS
 from ..springs.bending import bending, bending_adjoint
@@ -49,15 +49,25 @@ def particle_solve(
 
     @wp.func
     def solve_particles(
-        at: Span, pace: Pace, run: Run, tops: wp.vec4i, q: Particles, springs: Springs,
-        pairs: Pairs, near: Near, grips: Grips, sheets: Sheets, cells: Cells, tape: Tape,
-    ):  # fmt: skip
+        at: Span,
+        pace: Pace,
+        run: Run,
+        tops: wp.vec4i,
+        particles: Particles,
+        springs: Springs,
+        pairs: Pairs,
+        near: Near,
+        grips: Grips,
+        sheets: Sheets,
+        cells: Cells,
+        tape: Tape,
+    ):
         zero = V(S(0.0))
         p0 = at.p0
-        w0 = at.w0
+        world0 = at.world0
         inverse_dt2 = pace.inverse_dt2
         contact_mu = pace.contact_mu
-        push = pace.push
+        max_recovery = pace.max_recovery
         holding = run.holding
         on = run.on
         tx = int(tops[0])
@@ -70,29 +80,29 @@ def particle_solve(
         for s in range(at.s0, at.s1):
             if wp.static(taped):
                 if springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                    record_bend(s, p0, tx, inverse_dt2, q, springs, tape)
+                    record_bend(s, p0, tx, inverse_dt2, particles, springs, tape)
                     tx += 1
                 else:
-                    acted = record_distance(s, p0, tx, inverse_dt2, q, springs, tape)
+                    acted = record_distance(s, p0, tx, inverse_dt2, particles, springs, tape)
                     if acted:
                         tx += 1
                         if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
                             tape.k[tk] = s
                             tk += 1
             elif springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                project_bend(s, p0, inverse_dt2, q, springs)
+                project_bend(s, p0, inverse_dt2, particles, springs)
             else:
-                project_distance(s, p0, inverse_dt2, q, springs)
+                project_distance(s, p0, inverse_dt2, particles, springs)
         if wp.static(taped):
             tape.k[tk] = tk - mark
             tk += 1
         if wp.static(with_sheets):
             if any_less(zero - holding, S(0.0)):
-                held = q.x[p0]
+                held = particles.x[p0]
                 for lane in range(wp.static(L)):
-                    i = grips.particle[w0 + lane]
+                    i = grips.particle[world0 + lane]
                     if i >= 0:
-                        x = q.x[p0 + i]
+                        x = particles.x[p0 + i]
                         held.x[lane] = x.x[lane]
                         held.y[lane] = x.y[lane]
                         held.z[lane] = x.z[lane]
@@ -100,31 +110,31 @@ def particle_solve(
                     mark = int(tk)
                 for i in range(at.particles):
                     if wp.static(taped):
-                        if record_tether(p0 + i, tx, holding, held, q, tape):
+                        if record_tether(p0 + i, tx, holding, held, particles, tape):
                             tape.k[tk] = i
                             tx += 1
                             tk += 1
                     else:
-                        project_tether(p0 + i, holding, held, q)
+                        project_tether(p0 + i, holding, held, particles)
                 if wp.static(taped):
                     tape.k[tk] = tk - mark
                     tk += 1
                     for lane in range(wp.static(L)):
-                        tape.k[tk] = grips.particle[w0 + lane]
+                        tape.k[tk] = grips.particle[world0 + lane]
                         tk += 1
         if wp.static(taped):
             mark = int(tk)
         for c in range(at.near0, at.near0 + run.near_count):
             if wp.static(taped):
                 if record_contact(
-                    c, p0, tx, tv, contact_mu, push, q, pairs, near, tape
-                ):  # fmt: skip
+                    c, p0, tx, tv, contact_mu, max_recovery, particles, pairs, near, tape
+                ):
                     tape.k[tk] = near.pair[c]
                     tx += 2
                     tv += 1
                     tk += 1
             else:
-                project_contact(c, p0, contact_mu, push, q, pairs, near)
+                project_contact(c, p0, contact_mu, max_recovery, particles, pairs, near)
         if wp.static(taped):
             tape.k[tk] = tk - mark
             tk += 1
@@ -133,32 +143,47 @@ def particle_solve(
                 for lane in range(wp.static(L)):
                     if on[lane] > S(0.0):
                         if wp.static(taped):
-                            found = record_triangles(
-                                at.g, lane, p0, grips.particle[w0 + lane], tk, ts,
-                                contact_mu[lane], push, sheets, cells, tape,
-                            )  # fmt: skip
-                            cells.met[w0 + lane] = found % 2
-                            found = found // 2
-                            tk += wp.static(TRIANGLE_WORDS) * found
-                            ts += wp.static(TRIANGLE_SCALARS) * found
-                            tape.k[tk] = found
+                            acted_count = record_triangles(
+                                at.g,
+                                lane,
+                                p0,
+                                grips.particle[world0 + lane],
+                                tk,
+                                ts,
+                                contact_mu[lane],
+                                max_recovery,
+                                sheets,
+                                cells,
+                                tape,
+                            )
+                            cells.met[world0 + lane] = acted_count % 2
+                            acted_count = acted_count // 2
+                            tk += wp.static(TRIANGLE_WORDS) * acted_count
+                            ts += wp.static(TRIANGLE_SCALARS) * acted_count
+                            tape.k[tk] = acted_count
                             tk += 1
                             if wp.static(with_edges):
-                                found = record_edges(
-                                    at.g, lane, p0, tk, ts, push, sheets, cells, tape
-                                )  # fmt: skip
-                                tk += wp.static(TRIANGLE_WORDS) * found
-                                ts += wp.static(TRIANGLE_SCALARS) * found
-                                tape.k[tk] = found
+                                acted_count = record_edges(
+                                    at.g, lane, p0, tk, ts, max_recovery, sheets, cells, tape
+                                )
+                                tk += wp.static(TRIANGLE_WORDS) * acted_count
+                                ts += wp.static(TRIANGLE_SCALARS) * acted_count
+                                tape.k[tk] = acted_count
                                 tk += 1
                         else:
                             hit = project_triangles(
-                                at.g, lane, p0, grips.particle[w0 + lane], contact_mu[lane],
-                                push, sheets, cells,
-                            )  # fmt: skip
-                            cells.met[w0 + lane] = wp.where(hit, 1, 0)
+                                at.g,
+                                lane,
+                                p0,
+                                grips.particle[world0 + lane],
+                                contact_mu[lane],
+                                max_recovery,
+                                sheets,
+                                cells,
+                            )
+                            cells.met[world0 + lane] = wp.where(hit, 1, 0)
                             if wp.static(with_edges):
-                                project_edges(at.g, lane, p0, push, sheets, cells)
+                                project_edges(at.g, lane, p0, max_recovery, sheets, cells)
         return wp.vec4i(tx, tv, tk, ts)
 
     return SimpleNamespace(solve_particles=solve_particles)

@@ -13,11 +13,11 @@ from ..bodies.box_box_adjoint import box_box_adjoint
 from ..bodies.box_particle_adjoint import box_particle_adjoint
 from ..bodies.box_table import box_table
 from ..bodies.box_triangle_adjoint import box_triangle_adjoint
-from ..bodies.rigid_body_adjoint import rigid_adjoint
+from ..bodies.rigid_body_adjoint import rigid_body_adjoint
 from ..lanes.algebra import add  # noqa: F401  (operators are found by name)
 from ..lanes.sweep_state import sweep_state
-from ..lanes.tape import BODY_SCALARS, BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS
-from .grip import grip_adjoint
+from ..lanes.tape import BODY_SCALARS, BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS, tape
+from .grip_adjoint import grip_adjoint
 
 __all__ = ["sweep_solids"]
 
@@ -41,13 +41,17 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     sweep_end_body, sweep_visits, sweep_listed, sweep_spread, clear_contacts = (
         getattr(contact_, name)
         for name in (
-            "sweep_end_body", "sweep_visits", "sweep_listed", "sweep_spread", "clear_contacts"
+            "sweep_end_body",
+            "sweep_visits",
+            "sweep_listed",
+            "sweep_spread",
+            "clear_contacts",
         )
-    )  # fmt: skip
+    )
     sweep_box_particle = box_particle_adjoint(scalar, lanes).sweep_box_particle
     sweep_box_triangle = box_triangle_adjoint(scalar, lanes).sweep_box_triangle
-    poses = rigid_adjoint(scalar, lanes)
-    position, quaternion = poses.position, poses.quaternion
+    poses = rigid_body_adjoint(scalar, lanes)
+    position, quaternion = tape(scalar, lanes).position, tape(scalar, lanes).quaternion
     load_body, sweep_finish_body = poses.load_body, poses.sweep_finish_body
     sweep_predict_body = poses.sweep_predict_body
     turned_by = grip_adjoint(scalar, lanes, False).turned_by
@@ -58,26 +62,36 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
 
     @wp.func
     def sweep_body_pairs(
-        lane: int, at: Span, pace: Pace, counts: int, before: int, top: Topology, shapes: Shapes,
-        group: Group, bodies: Bodies, contacts: Contacts, tape: Tape, ba: BodyAdjoint,
+        lane: int,
+        at: Span,
+        pace: Pace,
+        counts: int,
+        before: int,
+        top: Topology,
+        shapes: Shapes,
+        group: Group,
+        bodies: Bodies,
+        contacts: Contacts,
+        tape: Tape,
+        ba: BodyAdjoint,
         adj: Adjoint,
-    ):  # fmt: skip
+    ):
         """Contacts of one lane's bodies with each other and the table.
 
         Poses `before` these contacts are on the tape; returns the derivatives by friction of the
         table and of contacts.
         """
         g = at.g
-        push = pace.push
+        max_recovery = pace.max_recovery
         # Warp puts functions that take gradients last: what calls them has to be such a one, too
-        one = wp.grad(itself)(push)
+        one = wp.grad(itself)(max_recovery)
         count = at.bodies
         b0 = at.b0 + lane * count
         for b in range(count):
             bodies.x[b0 + b] = position(before + b * wp.static(POSE), tape)
             bodies.q[b0 + b] = quaternion(before + b * wp.static(POSE) + 3, tape)
         start = group.contact_start[g]
-        end = list_pairs(g, lane, at.k, push, top, shapes, group, bodies, contacts)
+        end = list_pairs(g, lane, at.k, max_recovery, top, shapes, group, bodies, contacts)
         passes = solve_contacts(start, end, bodies, contacts)
         clear_contacts(start, end, ba)
         for b in range(b0, b0 + count):
@@ -94,13 +108,13 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
             pb = bodies.x[b] + contacts.rb[i]
             if a >= 0:
                 pa = bodies.x[a] + contacts.ra[i]
-                ga, gb, gn = sweep_listed(i, pa, pb, push, bodies, contacts, ba)
+                ga, gb, gn = sweep_listed(i, pa, pb, max_recovery, bodies, contacts, ba)
                 sweep_boxes(a, b, code, ga, gb, gn, shapes, bodies, ba)
                 rub = wp.min(shapes.friction[code[0]], shapes.friction[code[1]])
                 by_contact += ba.mu[i] * rub
             else:
                 foot = R3(pb[0], pb[1], S(0.0))
-                ga, gb, gn = sweep_listed(i, foot, pb, push, bodies, contacts, ba)
+                ga, gb, gn = sweep_listed(i, foot, pb, max_recovery, bodies, contacts, ba)
                 gp = gb + R3(ga[0], ga[1], S(0.0))
                 ba.x[b] = ba.x[b] + gp
                 local = corner(code[1], code[2], shapes)
@@ -112,19 +126,29 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
 
     @wp.func
     def sweep_body_contacts(
-        lane: int, at: Span, pace: Pace, now: Substep, tops: wp.vec4i, top: Topology,
-        shapes: Shapes, bodies: Bodies, sheets: Sheets, tape: Tape, ba: BodyAdjoint, adj: Adjoint,
-    ):  # fmt: skip
+        lane: int,
+        at: Span,
+        pace: Pace,
+        now: Substep,
+        tops: wp.vec4i,
+        top: Topology,
+        shapes: Shapes,
+        bodies: Bodies,
+        sheets: Sheets,
+        tape: Tape,
+        ba: BodyAdjoint,
+        adj: Adjoint,
+    ):
         """Contacts of one lane's bodies with particles and triangles; returns the tops of the tape
         and the derivative by friction.
         """
-        push = pace.push
+        max_recovery = pace.max_recovery
         counts = now.counts
         p0 = at.p0
         b0 = at.b0 + lane * at.bodies
         mu = pace.contact_mu[lane]
         radii = at.radii
-        one = wp.grad(itself)(push)
+        one = wp.grad(itself)(max_recovery)
         by_mu = one - one
         tk = tops[2] - 1
         ts = int(tops[3])
@@ -136,15 +160,43 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
             if who >= 0:
                 ts -= wp.static(BOX_PARTICLE_SCALARS)
                 by_mu += sweep_box_particle(
-                    ts, p0 + who, lane, top.radius[radii + who], shape, b, mu, push, counts,
-                    shapes, bodies, tape, ba, adj,
-                )  # fmt: skip
+                    ts,
+                    p0 + who,
+                    lane,
+                    top.radius[radii + who],
+                    shape,
+                    b,
+                    mu,
+                    max_recovery,
+                    counts,
+                    shapes,
+                    bodies,
+                    tape,
+                    ba,
+                    adj,
+                )
             elif wp.static(with_sheets):
                 ts -= wp.static(BOX_TRIANGLE_SCALARS)
                 by_mu += sweep_box_triangle(
-                    ts, -1 - who, now.finished, lane, p0, radii, shape, b, mu, push, counts, top,
-                    shapes, bodies, sheets, tape, ba, adj,
-                )  # fmt: skip
+                    ts,
+                    -1 - who,
+                    now.finished,
+                    lane,
+                    p0,
+                    radii,
+                    shape,
+                    b,
+                    mu,
+                    max_recovery,
+                    counts,
+                    top,
+                    shapes,
+                    bodies,
+                    sheets,
+                    tape,
+                    ba,
+                    adj,
+                )
         return wp.vec4i(tops[0], tops[1], tk, ts), by_mu
 
     @wp.func
@@ -154,11 +206,17 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
 
     @wp.func
     def sweep_finished_bodies(
-        at: Span, pace: Pace, now: Substep, tops: wp.vec4i, bodies: Bodies, tape: Tape,
-        ba: BodyAdjoint, adj: Adjoint,
-    ):  # fmt: skip
+        at: Span,
+        pace: Pace,
+        now: Substep,
+        tops: wp.vec4i,
+        bodies: Bodies,
+        tape: Tape,
+        ba: BodyAdjoint,
+        adj: Adjoint,
+    ):
         """Returns the tops of the tape, and in which lanes anything depends on the contacts."""
-        unit = wp.grad(itself)(pace.push)  # as above
+        unit = wp.grad(itself)(pace.max_recovery)  # as above
         matters = V(S(0.0))
         for r in range(wp.static(L)):
             lane = wp.static(L) - 1 - r
@@ -178,11 +236,23 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
 
     @wp.func
     def sweep_bodies(
-        at: Span, pace: Pace, now: Substep, matters: V, by: By, tops: wp.vec4i, top: Topology,
-        shapes: Shapes, group: Group, bodies: Bodies, contacts: Contacts, sheets: Sheets,
-        tape: Tape, ba: BodyAdjoint, adj: Adjoint,
-    ):  # fmt: skip
-        unit = wp.grad(itself)(pace.push)  # as above
+        at: Span,
+        pace: Pace,
+        now: Substep,
+        matters: V,
+        by: By,
+        tops: wp.vec4i,
+        top: Topology,
+        shapes: Shapes,
+        group: Group,
+        bodies: Bodies,
+        contacts: Contacts,
+        sheets: Sheets,
+        tape: Tape,
+        ba: BodyAdjoint,
+        adj: Adjoint,
+    ):
+        unit = wp.grad(itself)(pace.max_recovery)  # as above
         by_table = by.table
         by_contact = by.contact
         for r in range(wp.static(L)):
@@ -192,9 +262,20 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
                 # where all bodies sleep on, nothing depends on what contacts would do
                 if matters[lane] > S(0.0):
                     by_floor, by_pairs = sweep_body_pairs(
-                        lane, at, pace, now.counts, tops[3], top, shapes, group, bodies, contacts,
-                        tape, ba, adj,
-                    )  # fmt: skip
+                        lane,
+                        at,
+                        pace,
+                        now.counts,
+                        tops[3],
+                        top,
+                        shapes,
+                        group,
+                        bodies,
+                        contacts,
+                        tape,
+                        ba,
+                        adj,
+                    )
                     by_table[lane] = by_table[lane] + by_floor
                     by_contact[lane] = by_contact[lane] + by_pairs
                 tops, by_mu = sweep_body_contacts(
@@ -209,19 +290,20 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     def sweep_predicted_bodies(
         at: Span, pace: Pace, now: Substep, by: By, bodies: Bodies, ba: BodyAdjoint
     ):
-        unit = wp.grad(itself)(pace.push)  # as above
-        by_kept = by.kept
+        unit = wp.grad(itself)(pace.max_recovery)  # as above
+        by_damping = by.damping_factor
         for lane in range(wp.static(L)):
             if now.on[lane] * unit > S(0.0):
-                pull = R3(pace.gravity.x[lane], pace.gravity.y[lane], pace.gravity.z[lane])
+                gravity = R3(pace.gravity.x[lane], pace.gravity.y[lane], pace.gravity.z[lane])
                 for b in range(at.b0 + lane * at.bodies, at.b0 + (lane + 1) * at.bodies):
-                    by_kept[lane] = by_kept[lane] + sweep_predict_body(
-                        b, pace.dt, pace.kept[lane], pull, bodies, ba
+                    by_damping[lane] = by_damping[lane] + sweep_predict_body(
+                        b, pace.dt, pace.damping_factor[lane], gravity, bodies, ba
                     )
-        by.kept = by_kept
+        by.damping_factor = by_damping
         return by
 
     return SimpleNamespace(
-        sweep_finished_bodies=sweep_finished_bodies, sweep_bodies=sweep_bodies,
+        sweep_finished_bodies=sweep_finished_bodies,
+        sweep_bodies=sweep_bodies,
         sweep_predicted_bodies=sweep_predicted_bodies,
-    )  # fmt: skip
+    )

@@ -25,9 +25,15 @@ def watch(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
 
     @wp.func
     def watch_boxes(
-        g: int, lane: int, b0: int, first: int, last: int, shapes: Shapes, bodies: Bodies,
+        g: int,
+        lane: int,
+        b0: int,
+        first: int,
+        last: int,
+        shapes: Shapes,
+        bodies: Bodies,
         watch: Watch,
-    ):  # fmt: skip
+    ):
         """Worst depths of the boxes of one lane, whose bodies begin at b0.
 
         What has no mass is scenery and may stand in the table and in other scenery. What is held
@@ -52,9 +58,14 @@ def watch(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
 
     @wp.func
     def watch_group(
-        at: Span, springs: Springs, shapes: Shapes, group: Group, q: Particles,
-        bodies: Bodies, watch: Watch,
-    ):  # fmt: skip
+        at: Span,
+        springs: Springs,
+        shapes: Shapes,
+        group: Group,
+        particles: Particles,
+        bodies: Bodies,
+        watch: Watch,
+    ):
         """Worst values of the guards, once every `check_every` substeps."""
         g = at.g
         p0 = at.p0
@@ -65,7 +76,7 @@ def watch(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
         bad = watch.nonfinite[g]
         lowest = V(S(1.0e9))
         for i in range(p0, p0 + n):
-            x = q.x[i]
+            x = particles.x[i]
             bad = wp.max(bad, nonfinite(x.x + x.y + x.z))
             lowest = wp.min(lowest, x.z)
         if wp.static(with_bodies):
@@ -83,16 +94,22 @@ def watch(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
                 if on[lane] > S(0.0) and bad[lane] == S(0.0):
                     first = at.shape0 + lane * at.shapes
                     watch_boxes(
-                        g, lane, b0 + lane * body_count, first, first + at.shapes, shapes,
-                        bodies, watch,
-                    )  # fmt: skip
+                        g,
+                        lane,
+                        b0 + lane * body_count,
+                        first,
+                        first + at.shapes,
+                        shapes,
+                        bodies,
+                        watch,
+                    )
         watch.nonfinite[g] = bad
         watch.depth[g] = wp.max(watch.depth[g], wp.max(zero - lowest, zero))
         stretch = watch.stretch[g]
         for s in range(at.s0, at.s1):
             if springs.watched[s] > 0:
                 ij = springs.ij[s]
-                l = length(q.x[p0 + ij[0]] - q.x[p0 + ij[1]])
+                l = length(particles.x[p0 + ij[0]] - particles.x[p0 + ij[1]])
                 stretch = wp.max(stretch, l * (S(1.0) / springs.length[s]))
         watch.stretch[g] = stretch
 

@@ -37,7 +37,7 @@ __all__ = [
     "root",
     "select",
     "sub",
-]  # fmt: skip
+]
 
 LANES = (1, 4, 8, 16)
 PRECISIONS = (wp.float32, wp.float64)
@@ -137,15 +137,28 @@ def _overloads(scalar: Any, lanes: int) -> tuple[SimpleNamespace, dict[str, list
         )
 
     types = SimpleNamespace(
-        S=scalar, L=lanes, V=vector, V3=V3, R3=wp.types.vector(3, scalar),
-        Q=wp.types.quaternion(scalar), M33=wp.types.matrix((3, 3), scalar),
-    )  # fmt: skip
+        S=scalar,
+        L=lanes,
+        V=vector,
+        V3=V3,
+        R3=wp.types.vector(3, scalar),
+        Q=wp.types.quaternion(scalar),
+        M33=wp.types.matrix((3, 3), scalar),
+    )
     functions = {
-        "root": [root], "select": [select], "less": [less], "any_less": [any_less],
-        "nonfinite": [nonfinite], "add": [add],
-        "sub": [sub], "mul": [mul_vector, mul_scalar, mul_lanes], "div": [div], "dot": [dot],
-        "length": [length], "cross": [cross],
-    }  # fmt: skip
+        "root": [root],
+        "select": [select],
+        "less": [less],
+        "any_less": [any_less],
+        "nonfinite": [nonfinite],
+        "add": [add],
+        "sub": [sub],
+        "mul": [mul_vector, mul_scalar, mul_lanes],
+        "div": [div],
+        "dot": [dot],
+        "length": [length],
+        "cross": [cross],
+    }
     return types, functions
 
 

@@ -33,7 +33,7 @@ def group_state(scalar: Any, lanes: int) -> SimpleNamespace:
 
         g: int
         k: int  # topology
-        w0: int  # world in lane 0
+        world0: int  # world in lane 0
         p0: int  # first particle
         particles: int
         radii: int  # first of the particles' radii
@@ -52,9 +52,9 @@ def group_state(scalar: Any, lanes: int) -> SimpleNamespace:
 
         dt: S
         inverse_dt: S
-        push: S  # farthest that a contact separates in a substep [m]
-        kept: V  # share of its velocity that air damping leaves
-        share: V  # kept * dt
+        max_recovery: S  # farthest that a contact separates in a substep [m]
+        damping_factor: V  # share of its velocity that air damping leaves
+        damped_dt: V  # damping_factor * dt
         gravity: V3  # [m/s^2]
         fall: V3  # velocity that gravity adds [m/s]
         inverse_dt2: V  # by which a compliance is multiplied, over the stiffness factor
@@ -87,7 +87,7 @@ def group_state(scalar: Any, lanes: int) -> SimpleNamespace:
         k = group.topology[g]
         at.g = g
         at.k = k
-        at.w0 = g * wp.static(L)
+        at.world0 = g * wp.static(L)
         at.p0 = group.particle_start[g]
         at.particles = top.particle_count[k]
         at.radii = top.particle_start[k]
@@ -108,12 +108,12 @@ def group_state(scalar: Any, lanes: int) -> SimpleNamespace:
         one = V(S(1.0))
         inverse_dt = S(1.0) / dt
         gravity = group.gravity[g]
-        kept = wp.max(V(S(0.0)), one - group.damping[g] * dt)
+        damping_factor = wp.max(V(S(0.0)), one - group.damping[g] * dt)
         pace.dt = dt
         pace.inverse_dt = inverse_dt
-        pace.push = st.recovery * dt
-        pace.kept = kept
-        pace.share = kept * dt
+        pace.max_recovery = st.recovery * dt
+        pace.damping_factor = damping_factor
+        pace.damped_dt = damping_factor * dt
         pace.gravity = gravity
         pace.fall = gravity * dt
         pace.inverse_dt2 = one * (inverse_dt * inverse_dt) / group.stiffness[g]

@@ -18,10 +18,11 @@ __all__ = ["lane_access"]
 @functools.cache
 def lane_access(scalar: Any, lanes: int) -> SimpleNamespace:
     """`get(x, i, lane)` and `put(x, i, lane, value)` for flat arrays of V3, `get_mass` of V;
-    `count_one` counts a constraint that acted in one lane of the backward sweep.
+    `count_one` counts a constraint that acted in one lane of the backward sweep, `count_lanes` an
+    `amount` of them in the lanes that are `on`.
     """
     t = structures(scalar, lanes)
-    S, R3, L, Adjoint = t.S, t.R3, t.L, t.Adjoint
+    S, V, R3, L, Adjoint = t.S, t.V, t.R3, t.L, t.Adjoint
 
     c_type = {wp.float32: "float", wp.float64: "double"}[scalar]
     at = f"{c_type}* p = x.data + (size_t)i * {3 * L} + lane;"
@@ -40,11 +41,20 @@ def lane_access(scalar: Any, lanes: int) -> SimpleNamespace:
     def put_scalar(x: wp.array(dtype=S), i: int, lane: int, v: S): ...
 
     @wp.func
+    def count_lanes(kind: int, on: V, amount: int, adj: Adjoint):
+        adj.fired[kind] = adj.fired[kind] + on * S(amount)
+
+    @wp.func
     def count_one(kind: int, lane: int, adj: Adjoint):
         fired = adj.fired[kind]
         fired[lane] = fired[lane] + S(1.0)
         adj.fired[kind] = fired
 
     return SimpleNamespace(
-        get=get, put=put, get_mass=get_mass, put_scalar=put_scalar, count_one=count_one
+        get=get,
+        put=put,
+        get_mass=get_mass,
+        put_scalar=put_scalar,
+        count_one=count_one,
+        count_lanes=count_lanes,
     )

@@ -343,8 +343,23 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         mu: wp.array(dtype=S)
 
     return SimpleNamespace(
-        **vars(t), V4=V4, Settings=Settings, Topology=Topology, Springs=Springs, Pairs=Pairs,
-        Shapes=Shapes, Group=Group, Particles=Particles, Near=Near, Bodies=Bodies, Grips=Grips,
-        Watch=Watch, Contacts=Contacts, Sheets=Sheets, Cells=Cells, Tape=Tape,
-        Adjoint=Adjoint, BodyAdjoint=BodyAdjoint,
-    )  # fmt: skip
+        **vars(t),
+        V4=V4,
+        Settings=Settings,
+        Topology=Topology,
+        Springs=Springs,
+        Pairs=Pairs,
+        Shapes=Shapes,
+        Group=Group,
+        Particles=Particles,
+        Near=Near,
+        Bodies=Bodies,
+        Grips=Grips,
+        Watch=Watch,
+        Contacts=Contacts,
+        Sheets=Sheets,
+        Cells=Cells,
+        Tape=Tape,
+        Adjoint=Adjoint,
+        BodyAdjoint=BodyAdjoint,
+    )

@@ -21,7 +21,7 @@ def sweep_state(scalar: Any, lanes: int) -> SimpleNamespace:
     class By:
         """Derivatives of the loss by the parameters of each lane's world."""
 
-        kept: V  # share of velocity that air damping leaves
+        damping_factor: V  # share of velocity that air damping leaves
         inverse_dt2: V  # as in `Pace`, so by the stiffness factor
         table: V  # friction of the table
         contact: V  # friction of contacts

@@ -17,9 +17,19 @@ import warp as wp
 
 from .group_state import group_state
 
-__all__ = ["BODY_SCALARS", "BODY_WORDS", "BOX_PARTICLE_SCALARS", "BOX_TRIANGLE_SCALARS",
-           "COUNTERS", "GRIP_WORDS", "STATE", "TRIANGLE_SCALARS", "TRIANGLE_WORDS", "Kind",
-           "tape"]  # fmt: skip
+__all__ = [
+    "BODY_SCALARS",
+    "BODY_WORDS",
+    "BOX_PARTICLE_SCALARS",
+    "BOX_TRIANGLE_SCALARS",
+    "COUNTERS",
+    "GRIP_WORDS",
+    "STATE",
+    "TRIANGLE_SCALARS",
+    "TRIANGLE_WORDS",
+    "Kind",
+    "tape",
+]
 
 STATE = 14
 """Lane vectors of the kernel's own state per group."""
@@ -82,9 +92,13 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
     the tape, and the grips of the next substep with it.
 
     `load_state(g, tape)`, `save_state(g, run, tape)`: a group's `Run` between launches.
+
+    `record_pose(at, x, q, tape)` leaves a position and a quaternion among the scalars of one lane;
+    `position(at, tape)` and `quaternion(at, tape)` read such.
     """
     t = group_state(scalar, lanes)
-    L, V3, Tape, Span, Run = t.L, t.V3, t.Tape, t.Span, t.Run
+    L, V3, R3, Q = t.L, t.V3, t.R3, t.Q
+    Tape, Span, Run = t.Tape, t.Span, t.Run
     far = "const char* p = (const char*)(x.data + (begin > 0 ? begin : 0));"
     lines = "for (int i = 0; i < bytes; i += 64) __builtin_prefetch(p + i, 0, 2);"
 
@@ -156,6 +170,27 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
         tape.counters[at + 1] = run.near_count
         tape.counters[at + 2] = run.longest_push
 
+    @wp.func
+    def record_pose(at: int, x: R3, q: Q, tape: Tape):
+        for k in range(3):
+            tape.s[at + k] = x[k]
+        for k in range(4):
+            tape.s[at + 3 + k] = q[k]
+
+    @wp.func
+    def position(at: int, tape: Tape):
+        return R3(tape.s[at], tape.s[at + 1], tape.s[at + 2])
+
+    @wp.func
+    def quaternion(at: int, tape: Tape):
+        return Q(tape.s[at], tape.s[at + 1], tape.s[at + 2], tape.s[at + 3])
+
     return SimpleNamespace(
-        has_room=has_room, fetch_ahead=fetch_ahead, load_state=load_state, save_state=save_state
+        has_room=has_room,
+        fetch_ahead=fetch_ahead,
+        load_state=load_state,
+        save_state=save_state,
+        record_pose=record_pose,
+        position=position,
+        quaternion=quaternion,
     )

@@ -18,7 +18,7 @@ _GRID = (4, 64)  # cells of the list along a side, at least and at most
 def add_sheets(data: PackedWorlds, pairs_per_particle: int) -> None:
     """Add the arrays of the structs `Sheets` and `Cells` to `data`; tiny ones without triangles."""
     t, number, tops, L = data.types, data.number, data.topologies, data.lanes
-    any_here = data.has_sheets
+    has_sheets = data.has_sheets
     grid = [
         int(np.clip(np.sqrt(top.particle_count), *_GRID)) if len(top.sheet_triangle) else 0
         for top in tops
@@ -39,7 +39,7 @@ def add_sheets(data: PackedWorlds, pairs_per_particle: int) -> None:
         for top in tops:
             values = getattr(top, f"sheet_{field}")
             blank = np.zeros((top.particle_count, *values.shape[1:]), values.dtype)
-            parts.append(values if len(values) or not any_here else blank)
+            parts.append(values if len(values) or not has_sheets else blank)
         return np.concatenate(parts)
 
     first = np.cumsum([0, *(len(top.sheet_triangle) for top in tops)])
@@ -72,7 +72,7 @@ def add_sheets(data: PackedWorlds, pairs_per_particle: int) -> None:
     data.add_constant("sheets.edge_widest", edge_widest, t.S, number)
     data.add_constant("sheets.cell", cell, t.S, number)
     data.add_constant("sheets.widest", widest, t.S, number)
-    particles = int(data.group_particle[-1]) if any_here else 0
+    particles = int(data.group_particle[-1]) if has_sheets else 0
     slots = data.group_count * L
     edge_room = int(list_start[-1]) if data.has_edges else 0
     for name, count in (
@@ -115,7 +115,7 @@ def _exempt(
     rest = of_particles("rest").astype(data.number)
     exclusion = of_particles("exclusion").astype(data.number)
     owner = of_particles("owner")
-    found, counts, start = [], [], 0
+    exempt, counts, start = [], [], 0
     for top in data.topologies:
         rows = slice(start, start + top.particle_count)
         start += top.particle_count
@@ -131,6 +131,6 @@ def _exempt(
         close = (d * d).sum(axis=1) <= exclusion[rows][other] ** 2
         keep = close & (owner[rows][corner] == owner[rows][other])
         order = np.lexsort((other[keep], corner[keep]))
-        found.append(other[keep][order])
+        exempt.append(other[keep][order])
         counts.append(np.bincount(corner[keep], minlength=top.particle_count))
-    return np.cumsum([0, *np.concatenate(counts)]), np.concatenate([np.zeros(0, int), *found])
+    return np.cumsum([0, *np.concatenate(counts)]), np.concatenate([np.zeros(0, int), *exempt])

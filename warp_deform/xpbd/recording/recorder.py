@@ -184,7 +184,7 @@ class Recorder:
         # tapes of the last rollout are used again: fresh memory is dear
         self._spent = [segment.tape for segment in self._segments]
         self._segments, self.states = [], {}
-        self._kept, self._on_tape = 0, -1
+        self._stored, self._on_tape = 0, -1
         begin, last = 0, self._marks[-1]
         while begin < last:
             mark = next(m for m in self._marks if m > begin)
@@ -209,7 +209,7 @@ class Recorder:
             self._checkpoints.restore(checkpoint)
             end = begin + max(steps, 1)
         self._room.learn(tape, end - begin)
-        self._kept += _nbytes(checkpoint) + (tape.nbytes if self.storage == "full" else 0)
+        self._stored += _nbytes(checkpoint) + (tape.nbytes if self.storage == "full" else 0)
         self._segments.append(_Segment(begin, end, checkpoint, tape))
         self._on_tape = len(self._segments) - 1
         return end
@@ -223,7 +223,7 @@ class Recorder:
         if not self._segments:
             return 16
         per_substep = self._room.per_substep()
-        least = round(np.sqrt(last * self._kept / len(self._segments) / per_substep))
+        least = round(np.sqrt(last * self._stored / len(self._segments) / per_substep))
         # every segment costs a launch and a checkpoint: a tape that the processor's cache holds is
         # no dearer when it is long
         return max(
@@ -246,7 +246,7 @@ class Recorder:
             room = np.maximum(room, self._tape.room)
             if (room == self._tape.room).all():
                 return self._tape
-        self.nbytes = self._room.check(room, self._kept, self.memory)
+        self.nbytes = self._room.check(room, self._stored, self.memory)
         tape = new_stacks(self.solver.data, self._control, room)
         if replay:
             self._tape = tape

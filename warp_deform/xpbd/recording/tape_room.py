@@ -98,13 +98,13 @@ class TapeRoom:
         room: np.ndarray = np.ceil(use * length + self.spare).astype(int)
         return room
 
-    def check(self, room: np.ndarray, kept: int, memory: int) -> int:
-        """Bytes of a tape with the room and of what is `kept` beside it.
+    def check(self, room: np.ndarray, stored: int, memory: int) -> int:
+        """Bytes of a tape with the room and of what is `stored` beside it.
 
         Raises:
             InputError: that is more than `memory`, or more than can be counted.
         """
-        nbytes = kept + int((room * self.sizes).sum())
+        nbytes = stored + int((room * self.sizes).sum())
         if nbytes > memory or int(room.sum(axis=0).max()) > MOST:
             raise InputError(
                 f"the tape would need {nbytes} bytes of {memory}: allow more memory, use "

@@ -19,7 +19,7 @@ __all__ = ["bending", "bending_adjoint"]
 
 @functools.cache
 def bending(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`project_bend(k, p0, inverse_dt2, q, springs)`: solve bending spring `k`.
+    """`project_bend(k, p0, inverse_dt2, particles, springs)`: solve bending spring `k`.
 
     With the constraint |d| - h and its gradients 1 on the middle particle and -1/2 on the ends,
     ``lambda = (|d| - h) / (wj + (wi + wk) / 4 + a / dt^2)``.
@@ -28,23 +28,23 @@ def bending(scalar: Any, lanes: int) -> SimpleNamespace:
     S, V, Particles, Springs = t.S, t.V, t.Particles, t.Springs
 
     @wp.func
-    def project_bend(k: int, p0: int, inverse_dt2: V, q: Particles, springs: Springs):
+    def project_bend(k: int, p0: int, inverse_dt2: V, particles: Particles, springs: Springs):
         ends = springs.ij[k]
         i = p0 + ends[0]
         j = p0 + springs.middle[k]
         e = p0 + ends[1]
-        wi = q.w[i]
-        wj = q.w[j]
-        we = q.w[e]
+        wi = particles.w[i]
+        wj = particles.w[j]
+        we = particles.w[e]
         half = S(0.5)
-        d = q.x[j] - (q.x[i] + q.x[e]) * half
+        d = particles.x[j] - (particles.x[i] + particles.x[e]) * half
         tiny = V(S(1.0e-9))
         l = wp.max(root(dot(d, d)), tiny)
         w = wj + (wi + we) * S(0.25) + inverse_dt2 * springs.compliance[k] + tiny
         s = (l - V(springs.length[k])) / (l * w)
-        q.x[i] = q.x[i] + d * (s * wi * half)
-        q.x[e] = q.x[e] + d * (s * we * half)
-        q.x[j] = q.x[j] - d * (s * wj)
+        particles.x[i] = particles.x[i] + d * (s * wi * half)
+        particles.x[e] = particles.x[e] + d * (s * we * half)
+        particles.x[j] = particles.x[j] - d * (s * wj)
 
     return SimpleNamespace(project_bend=project_bend)
 
@@ -61,12 +61,12 @@ def bending_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def record_bend(
-        k: int, p0: int, at: int, inverse_dt2: V, q: Particles, springs: Springs, tape: Tape
+        k: int, p0: int, at: int, inverse_dt2: V, particles: Particles, springs: Springs, tape: Tape
     ):
         ends = springs.ij[k]
-        middle = q.x[p0 + springs.middle[k]]
-        tape.x[at] = middle - (q.x[p0 + ends[0]] + q.x[p0 + ends[1]]) * S(0.5)
-        project_bend(k, p0, inverse_dt2, q, springs)
+        middle = particles.x[p0 + springs.middle[k]]
+        tape.x[at] = middle - (particles.x[p0 + ends[0]] + particles.x[p0 + ends[1]]) * S(0.5)
+        project_bend(k, p0, inverse_dt2, particles, springs)
 
     @wp.func
     def sweep_bend(k: int, p0: int, d: V3, inverse_dt2: V, springs: Springs, adj: Adjoint):

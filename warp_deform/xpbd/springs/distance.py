@@ -30,7 +30,9 @@ __all__ = ["distance", "distance_adjoint"]
 
 @functools.cache
 def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamespace:
-    """`project_distance(k, p0, inverse_dt2, q, springs)`: solve spring `k`; whether it acted.
+    """`project_distance(k, p0, inverse_dt2, particles, springs)`: solve spring `k`.
+
+    It returns whether the spring acted.
 
     For a two-sided spring (mode 0) of length l, rest length L and compliance a,
     ``lambda = (l - L) / (wi + wj + a / dt^2)`` moves both ends along the spring. AT_LEAST (mode 1)
@@ -42,14 +44,14 @@ def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamesp
     S, V, Particles, Springs = t.S, t.V, t.Particles, t.Springs
 
     @wp.func
-    def project_distance(k: int, p0: int, inverse_dt2: V, q: Particles, springs: Springs):
+    def project_distance(k: int, p0: int, inverse_dt2: V, particles: Particles, springs: Springs):
         ij = springs.ij[k]
         i = p0 + ij[0]
         j = p0 + ij[1]
         rest = springs.length[k]
         mode = springs.mode[k]
-        xi = q.x[i]
-        xj = q.x[j]
+        xi = particles.x[i]
+        xj = particles.x[j]
         d = xi - xj
         l2 = dot(d, d)
         acts = mode == 0 or (mode == 1 and any_less(l2, rest * rest))
@@ -66,8 +68,8 @@ def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamesp
                 c = wp.min(c, zero)
             if mode == 2:
                 c = wp.max(c, zero)
-            wi = q.w[i]
-            wj = q.w[j]
+            wi = particles.w[i]
+            wj = particles.w[j]
             w = wi + wj + tiny
             safe = wp.max(l, tiny)
             s = c / ((w + inverse_dt2 * springs.compliance[k]) * safe)
@@ -78,8 +80,8 @@ def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamesp
                 floor = springs.floor[k]
                 if any_less(l2, floor * floor):
                     s = wp.min(s, (l - V(floor)) / (w * safe))
-            q.x[i] = xi - d * (s * wi)
-            q.x[j] = xj + d * (s * wj)
+            particles.x[i] = xi - d * (s * wi)
+            particles.x[j] = xj + d * (s * wj)
         return acts
 
     return SimpleNamespace(project_distance=project_distance)
@@ -101,11 +103,11 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
 
     @wp.func
     def record_distance(
-        k: int, p0: int, at: int, inverse_dt2: V, q: Particles, springs: Springs, tape: Tape
+        k: int, p0: int, at: int, inverse_dt2: V, particles: Particles, springs: Springs, tape: Tape
     ):
         ij = springs.ij[k]
-        tape.x[at] = q.x[p0 + ij[0]] - q.x[p0 + ij[1]]
-        return project_distance(k, p0, inverse_dt2, q, springs)
+        tape.x[at] = particles.x[p0 + ij[0]] - particles.x[p0 + ij[1]]
+        return project_distance(k, p0, inverse_dt2, particles, springs)
 
     @wp.func
     def sweep_distance(

@@ -22,9 +22,9 @@ __all__ = ["internal_friction", "internal_friction_adjoint"]
 def internal_friction(scalar: Any, lanes: int) -> SimpleNamespace:
     """`sleep_speed(free, ...)`: the sleep speed `free` seconds after a release, by lane.
 
-    `calm_particle(i, dry, sleep, on, q)`: dry friction and sleep of one particle after its velocity
-    is known; returns its squared speed. `damp_spring(s, p0, share, on, q, springs)`: viscosity of
-    one spring.
+    `calm_particle(i, dry, sleep, on, particles)`: dry friction and sleep of one particle after its
+    velocity is known; returns its squared speed. `damp_spring(s, p0, share, on, particles,
+    springs)`: viscosity of one spring.
     """
     t = structures(scalar, lanes)
     S, V, V3, Particles, Springs = t.S, t.V, t.V3, t.Particles, t.Springs
@@ -35,39 +35,39 @@ def internal_friction(scalar: Any, lanes: int) -> SimpleNamespace:
         return (V(S(1.0)) + late * (ramp - S(1.0))) * speed
 
     @wp.func
-    def calm_particle(i: int, dry: S, sleep: V, on: V, q: Particles):
-        v = q.v[i]
+    def calm_particle(i: int, dry: S, sleep: V, on: V, particles: Particles):
+        v = particles.v[i]
         speed2 = dot(v, v)
         zero = V(S(0.0))
         one = V(S(1.0))
         speed = root(speed2)
-        kept = wp.max(speed - V(dry), zero) / wp.max(speed, V(S(1.0e-12)))
+        friction_factor = wp.max(speed - V(dry), zero) / wp.max(speed, V(S(1.0e-12)))
         # what is held or frozen keeps its velocity
-        free = on * less(zero, q.w[i])
-        kept = select(free, kept, one)
-        asleep = less(speed * kept, sleep) * free
-        v = v * (kept * (one - asleep))
+        free = on * less(zero, particles.w[i])
+        friction_factor = select(free, friction_factor, one)
+        asleep = less(speed * friction_factor, sleep) * free
+        v = v * (friction_factor * (one - asleep))
         if any_less(zero - asleep, S(0.0)):
-            x = q.x[i]
-            o = q.xp[i]
-            q.x[i] = V3(
+            x = particles.x[i]
+            o = particles.xp[i]
+            particles.x[i] = V3(
                 select(asleep, o.x, x.x), select(asleep, o.y, x.y), select(asleep, o.z, x.z)
             )
-        q.v[i] = v
+        particles.v[i] = v
         return dot(v, v) * on
 
     @wp.func
-    def damp_spring(s: int, p0: int, share: S, on: V, q: Particles, springs: Springs):
+    def damp_spring(s: int, p0: int, share: S, on: V, particles: Particles, springs: Springs):
         ij = springs.ij[s]
         i = p0 + ij[0]
         j = p0 + ij[1]
-        wi = q.w[i]
-        wj = q.w[j]
-        vi = q.v[i]
-        vj = q.v[j]
+        wi = particles.w[i]
+        wj = particles.w[j]
+        vi = particles.v[i]
+        vj = particles.v[j]
         lost = (vi - vj) * (on * share / (wi + wj + V(S(1.0e-9))))
-        q.v[i] = vi - lost * wi
-        q.v[j] = vj + lost * wj
+        particles.v[i] = vi - lost * wi
+        particles.v[j] = vj + lost * wj
 
     return SimpleNamespace(
         sleep_speed=sleep_speed, calm_particle=calm_particle, damp_spring=damp_spring
@@ -88,11 +88,18 @@ def internal_friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def record_spring(
-        s: int, p0: int, at: int, share: S, on: V, q: Particles, springs: Springs, tape: Tape
+        s: int,
+        p0: int,
+        at: int,
+        share: S,
+        on: V,
+        particles: Particles,
+        springs: Springs,
+        tape: Tape,
     ):
         ij = springs.ij[s]
-        tape.x[at] = q.v[p0 + ij[0]] - q.v[p0 + ij[1]]
-        damp_spring(s, p0, share, on, q, springs)
+        tape.x[at] = particles.v[p0 + ij[0]] - particles.v[p0 + ij[1]]
+        damp_spring(s, p0, share, on, particles, springs)
 
     @wp.func
     def sweep_spring(s: int, p0: int, d: V3, share: S, on: V, springs: Springs, adj: Adjoint):
@@ -120,10 +127,10 @@ def internal_friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         one = V(S(1.0))
         speed = root(dot(v, v))
         safe = wp.max(speed, V(S(1.0e-12)))
-        kept = wp.max(speed - V(dry), zero) / safe
+        friction_factor = wp.max(speed - V(dry), zero) / safe
         free = on * less(zero, adj.w[i])
-        kept = select(free, kept, one)
-        asleep = less(speed * kept, sleep) * free
+        friction_factor = select(free, friction_factor, one)
+        asleep = less(speed * friction_factor, sleep) * free
         rubs = less(V(dry), speed) * free
         kind = counts + wp.static(int(Kind.SLEEP))
         adj.fired[kind] = adj.fired[kind] + asleep
@@ -134,7 +141,7 @@ def internal_friction_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             adj.x[i] = adj.x[i] - back
             adj.xp[i] = adj.xp[i] + back
         g = g * (one - asleep)
-        return g * kept + v * (dot(v, g) * rubs * dry / (safe * safe * safe))
+        return g * friction_factor + v * (dot(v, g) * rubs * dry / (safe * safe * safe))
 
     return SimpleNamespace(
         record_spring=record_spring, sweep_spring=sweep_spring, sweep_calm=sweep_calm

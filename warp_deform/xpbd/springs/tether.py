@@ -25,24 +25,26 @@ NO_TETHER = 1.0e6
 
 @functools.cache
 def tether(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`project_tether(i, holding, held, q)`: bring particle i back to its tether's length from what
-    is held, in the lanes that hold something; returns whether it was farther in any lane.
+    """`project_tether(i, holding, held, particles)`: bring particle i back to its tether's length
+    from what is held, in the lanes that hold something; returns whether it was farther in any lane.
     """
     t = structures(scalar, lanes)
     S, V, V3, Particles = t.S, t.V, t.V3, t.Particles
 
     @wp.func
-    def project_tether(i: int, holding: V, held: V3, q: Particles):
-        longest = select(holding, q.tether[i], V(S(NO_TETHER)))
-        x = q.x[i]
+    def project_tether(i: int, holding: V, held: V3, particles: Particles):
+        longest = select(holding, particles.tether[i], V(S(NO_TETHER)))
+        x = particles.x[i]
         d = x - held
         l2 = dot(d, d)
         pulls = any_less(longest * longest - l2, S(0.0))
         if pulls:
-            over = less(longest * longest, l2) * less(V(S(0.0)), q.w[i])
+            over = less(longest * longest, l2) * less(V(S(0.0)), particles.w[i])
             y = held + d * (longest / wp.max(root(l2), V(S(1.0e-12))))
             # rounding must not move what is within reach
-            q.x[i] = V3(select(over, y.x, x.x), select(over, y.y, x.y), select(over, y.z, x.z))
+            particles.x[i] = V3(
+                select(over, y.x, x.x), select(over, y.y, x.y), select(over, y.z, x.z)
+            )
         return pulls
 
     return SimpleNamespace(project_tether=project_tether)
@@ -58,13 +60,15 @@ def tether_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     project_tether = tether(scalar, lanes).project_tether
 
     @wp.func
-    def record_tether(i: int, at: int, holding: V, held: V3, q: Particles, tape: Tape):
-        tape.x[at] = q.x[i] - held
-        return project_tether(i, holding, held, q)
+    def record_tether(i: int, at: int, holding: V, held: V3, particles: Particles, tape: Tape):
+        tape.x[at] = particles.x[i] - held
+        return project_tether(i, holding, held, particles)
 
     @wp.func
-    def sweep_tether(i: int, d: V3, holding: V, counts: int, on: V, q: Particles, adj: Adjoint):
-        longest = select(holding, q.tether[i], V(S(NO_TETHER)))
+    def sweep_tether(
+        i: int, d: V3, holding: V, counts: int, on: V, particles: Particles, adj: Adjoint
+    ):
+        longest = select(holding, particles.tether[i], V(S(NO_TETHER)))
         l2 = dot(d, d)
         over = less(longest * longest, l2) * less(V(S(0.0)), adj.w[i])
         kind = counts + wp.static(int(Kind.TETHER))
