@@ -8,8 +8,9 @@ import warp as wp
 
 from ..lanes.structures import structures
 from .body_contact import AHEAD, body_contact
+from .rigid_body_adjoint import rigid_body_adjoint
 
-__all__ = ["box_table"]
+__all__ = ["box_table", "box_table_adjoint"]
 
 
 @functools.cache
@@ -64,3 +65,32 @@ def box_table(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
         return c
 
     return SimpleNamespace(list_table=list_table, corner=corner)
+
+
+@functools.cache
+def box_table_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+    """`sweep_table(b, code, by_foot, by_corner, ...)` gives the derivatives by a corner and by its
+    foot on the table to the pose of body b.
+    """
+    t = structures(scalar, lanes)
+    S, R3 = t.S, t.R3
+    Shapes, Bodies, BodyAdjoint = t.Shapes, t.Bodies, t.BodyAdjoint
+    corner = box_table(scalar, lanes, True).corner
+    rotate_adjoint = rigid_body_adjoint(scalar, lanes).rotate_adjoint
+
+    @wp.func
+    def sweep_table(
+        b: int,
+        code: wp.vec4i,
+        by_foot: R3,
+        by_corner: R3,
+        shapes: Shapes,
+        bodies: Bodies,
+        ba: BodyAdjoint,
+    ):
+        g = by_corner + R3(by_foot[0], by_foot[1], S(0.0))
+        ba.x[b] = ba.x[b] + g
+        local = corner(code[1], code[2], shapes)
+        ba.q[b] = ba.q[b] + rotate_adjoint(local, bodies.q[b], g)
+
+    return SimpleNamespace(sweep_table=sweep_table)

@@ -38,6 +38,18 @@ def rigid_body_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     turned, stepped_body = rigid_body(scalar, lanes).turned, rigid_body(scalar, lanes).stepped_body
 
     @wp.func
+    def rotate_adjoint(o: R3, q: Q, g: R3):
+        """Derivative by q of `g . quat_rotate(q, o)`."""
+        v = R3(q[0], q[1], q[2])
+        r = (
+            wp.cross(o, g) * (S(2.0) * q[3])
+            + g * (S(2.0) * wp.dot(v, o))
+            + o * (S(2.0) * wp.dot(v, g))
+        )
+        s = S(4.0) * q[3] * wp.dot(g, o) + S(2.0) * wp.dot(g, wp.cross(v, o))
+        return Q(r[0], r[1], r[2], s)
+
+    @wp.func
     def record_body(
         at: int,
         b: int,
@@ -190,4 +202,5 @@ def rigid_body_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         load_body=load_body,
         sweep_finish_body=sweep_finish_body,
         sweep_predict_body=sweep_predict_body,
+        rotate_adjoint=rotate_adjoint,
     )

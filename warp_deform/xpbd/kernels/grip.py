@@ -36,29 +36,29 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
     particle_gap = box_particle(scalar, lanes).particle_gap
 
     @wp.func
-    def tip_position(w: int, clock: S, grips: Grips):
-        k = grips.knot[w]
+    def tip_position(world: int, clock: S, grips: Grips):
+        k = grips.knot[world]
         span = grips.time[k + 1] - grips.time[k]
         u = wp.clamp((clock - grips.time[k]) / wp.max(span, S(1.0e-9)), S(0.0), S(1.0))
-        return grips.position[k] * (S(1.0) - u) + grips.position[k + 1] * u + grips.shift[w]
+        return grips.position[k] * (S(1.0) - u) + grips.position[k + 1] * u + grips.shift[world]
 
     @wp.func
-    def tip_rotation(w: int, clock: S, grips: Grips):
-        k = grips.knot[w]
+    def tip_rotation(world: int, clock: S, grips: Grips):
+        k = grips.knot[world]
         span = grips.time[k + 1] - grips.time[k]
         u = wp.clamp((clock - grips.time[k]) / wp.max(span, S(1.0e-9)), S(0.0), S(1.0))
         return wp.normalize(grips.rotation[k] * (S(1.0) - u) + grips.rotation[k + 1] * u)
 
     @wp.func
-    def set_knot(w: int, clock: S, grips: Grips):
-        k = grips.knot[w]
-        while k + 2 < grips.knot_end[w] and grips.time[k + 1] <= clock:
+    def set_knot(world: int, clock: S, grips: Grips):
+        k = grips.knot[world]
+        while k + 2 < grips.knot_end[world] and grips.time[k + 1] <= clock:
             k += 1
-        grips.knot[w] = k
+        grips.knot[world] = k
 
     @wp.func
     def reached(
-        w: int,
+        world: int,
         lane: int,
         at: Span,
         near_count: int,
@@ -75,7 +75,7 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
         b0 = at.b0 + lane * at.bodies
         first = at.shape0 + lane * at.shapes
         last = first + at.shapes
-        particle = grips.particle[w]
+        particle = grips.particle[world]
         if particle >= 0:
             radius = top.radius[at.radii + particle]
             hit = touches(particle, lane, at.p0, at.near0, near_count, particles, pairs, near)
@@ -86,10 +86,10 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
                 if gap < radius + S(CONTACT):
                     hit = True
         else:
-            b = b0 + grips.body[w]
+            b = b0 + grips.body[world]
             hit = bodies.touching[b] > 0
             for shape in range(first, last):
-                if shapes.body[shape] == grips.body[w]:
+                if shapes.body[shape] == grips.body[world]:
                     for c in range(8):
                         z = (
                             bodies.x[b][2]
@@ -114,25 +114,25 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
         bodies: Bodies,
         grips: Grips,
     ):
-        w = at.world0 + lane
-        tick = grips.tick[w] + 1
+        world = at.world0 + lane
+        tick = grips.tick[world] + 1
         clock = S(tick) * dt
-        if clock > grips.lower_start[w] and clock < grips.lower_end[w]:
+        if clock > grips.lower_start[world] and clock < grips.lower_end[world]:
             if met or reached(
-                w, lane, at, near_count, top, particles, pairs, shapes, near, bodies, grips
+                world, lane, at, near_count, top, particles, pairs, shapes, near, bodies, grips
             ):
-                set_knot(w, clock - dt, grips)
-                reached_position = tip_position(w, clock - dt, grips)
-                tick = int(grips.lower_end[w] / dt)
+                set_knot(world, clock - dt, grips)
+                reached_position = tip_position(world, clock - dt, grips)
+                tick = int(grips.lower_end[world] / dt)
                 clock = S(tick) * dt
-                set_knot(w, clock, grips)
-                grips.shift[w] = reached_position - tip_position(w, clock, grips)
-        grips.tick[w] = tick
-        set_knot(w, clock, grips)
-        position = tip_position(w, clock, grips)
-        rotation = tip_rotation(w, clock, grips)
-        held = position + wp.quat_rotate(rotation, grips.offset[w])
-        particle = grips.particle[w]
+                set_knot(world, clock, grips)
+                grips.shift[world] = reached_position - tip_position(world, clock, grips)
+        grips.tick[world] = tick
+        set_knot(world, clock, grips)
+        position = tip_position(world, clock, grips)
+        rotation = tip_rotation(world, clock, grips)
+        held = position + wp.quat_rotate(rotation, grips.offset[world])
+        particle = grips.particle[world]
         if particle >= 0:
             i = at.p0 + particle
             x = particles.x[i]
@@ -141,29 +141,29 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
             x.z[lane] = held[2]
             particles.x[i] = x
         else:
-            b = at.b0 + lane * at.bodies + grips.body[w]
+            b = at.b0 + lane * at.bodies + grips.body[world]
             bodies.x[b] = held
-            bodies.q[b] = wp.normalize(rotation * grips.turn[w])
-        return clock < grips.time[grips.knot_end[w] - 1]
+            bodies.q[b] = wp.normalize(rotation * grips.turn[world])
+        return clock < grips.time[grips.knot_end[world] - 1]
 
     @wp.func
     def take(
-        w: int, lane: int, p0: int, b0: int, particles: Particles, bodies: Bodies, grips: Grips
+        world: int, lane: int, p0: int, b0: int, particles: Particles, bodies: Bodies, grips: Grips
     ):
         """What is gripped becomes kinematic."""
-        if grips.particle[w] >= 0:
-            mass = particles.w[p0 + grips.particle[w]]
+        if grips.particle[world] >= 0:
+            mass = particles.w[p0 + grips.particle[world]]
             mass[lane] = S(0.0)
-            particles.w[p0 + grips.particle[w]] = mass
-        elif grips.body[w] >= 0:
-            bodies.w[b0 + grips.body[w]] = S(0.0)
+            particles.w[p0 + grips.particle[world]] = mass
+        elif grips.body[world] >= 0:
+            bodies.w[b0 + grips.body[world]] = S(0.0)
 
     @wp.func
     def let_go(
-        w: int, lane: int, p0: int, b0: int, particles: Particles, bodies: Bodies, grips: Grips
+        world: int, lane: int, p0: int, b0: int, particles: Particles, bodies: Bodies, grips: Grips
     ):
         """What was gripped is free again, and at rest: its step of this substep does not count."""
-        particle = grips.particle[w]
+        particle = grips.particle[world]
         if particle >= 0:
             i = p0 + particle
             mass = particles.w[i]
@@ -182,13 +182,13 @@ def grip(scalar: Any, lanes: int) -> SimpleNamespace:
             start.z[lane] = x.z[lane]
             particles.xp[i] = start
         else:
-            b = b0 + grips.body[w]
+            b = b0 + grips.body[world]
             bodies.w[b] = bodies.w0[b]
             bodies.xp[b] = bodies.x[b]
             bodies.qp[b] = bodies.q[b]
             bodies.v[b] = R3()
             bodies.omega[b] = R3()
-        grips.particle[w] = -1
-        grips.body[w] = -1
+        grips.particle[world] = -1
+        grips.body[world] = -1
 
     return SimpleNamespace(follow_path=follow_path, take=take, let_go=let_go)

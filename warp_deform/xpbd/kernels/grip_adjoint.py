@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from ..bodies.rigid_body_adjoint import rigid_body_adjoint
 from ..lanes.algebra import add, mul, sub  # noqa: F401  (operators are found by name)
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
@@ -27,11 +28,12 @@ def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
     S, R3, Q = t.S, t.R3, t.Q
     Grips, Tape, Adjoint, BodyAdjoint = t.Grips, t.Tape, t.Adjoint, t.BodyAdjoint
     count_one = lane_access(scalar, lanes).count_one
+    rotate_adjoint = rigid_body_adjoint(scalar, lanes).rotate_adjoint
 
     @wp.func
     def record_grip(
         at: int,
-        w: int,
+        world: int,
         lane: int,
         tick: int,
         knot: int,
@@ -43,31 +45,19 @@ def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
         """`tick`, `knot`, `shift`: before the substep. Knots count from the path's end."""
         # a descent that ends in its last substep skips none
         reached = int(0)
-        if grips.tick[w] != tick + 1 or wp.length_sq(grips.shift[w] - shift) > S(0.0):
+        if grips.tick[world] != tick + 1 or wp.length_sq(grips.shift[world] - shift) > S(0.0):
             reached = 1
-        held = grips.particle[w]
+        held = grips.particle[world]
         if held < 0:
-            held = -1 - grips.body[w]
+            held = -1 - grips.body[world]
         tape.k[at] = lane
         tape.k[at + 1] = held
-        tape.k[at + 2] = grips.tick[w]
-        tape.k[at + 3] = grips.knot_end[w] - grips.knot[w]
+        tape.k[at + 2] = grips.tick[world]
+        tape.k[at + 3] = grips.knot_end[world] - grips.knot[world]
         tape.k[at + 4] = released
         tape.k[at + 5] = tick
-        tape.k[at + 6] = grips.knot_end[w] - knot
+        tape.k[at + 6] = grips.knot_end[world] - knot
         tape.k[at + 7] = reached
-
-    @wp.func
-    def turned_by(o: R3, q: Q, g: R3):
-        """Derivative by q of `g . quat_rotate(q, o)`."""
-        v = R3(q[0], q[1], q[2])
-        r = (
-            wp.cross(o, g) * (S(2.0) * q[3])
-            + g * (S(2.0) * wp.dot(v, o))
-            + o * (S(2.0) * wp.dot(v, g))
-        )
-        s = S(4.0) * q[3] * wp.dot(g, o) + S(2.0) * wp.dot(g, wp.cross(v, o))
-        return Q(r[0], r[1], r[2], s)
 
     @wp.func
     def along(k: int, clock: S, grips: Grips):
@@ -128,8 +118,8 @@ def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
         lane = tape.k[at]
         held = tape.k[at + 1]
         tick = tape.k[at + 2]
-        w = world0 + lane
-        knot = grips.knot_end[w] - tape.k[at + 3]
+        world = world0 + lane
+        knot = grips.knot_end[world] - tape.k[at + 3]
         clock = S(tick) * dt
         g = R3()
         still = Q(S(0.0), S(0.0), S(0.0), S(0.0))
@@ -167,33 +157,31 @@ def grip_adjoint(scalar: Any, lanes: int, with_bodies: bool) -> SimpleNamespace:
             ba.q[b] = still
             u = along(knot, clock, grips)
             mixed = grips.rotation[knot] * (S(1.0) - u) + grips.rotation[knot + 1] * u
-            of = grips.turn[w]
+            of = grips.turn[world]
             pose = wp.normalize(mixed) * of
             size = wp.length(pose)
             pose = pose * (S(1.0) / size)
             gq = (gq - pose * wp.dot(pose, gq)) * (S(1.0) / size)
             turn = gq * Q(-of[0], -of[1], -of[2], of[3])
-        if wp.length_sq(grips.offset[w]) > S(0.0):
+        if wp.length_sq(grips.offset[world]) > S(0.0):
             u = along(knot, clock, grips)
             mixed = grips.rotation[knot] * (S(1.0) - u) + grips.rotation[knot + 1] * u
-            turn = turn + turned_by(grips.offset[w], wp.normalize(mixed), g)
+            turn = turn + rotate_adjoint(grips.offset[world], wp.normalize(mixed), g)
         to_knots(knot, clock, g, turn, grips, adj)
-        shift = adj.shift[w] + g
+        shift = adj.shift[world] + g
         before = tape.k[at + 5]
         if tape.k[at + 7] > 0:
             kind = counts + wp.static(int(Kind.REACHED))
             to_knots(knot, clock, -shift, still, grips, adj)
             reached_clock = S(before + 1) * dt - dt
-            k = int(grips.knot_end[w] - tape.k[at + 6])
-            while k + 2 < grips.knot_end[w] and grips.time[k + 1] <= reached_clock:
+            k = int(grips.knot_end[world] - tape.k[at + 6])
+            while k + 2 < grips.knot_end[world] and grips.time[k + 1] <= reached_clock:
                 k += 1
             to_knots(k, reached_clock, shift, still, grips, adj)
             shift = R3()
-        adj.shift[w] = shift
+        adj.shift[world] = shift
         if tape.k[at + 4] > 0:
             kind = counts + wp.static(int(Kind.RELEASE))
         count_one(kind, lane, adj)
 
-    return SimpleNamespace(
-        record_grip=record_grip, sweep_grip=sweep_grip, held_again=held_again, turned_by=turned_by
-    )
+    return SimpleNamespace(record_grip=record_grip, sweep_grip=sweep_grip, held_again=held_again)

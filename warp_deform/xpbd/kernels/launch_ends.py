@@ -49,15 +49,15 @@ def launch_ends(
         holding = zero
         longest = int(0)
         for lane in range(wp.static(L)):
-            w = at.world0 + lane
+            world = at.world0 + lane
             if wp.static(with_sheets):
-                cells.met[w] = 0
+                cells.met[world] = 0
             if run.on[lane] > S(0.0):
-                if grips.particle[w] >= 0 or grips.body[w] >= 0:
+                if grips.particle[world] >= 0 or grips.body[world] >= 0:
                     holding[lane] = S(1.0)
-                    take(w, lane, at.p0, at.b0 + lane * at.bodies, particles, bodies, grips)
+                    take(world, lane, at.p0, at.b0 + lane * at.bodies, particles, bodies, grips)
                 for p in range(wp.static(MOST_PUSHES)):
-                    slot = w * wp.static(MOST_PUSHES) + p
+                    slot = world * wp.static(MOST_PUSHES) + p
                     if grips.push[slot] >= 0:
                         longest = wp.max(longest, grips.push_steps[slot])
         run.holding = holding
@@ -97,14 +97,14 @@ def launch_ends(
             mark = int(tops[2])
         for lane in range(wp.static(L)):
             if ends and run.holding[lane] > S(0.0):
-                w = at.world0 + lane
+                world = at.world0 + lane
                 if wp.static(taped):
                     tape.k[tops[2]] = lane
-                    tape.k[tops[2] + 1] = grips.particle[w]
-                    if grips.particle[w] < 0:
-                        tape.k[tops[2] + 1] = -1 - grips.body[w]
+                    tape.k[tops[2] + 1] = grips.particle[world]
+                    if grips.particle[world] < 0:
+                        tape.k[tops[2] + 1] = -1 - grips.body[world]
                     tops[2] += 2
-                let_go(w, lane, at.p0, at.b0 + lane * at.bodies, particles, bodies, grips)
+                let_go(world, lane, at.p0, at.b0 + lane * at.bodies, particles, bodies, grips)
         if wp.static(taped):
             tape.k[tops[2]] = (tops[2] - mark) // 2
             tops[2] += 1

@@ -54,14 +54,14 @@ def leads(
             least = run.least
             for lane in range(wp.static(L)):
                 if holding[lane] > S(0.0) and run.on[lane] > S(0.0):
-                    w = at.world0 + lane
+                    world = at.world0 + lane
                     met = bool(False)
                     if wp.static(with_sheets):
-                        met = cells.met[w] > 0
+                        met = cells.met[world] > 0
                     if wp.static(taped):
-                        tick = grips.tick[w]
-                        knot = grips.knot[w]
-                        shift = grips.shift[w]
+                        tick = grips.tick[world]
+                        knot = grips.knot[world]
+                        shift = grips.shift[world]
                     goes_on = follow_path(
                         lane,
                         met,
@@ -78,10 +78,12 @@ def leads(
                     )
                     if wp.static(taped):
                         released = wp.where(goes_on, 0, 1)
-                        record_grip(tops[2], w, lane, tick, knot, shift, released, grips, tape)
+                        record_grip(tops[2], world, lane, tick, knot, shift, released, grips, tape)
                         tops[2] += wp.static(GRIP_WORDS)
                     if not goes_on:
-                        let_go(w, lane, at.p0, at.b0 + lane * at.bodies, particles, bodies, grips)
+                        let_go(
+                            world, lane, at.p0, at.b0 + lane * at.bodies, particles, bodies, grips
+                        )
                         holding[lane] = S(0.0)
                         after = group.calm_after[at.g]
                         calm[lane] = after[lane]

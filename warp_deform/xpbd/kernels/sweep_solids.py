@@ -11,13 +11,12 @@ from ..bodies.body_contact_adjoint import body_contact_adjoint
 from ..bodies.body_pairs import body_pairs
 from ..bodies.box_box_adjoint import box_box_adjoint
 from ..bodies.box_particle_adjoint import box_particle_adjoint
-from ..bodies.box_table import box_table
+from ..bodies.box_table import box_table_adjoint
 from ..bodies.box_triangle_adjoint import box_triangle_adjoint
 from ..bodies.rigid_body_adjoint import rigid_body_adjoint
 from ..lanes.algebra import add  # noqa: F401  (operators are found by name)
 from ..lanes.sweep_state import sweep_state
 from ..lanes.tape import BODY_SCALARS, BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS, tape
-from .grip_adjoint import grip_adjoint
 
 __all__ = ["sweep_solids"]
 
@@ -33,9 +32,9 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     Topology, Shapes, Group, Sheets = t.Topology, t.Shapes, t.Group, t.Sheets
     Bodies, Contacts, Tape = t.Bodies, t.Contacts, t.Tape
     Adjoint, BodyAdjoint = t.Adjoint, t.BodyAdjoint
-    corner = box_table(scalar, lanes, True).corner
     list_pairs = body_pairs(scalar, lanes, True).list_pairs
     sweep_boxes = box_box_adjoint(scalar, lanes).sweep_boxes
+    sweep_table = box_table_adjoint(scalar, lanes).sweep_table
     solve_contacts = body_contact(scalar, lanes, True).solve_contacts
     contact_ = body_contact_adjoint(scalar, lanes)
     sweep_end_body, sweep_visits, sweep_listed, sweep_spread, clear_contacts = (
@@ -54,7 +53,6 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     position, quaternion = tape(scalar, lanes).position, tape(scalar, lanes).quaternion
     load_body, sweep_finish_body = poses.load_body, poses.sweep_finish_body
     sweep_predict_body = poses.sweep_predict_body
-    turned_by = grip_adjoint(scalar, lanes, False).turned_by
 
     @wp.func
     def itself(x: S) -> S:
@@ -115,10 +113,7 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
             else:
                 foot = R3(pb[0], pb[1], S(0.0))
                 ga, gb, gn = sweep_listed(i, foot, pb, max_recovery, bodies, contacts, ba)
-                gp = gb + R3(ga[0], ga[1], S(0.0))
-                ba.x[b] = ba.x[b] + gp
-                local = corner(code[1], code[2], shapes)
-                ba.q[b] = ba.q[b] + turned_by(local, bodies.q[b], gp)
+                sweep_table(b, code, ga, gb, shapes, bodies, ba)
                 by_table += ba.mu[i] * shapes.friction[code[1]]
         for b in range(b0, b0 + count):
             sweep_spread(b, bodies, ba)
