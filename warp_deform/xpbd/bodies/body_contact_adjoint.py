@@ -2,7 +2,7 @@
 
 The sweep lists and solves them again, from the poses on the tape and with every visit noted, and
 goes back through the visits: corrections are undone one by one, so every visit finds the state that
-it met.
+it met. For functions called `..._loss` see `rigid_body_adjoint`.
 """
 
 import functools

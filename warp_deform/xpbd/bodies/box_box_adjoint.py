@@ -1,4 +1,4 @@
-"""Where boxes touch each other, and how that moves with them, see `box_box`."""
+"""Adjoint of where boxes touch each other: how points and normals move with them, see `box_box`."""
 
 import functools
 from types import SimpleNamespace

@@ -1,9 +1,11 @@
 """Adjoint of the motion of rigid bodies, see `rigid_body`.
 
 Derivatives by a quaternion are those by its four numbers: what a function does is differentiated as
-it is computed. Scalar functions without state are differentiated by `wp.grad`. They say again what
-the forward pass says: of a function that a forward kernel also builds, Warp 1.19 gives wrong
-derivatives and no warning.
+it is computed. The functions called `..._loss`, here and in the other adjoints of bodies, are the
+loss to first order: its derivatives by what a function of the forward pass computes, times what
+that computes. `wp.grad` of one takes the function back. They say again what the forward pass says:
+of a function that a forward kernel also builds, Warp 1.19 gives wrong derivatives and no warning.
+What such a function takes is bundled in structs by value, each field read once.
 """
 
 import functools
