@@ -1,1 +1,5 @@
-"""Who chooses the actions: policies, the planner, the true state, chance, or a person."""
+"""The agents at the table, by the names of `--agent`; each chooses actions as a `Chooser`.
+
+`planner` searches in simulation, `policy` was trained, `scripted` reads the simulated chain,
+`random` draws, and with `human` and `typed` a person shows where to pick and place.
+"""

@@ -1,7 +1,7 @@
-"""Who chooses actions: a learned policy, chance, or the twin's true state.
+"""The choosers of the agents `policy`, `random` and `scripted`.
 
 Actions are in the base frame. What was missed, refused or skipped is not proposed again until
-something is brought elsewhere. The other agents are `hardware.agents.planner` and
+something is brought elsewhere. Those of the other agents stand in `hardware.agents.planner` and
 `hardware.agents.human`.
 """
 
@@ -26,7 +26,14 @@ from ..vision.task_frame import PIXEL_RATIO, fits_task, to_base
 from ..vision.top_down_view import TopDownView
 from .finger_room import has_finger_room
 
-__all__ = ["PolicyChooser", "RandomChooser", "ScriptedChooser", "Tried", "tangent_at", "to_action"]
+__all__ = [
+    "FailedPicks",
+    "PolicyChooser",
+    "RandomChooser",
+    "ScriptedChooser",
+    "tangent_at",
+    "to_action",
+]
 
 _SHIFTED = 0.01
 """A cable has moved if more of it than this share lies beside where it lay, or the other way
@@ -50,19 +57,19 @@ def tangent_at(mask: np.ndarray, view: TopDownView, xy: tuple[float, float]) -> 
     row, column = np.rint(view.base_to_pixel(np.array(xy)))
     if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]):
         return 0.0
-    found = find_grasp(mask, (int(row), int(column)))
-    return 0.0 if found is None else map_direction(found.tangent, np.eye(2))
+    grasp = find_grasp(mask, (int(row), int(column)))
+    return 0.0 if grasp is None else map_direction(grasp.tangent, np.eye(2))
 
 
-class Tried:
-    """Where was picked since something was last brought elsewhere."""
+class FailedPicks:
+    """Where picking failed since something was last brought elsewhere."""
 
     def __init__(self) -> None:
         self._mask: np.ndarray | None = None
         self._picks: list[tuple[float, float]] = []
 
-    def picks(self, seen: Observation) -> list[tuple[float, float]]:
-        """Picks [m] that failed since then, or were refused or skipped."""
+    def positions(self, seen: Observation) -> list[tuple[float, float]]:
+        """Picks x, y [m] that failed since then, or were refused or skipped."""
         if _moved(seen, self._mask):
             self._picks = []
         self._mask = seen.mask
@@ -72,9 +79,9 @@ class Tried:
         """Remember an action; it counts as failed unless it brings the cable elsewhere."""
         self._picks.append(action.pick_xy)
 
-    def failed(self, seen: Observation, action: PickPlaceAction) -> bool:
-        """Whether the action's pick is near one of `picks`."""
-        return any(math.dist(action.pick_xy, xy) < _NEAR for xy in self.picks(seen))
+    def includes(self, seen: Observation, action: PickPlaceAction) -> bool:
+        """Whether the action's pick is near one of `positions`."""
+        return any(math.dist(action.pick_xy, xy) < _NEAR for xy in self.positions(seen))
 
 
 class RandomChooser:
@@ -121,12 +128,12 @@ class ScriptedChooser:
 
     def __init__(self, look: Callable[[], TwinLook], targets: np.ndarray) -> None:
         self._look, self._task = look, CableMaskGoal()
-        self._tried = Tried()
+        self._failed_picks = FailedPicks()
         self._layout = Layout(np.zeros((0, 3)), np.zeros((0, 7)), targets)
 
     def reset(self) -> None:
         """Forget what was missed."""
-        self._tried = Tried()
+        self._failed_picks = FailedPicks()
 
     def choose(self, seen: Observation) -> PickPlaceAction | None:
         """See `Chooser.choose`."""
@@ -135,8 +142,8 @@ class ScriptedChooser:
         rng = np.random.default_rng(0)  # asked for by the protocol; this demonstrator draws nothing
         for move in self._task.candidates(self._layout, snapshot, rng, len(beads)):
             action = to_action(move)
-            if not self._tried.failed(seen, action):
-                self._tried.chose(action)
+            if not self._failed_picks.includes(seen, action):
+                self._failed_picks.chose(action)
                 return action
         return None
 
@@ -152,7 +159,7 @@ def still_chain(beads: np.ndarray) -> Snapshot:
 
 
 class PolicyChooser:
-    """A policy that `warp-deform train` made.
+    """A learned policy that `warp-deform train` made.
 
     It sees the mask as three channels of 0 or 255 and a height of zeros, as in `cable-mask-goal`,
     and has the memory of policies in simulation, `learning.policy.memory`. Where a finger would

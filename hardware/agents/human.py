@@ -1,4 +1,4 @@
-"""A person at the table: confirms plans, clears problems, shows where to pick and place."""
+"""A person at the table: confirms proposals, clears problems, shows where to pick and place."""
 
 from __future__ import annotations
 
@@ -13,19 +13,25 @@ from warp_deform.errors import InputError, WarpDeformError
 
 from ..arm.pick_place import PickPlaceAction
 from ..episodes.episode import Observation
-from ..episodes.operators import Answer, Plan
+from ..episodes.operators import Answer, Proposal
 from ..vision.overlay import draw_action
 from ..vision.top_down_view import TopDownView
 from .choosers import tangent_at
 
-__all__ = ["HumanChooser", "Point", "Terminal", "clicked", "typed"]
+__all__ = [
+    "HumanChooser",
+    "TerminalOperator",
+    "ViewPixel",
+    "click_pick_and_place",
+    "type_pick_and_place",
+]
 
-Point = tuple[float, float]
-"""Row and column in the view."""
+ViewPixel = tuple[float, float]
+"""Row and column in the view from above [px]."""
 
 
-class Terminal:
-    """An operator at a terminal.
+class TerminalOperator:
+    """A person at a terminal who watches the robot.
 
     Enter goes ahead, "s" asks for another action, "q" stops; the end of the input stops.
 
@@ -38,30 +44,31 @@ class Terminal:
     def __init__(self, ask: Callable[[str], str] | None = None) -> None:
         self._ask = ask or _prompt
 
-    def confirm(self, plan: Plan) -> Answer:
-        """Show the plan and wait for an answer."""
-        if plan.action is None:
+    def confirm(self, proposal: Proposal) -> Answer:
+        """Show what is proposed and wait for an answer."""
+        action = proposal.action
+        if action is None:
             text = "the arm goes to its home pose"
         else:
-            turn = math.degrees(plan.action.place_yaw - plan.action.pick_yaw)
-            heights = ", ".join(f"{name} {T[2, 3]:.3f}" for name, T in plan.poses.items())
+            turn = math.degrees(action.place_yaw - action.pick_yaw)
+            heights = ", ".join(f"{name} {T[2, 3]:.3f}" for name, T in proposal.poses.items())
             text = (
-                f"action {plan.number}: pick {_xy(plan.action.pick_xy)} at "
-                f"{math.degrees(plan.action.pick_yaw):.0f} deg, place {_xy(plan.action.place_xy)} "
+                f"action {proposal.number}: pick {_xy(action.pick_xy)} at "
+                f"{math.degrees(action.pick_yaw):.0f} deg, place {_xy(action.place_xy)} "
                 f"turned by {turn:.0f} deg; z [m]: {heights}"
             )
-            if plan.picture is not None:
-                text += f"\n  drawn in {plan.picture}"
+            if proposal.picture is not None:
+                text += f"\n  drawn in {proposal.picture}"
         answers = {"": Answer.DO, "s": Answer.SKIP, "q": Answer.STOP}
         while True:
-            said = self._ask(f"{text}\n  Enter: do it, s: another, q: stop > ").strip().lower()
-            if said in answers:
-                return answers[said]
+            reply = self._ask(f"{text}\n  Enter: do it, s: another, q: stop > ").strip().lower()
+            if reply in answers:
+                return answers[reply]
 
     def go_on(self, problem: WarpDeformError) -> bool:
         """Show the problem and wait until it is cleared, or the episode given up."""
-        said = self._ask(f"{problem}\n  Enter: cleared, go on; q: stop > ")
-        return said.strip().lower() != "q"
+        reply = self._ask(f"{problem}\n  Enter: cleared, go on; q: stop > ")
+        return reply.strip().lower() != "q"
 
     def wait(self, text: str) -> bool:
         """Wait for something to be done by hand; False where the operator stops instead."""
@@ -71,10 +78,11 @@ class Terminal:
         """Return what the operator says to a text, "" for Enter; None to stop.
 
         Args:
+            text: what is asked
             choices: what may be said, for people: "Enter: done"
         """
-        said = self._ask(f"{text}\n  {choices}, q: stop > ").strip()
-        return None if said.lower() == "q" else said
+        reply = self._ask(f"{text}\n  {choices}, q: stop > ").strip()
+        return None if reply.lower() == "q" else reply
 
 
 def _prompt(text: str, source: TextIO | None = None) -> str:
@@ -100,7 +108,7 @@ class HumanChooser:
     """A person shows where to pick and place; the fingers go across the cable there.
 
     Args:
-        points: shown the enlarged view; returns the points of pick and place, None to stop
+        show: shows the enlarged view; returns the pixels of pick and place, None to stop
         view: the workspace
     """
 
@@ -108,11 +116,11 @@ class HumanChooser:
 
     def __init__(
         self,
-        points: Callable[[np.ndarray, TopDownView], tuple[Point, Point] | None],
+        show: Callable[[np.ndarray, TopDownView], tuple[ViewPixel, ViewPixel] | None],
         *,
         view: TopDownView | None = None,
     ) -> None:
-        self._points = points
+        self._show = show
         self._view = view or TopDownView()
 
     def reset(self) -> None:
@@ -121,16 +129,18 @@ class HumanChooser:
     def choose(self, seen: Observation) -> PickPlaceAction | None:
         """See `Chooser.choose`."""
         picture = draw_action(seen.view, self._view, mask=seen.mask, goal=seen.goal)
-        shown = self._points(picture, self._view)
-        if shown is None:
+        pixels = self._show(picture, self._view)
+        if pixels is None:
             return None
-        pick, place = (tuple(self._view.pixel_to_base(np.array(p)).tolist()) for p in shown)
+        pick, place = (tuple(self._view.pixel_to_base(np.array(p)).tolist()) for p in pixels)
         yaw = tangent_at(seen.mask, self._view, pick)
         return PickPlaceAction(pick, yaw, place, yaw)
 
 
-def clicked(picture: np.ndarray, view: TopDownView) -> tuple[Point, Point] | None:
-    """Return two points clicked in a window; None where it is closed.
+def click_pick_and_place(
+    picture: np.ndarray, view: TopDownView
+) -> tuple[ViewPixel, ViewPixel] | None:
+    """Return the pixels of pick and place, clicked in a window; None where it is closed.
 
     Raises:
         InputError: there is no display
@@ -144,27 +154,29 @@ def clicked(picture: np.ndarray, view: TopDownView) -> tuple[Point, Point] | Non
     figure, axes = plt.subplots(figsize=(5, 9))
     axes.imshow(picture)
     axes.set_title("click pick, then place; close to stop")
-    points = plt.ginput(2, timeout=0)
+    clicks = plt.ginput(2, timeout=0)
     plt.close(figure)
-    if len(points) < 2:
+    if len(clicks) < 2:
         return None
     scale = picture.shape[0] / view.shape[0]
-    pick, place = (((y + 0.5) / scale - 0.5, (x + 0.5) / scale - 0.5) for x, y in points)
+    pick, place = (((y + 0.5) / scale - 0.5, (x + 0.5) / scale - 0.5) for x, y in clicks)
     return pick, place
 
 
-def typed(picture: np.ndarray, view: TopDownView) -> tuple[Point, Point] | None:
-    """Return two points typed as "row column row column", in pixels of the view; "q" stops."""
+def type_pick_and_place(
+    picture: np.ndarray, view: TopDownView
+) -> tuple[ViewPixel, ViewPixel] | None:
+    """Return the pixels of pick and place, typed as "row column row column"; "q" stops."""
     rows, columns = view.shape
     while True:
-        said = _prompt(
+        reply = _prompt(
             f"pick and place in the newest *_view.png ({columns} x {rows}): "
             "row column row column, or q > "
         )
-        if said.strip().lower() == "q":
+        if reply.strip().lower() == "q":
             return None
         try:
-            a, b, c, d = (float(word) for word in said.split())
+            pick_row, pick_column, place_row, place_column = map(float, reply.split())
         except ValueError:
             continue
-        return (a, b), (c, d)
+        return (pick_row, pick_column), (place_row, place_column)

@@ -1,4 +1,4 @@
-"""`make_chooser`: the chooser of actions that `--agent` names on the command line."""
+"""`make_chooser`: from the name of an agent on the command line, `--agent`, to its chooser."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 from warp_deform.errors import InputError
 
 from ..episodes.episode import Chooser
-from ..episodes.goals import GoalSeen
+from ..episodes.goals import GoalMask
 from ..rig.config import AgentName
 from ..rig.rig import Rig
 from .choosers import PolicyChooser, RandomChooser, ScriptedChooser
-from .human import HumanChooser, clicked, typed
+from .human import HumanChooser, click_pick_and_place, type_pick_and_place
 
 __all__ = ["make_chooser"]
 
@@ -21,13 +21,21 @@ __all__ = ["make_chooser"]
 def make_chooser(
     agent: AgentName,
     rig: Rig,
-    goal: GoalSeen | None,
+    goal: GoalMask | None,
     *,
     seed: int,
     policy: Path | None = None,
     budget: int | None = None,
 ) -> Chooser:
-    """Return who chooses.
+    """Return the chooser that `--agent` names.
+
+    Args:
+        agent: the name
+        rig: its view is the workspace; `scripted` reads the simulated chain from it
+        goal: what is to be reached; None where there is none
+        seed: of random draws
+        policy: training run or snapshot, of the agent "policy" alone
+        budget: simulated actions for each real one, of the agent "planner"; default: its own
 
     Raises:
         InputError: an agent that needs what there is not
@@ -50,4 +58,5 @@ def make_chooser(
 
         config = PlannerConfig() if budget is None else PlannerConfig(budget=budget)
         return PlannerChooser(seed=seed, view=rig.view, config=config)
-    return HumanChooser(clicked if agent == "human" else typed, view=rig.view)
+    show = click_pick_and_place if agent == "human" else type_pick_and_place
+    return HumanChooser(show, view=rig.view)

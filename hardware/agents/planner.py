@@ -1,4 +1,6 @@
-"""A chooser that needs no demonstrations: estimate the chain, simulate actions, take the best.
+"""The chooser of the agent `planner`: estimate the chain, simulate actions, take the best.
+
+It needs no demonstrations.
 
 From the mask comes where the beads lie (`chain_from_mask`). A simulated chain is laid there, and
 the candidates of the task `cable-mask-goal`, and others around the best, are tried. What counts is
@@ -30,12 +32,12 @@ from ..arm.pick_place import PickPlaceAction
 from ..episodes.episode import Observation
 from ..vision.chain_from_mask import estimate_chain
 from ..vision.top_down_view import TopDownView
-from .choosers import Tried, to_action
+from .choosers import FailedPicks, to_action
 
 __all__ = ["PlannerChooser", "PlannerConfig", "SeenChain", "chord_error"]
 
 _LANES = 8
-_CHORD = 15
+_CHORD_LINKS = 15
 """Links that a chord bridges: 75 mm, more than a kink."""
 _RISE = 0.6
 """Of a strand that comes to lie on another, in radii a bead."""
@@ -84,9 +86,9 @@ class SeenChain(CableMaskGoal):
         """
         q, cable = snapshot.particle_q[:, :2], self.cable
         costs = [
-            np.linalg.norm(q - way, axis=1).mean() / cable.length
-            + chord_error(q, way, links=_CHORD, spacing=cable.spacing)
-            for way in (layout.targets, layout.targets[::-1])
+            np.linalg.norm(q - targets, axis=1).mean() / cable.length
+            + chord_error(q, targets, links=_CHORD_LINKS, spacing=cable.spacing)
+            for targets in (layout.targets, layout.targets[::-1])
         ]
         return self.score(layout, snapshot) - float(min(costs))
 
@@ -112,7 +114,7 @@ class PlannerChooser:
 
     def reset(self) -> None:
         """Forget what was missed."""
-        self._tried = Tried()
+        self._failed_picks = FailedPicks()
         self._ranked: list[PickPlaceAction] = []
         self._index = -1
 
@@ -127,8 +129,8 @@ class PlannerChooser:
         if seen.index != self._index:
             self._index, self._ranked = seen.index, self._search(seen)
         for action in self._ranked:
-            if not self._tried.failed(seen, action):
-                self._tried.chose(action)
+            if not self._failed_picks.includes(seen, action):
+                self._failed_picks.chose(action)
                 return action
         return None
 
@@ -146,8 +148,8 @@ class PlannerChooser:
         config = SearchConfig(
             method=self._config.method, budget=self._config.budget, depth=self._config.depth
         )
-        tried = search(self._lookahead, task, self._worlds.state(0), rng, config)
-        return [to_action(outlook.action) for outlook in tried]
+        outlooks = search(self._lookahead, task, self._worlds.state(0), rng, config)
+        return [to_action(outlook.action) for outlook in outlooks]
 
     def _prepare(self, goal: np.ndarray) -> None:
         """Worlds for a goal; made once."""
@@ -183,10 +185,10 @@ def chord_error(beads: np.ndarray, targets: np.ndarray, *, links: int, spacing: 
     Returns:
         the mean over all chords, relative to the length of a straight one
     """
-    found, wanted = (
+    chords, wanted_chords = (
         np.linalg.norm(points[links:] - points[:-links], axis=1) for points in (beads, targets)
     )
-    return float(np.abs(found - wanted).mean()) / (links * spacing)
+    return float(np.abs(chords - wanted_chords).mean()) / (links * spacing)
 
 
 def stacked(xy: np.ndarray, cable: CableConfig) -> np.ndarray:

@@ -114,7 +114,7 @@ class MotionChecks:
             advice="guide it back into the workspace by hand",
         )
 
-    def check_way_points(self, q: np.ndarray, *, rounding: float = _ROUNDING) -> np.ndarray:
+    def check_waypoints(self, q: np.ndarray, *, rounding: float = _ROUNDING) -> np.ndarray:
         """Refuse joint positions (N, 7) [rad] near a joint's limit or with the hand beyond a limit.
 
         Returns:
@@ -142,7 +142,7 @@ class MotionChecks:
         waypoints that repeat the one before, and with corners that may be rounded.
         """
         speed = self.check_share(speed)
-        self.check_way_points(points)
+        self.check_waypoints(points)
         pieces = [piece for _, piece in path_pieces(start, points)]
         kept = np.vstack(pieces) if pieces else points[-1:]  # which the arm has all but reached
         path = np.vstack([start, kept])
@@ -229,7 +229,7 @@ class MotionChecks:
             )
         # The pose itself was checked exactly; the planner meets it to a hundredth of a millimetre.
         already = np.maximum(limits.excess(self.arm.poses(q[None]))[0].max(), 0.0)
-        poses = self.check_way_points(points, rounding=already + _SOLVED)
+        poses = self.check_waypoints(points, rounding=already + _SOLVED)
         path = np.vstack([q, points])
         self._check_steps(path)
         self._check_along(self.arm.poses(dense_path(path)))

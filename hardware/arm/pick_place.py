@@ -32,7 +32,7 @@ __all__ = [
     "PickPlaceOutcome",
     "PickPlaceResult",
     "execute",
-    "way_points",
+    "waypoints",
 ]
 
 # Joint 7 turns so far either way, less the safety limits' margin [rad].
@@ -148,7 +148,7 @@ class PickPlaceResult:
     max_force_N: float
 
 
-def way_points(
+def waypoints(
     action: PickPlaceAction, table: TablePlane, config: PickPlaceConfig | None = None
 ) -> dict[str, np.ndarray]:
     """Return the poses of an action by name, in their order, (4, 4) each [m].
@@ -189,7 +189,7 @@ class _Execution:
     def __init__(self, robot: SafeRobot, action: PickPlaceAction, config: PickPlaceConfig) -> None:
         self._robot = robot
         self._config = config
-        self._poses = way_points(action, robot.limits.table, config)
+        self._poses = waypoints(action, robot.limits.table, config)
         self._lift = _lift(action, config)
         self._force = 0.0
         self._widths: list[float] = []

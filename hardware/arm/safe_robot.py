@@ -99,7 +99,7 @@ class SafeRobot(Closing):
         self._recoveries = 0
         self._sunk = 0.0
         try:
-            self._checks.check_way_points(self._home[None])
+            self._checks.check_waypoints(self._home[None])
         except SafetyViolation as error:
             raise InputError(f"the home pose breaks the safety limits: {error}") from error
         robot.recover()

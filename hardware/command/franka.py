@@ -30,7 +30,7 @@ from .records import ReplayOptions, ScoreOptions, replay, score
 
 if TYPE_CHECKING:
     from ..episodes.episode import EpisodeResult
-    from ..episodes.goals import GoalSeen
+    from ..episodes.goals import GoalMask
     from ..rig.rig import Rig
 
 __all__ = ["CaptureGoalOptions", "CollectOptions", "RunOptions", "franka"]
@@ -134,7 +134,7 @@ def _run(options: RunOptions) -> Outcome:
 def _collect(options: CollectOptions) -> Outcome:
     from warp_deform.episodes import EpisodeWriter
 
-    from ..agents.human import Terminal
+    from ..agents.human import TerminalOperator
     from ..recordings.pack import pack
     from ..rig.rig import open_rig
     from ..twin.camera import SimCamera
@@ -143,7 +143,7 @@ def _collect(options: CollectOptions) -> Outcome:
         raise InputError("collect needs --out, the folder of the dataset")
     live, writer = options.out / "live", EpisodeWriter(options.out)
     done: list[EpisodeResult] = []
-    kept = 0
+    demonstrations = 0
     with contextlib.ExitStack() as stack:
         rig: Rig | None = None
         for number in range(options.episodes):
@@ -155,7 +155,9 @@ def _collect(options: CollectOptions) -> Outcome:
             if isinstance(rig.camera, SimCamera):
                 rig.camera.reseed(seed)
             simulated = rig.toss is not None or options.auto
-            if not simulated and not Terminal().wait(f"episode {number + 1}: toss the cable"):
+            if not simulated and not TerminalOperator().wait(
+                f"episode {number + 1}: toss the cable"
+            ):
                 break
             done.append(_episode(options, rig, _next_folder(live), seed=seed))
             if done[-1].error is not None:
@@ -165,17 +167,19 @@ def _collect(options: CollectOptions) -> Outcome:
             episode = pack(done[-1].folder, seed=int(done[-1].folder.name))
             if episode.info.success:
                 writer.write(episode)
-                kept += 1
+                demonstrations += 1
             else:
                 _say(f"{done[-1].folder} is not kept as a demonstration: {_why_not(done[-1])}")
     data = {
         "out": options.out,
         "episodes": len(done),
-        "demonstrations": kept,
+        "demonstrations": demonstrations,
         "actions": sum(len(r.outcomes) for r in done),
         "recordings": [r.folder for r in done],
     }
-    text = f"{len(done)} episodes, {kept} of them kept as demonstrations, in {options.out}"
+    text = (
+        f"{len(done)} episodes, {demonstrations} of them kept as demonstrations, in {options.out}"
+    )
     return Outcome(data=data, text=text, failure=_failure(done[-1]) if done else None)
 
 
@@ -186,7 +190,7 @@ def _why_not(result: EpisodeResult) -> str:
 def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> EpisodeResult:
     from warp_deform.support.revision import running_revision
 
-    from ..agents.human import Terminal
+    from ..agents.human import TerminalOperator
     from ..agents.make import make_chooser
     from ..episodes.episode import EpisodeConfig, run_episode
     from ..episodes.goals import write_picture
@@ -231,14 +235,14 @@ def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> Episo
             recorder=recorder,
             goal=mask,
             config=settings,
-            operator=Terminal() if options.real and not options.auto else Unattended(),
+            operator=TerminalOperator() if options.real and not options.auto else Unattended(),
             empty=rig.empty,
             toss=rig.toss,
             say=_say,
         )
 
 
-def _goal(options: RunOptions, rig: Rig, seed: int) -> GoalSeen | None:
+def _goal(options: RunOptions, rig: Rig, seed: int) -> GoalMask | None:
     from ..episodes.goals import read_goal, sampled_goal
 
     if options.goal is not None:

@@ -38,7 +38,7 @@ from ..arm.pick_place import (
     PickPlaceOutcome,
     PickPlaceResult,
     execute,
-    way_points,
+    waypoints,
 )
 from ..arm.robot import ConnectionLost, MotionError, RobotError, SafetyViolation, UnreachablePose
 from ..arm.safe_robot import SafeRobot
@@ -49,7 +49,7 @@ from ..recordings.scoring import MAX_ACTIONS, SUCCESS_IOU, EpisodeScore, StartAt
 from ..vision.overlay import draw_action
 from ..vision.segmentation import SegmentationConfig, SegmentationError, segment_cable
 from ..vision.top_down_view import TopDownView
-from .operators import Answer, Operator, Plan, Unattended, until_cleared
+from .operators import Answer, Operator, Proposal, Unattended, until_cleared
 
 __all__ = ["Chooser", "EpisodeConfig", "EpisodeResult", "Observation", "refusal", "run_episode"]
 
@@ -108,7 +108,11 @@ class Observation:
 
 
 class Chooser(Protocol):
-    """Chooses actions: a policy, a planner, a person."""
+    """Chooses the actions of an episode; every agent that `--agent` names is one.
+
+    Attributes:
+        name: of the agent, for recordings and messages
+    """
 
     name: str
 
@@ -117,7 +121,11 @@ class Chooser(Protocol):
         ...
 
     def choose(self, seen: Observation) -> PickPlaceAction | None:
-        """Return the next action; None where there is nothing to do, which ends the episode."""
+        """Return the next action; None where there is nothing to do, which ends the episode.
+
+        It is asked again on the same picture, with the action among `seen.refused`, where the
+        safety limits or the operator refuse one.
+        """
         ...
 
 
@@ -150,7 +158,7 @@ def refusal(
     """
     down = {"hover", "grasp", "place"}
     try:
-        poses = way_points(action, robot.limits.table, config)
+        poses = waypoints(action, robot.limits.table, config)
         robot.check_lines(
             [
                 (T, config.descent_speed, config.stop_force_N)
@@ -182,10 +190,10 @@ def run_episode(
 
     Args:
         goal: the mask to reach, (H, W) bool; without one there is no score
-        operator: who confirms every plan; default: nobody, see `Unattended`
+        operator: who confirms every proposal; default: nobody, see `Unattended`
         empty: the view of the foam without a cable, (H, W, 3) uint8, see `segment_cable`
         toss: tosses a simulated cable again, given how often it was; see the module
-        say: told what goes on, a line each time
+        say: takes what goes on, a line each time
 
     Raises:
         InputError: goal and view differ in size, or the calibration belongs to another home pose
@@ -248,7 +256,7 @@ class _Episode:
     def run(self) -> str:
         """Return the outcome."""
         if not self._at_home():
-            if self.operator.confirm(Plan(None, {}, None, 0)) is not Answer.DO:
+            if self.operator.confirm(Proposal(None, {}, None, 0)) is not Answer.DO:
                 return "stopped"
             until_cleared(self.robot, self.operator, self.robot.home)
         while True:
@@ -337,7 +345,7 @@ class _Episode:
                 return None
             error = self._refusal(action)
             if error is None:
-                answer = self.operator.confirm(self._plan(seen, action))
+                answer = self.operator.confirm(self._proposal(seen, action))
                 if answer is Answer.DO:
                     return action
                 self.recorder.show(self._drawn(seen, None))
@@ -354,10 +362,10 @@ class _Episode:
         attempt = functools.partial(refusal, self.robot, action, self.config.pick_place)
         return until_cleared(self.robot, self.operator, attempt)
 
-    def _plan(self, seen: Observation, action: PickPlaceAction) -> Plan:
+    def _proposal(self, seen: Observation, action: PickPlaceAction) -> Proposal:
         overlay = self._drawn(seen, action)
-        poses = way_points(action, self.robot.limits.table, self.config.pick_place)
-        return Plan(action, poses, overlay, seen.index + 1, self.recorder.show(overlay))
+        poses = waypoints(action, self.robot.limits.table, self.config.pick_place)
+        return Proposal(action, poses, overlay, seen.index + 1, self.recorder.show(overlay))
 
     def _do(self, action: PickPlaceAction) -> None:
         view, config = self.config.view, self.config.pick_place
@@ -365,21 +373,21 @@ class _Episode:
             tuple(view.base_to_pixel(np.array(xy)).tolist())
             for xy in (action.pick_xy, action.place_xy)
         )
-        self.recorder.plan(action, self._lift(action), pick_pixel=pick, place_pixel=place)
+        self.recorder.begin_action(action, self._lift(action), pick_pixel=pick, place_pixel=place)
         try:
             result = execute(self.robot, action, config)
         except MotionError as problem:
             self.say(f"action {len(self.outcomes) + 1}: {problem}")
             result = self._recovered(action, problem)
-        self.recorder.act(action, result, pick_pixel=pick, place_pixel=place)
+        self.recorder.end_action(action, result, pick_pixel=pick, place_pixel=place)
         self.outcomes.append(result.outcome)
         self.say(f"action {len(self.outcomes)}: {result.outcome}")
 
     def _lift(self, action: PickPlaceAction) -> float:
         """The height at which an action carries [m]."""
         limits = self.robot.limits
-        planned = way_points(action, limits.table, self.config.pick_place)
-        return float(limits.height(planned["lift"]))
+        poses = waypoints(action, limits.table, self.config.pick_place)
+        return float(limits.height(poses["lift"]))
 
     def _recovered(self, action: PickPlaceAction, problem: MotionError) -> PickPlaceResult:
         """Recover the arm, let go and go home; what became of the cable shows the next picture."""
@@ -391,6 +399,6 @@ class _Episode:
             robot.home()
 
         until_cleared(robot, self.operator, let_go, problem=problem)
-        grasp = way_points(action, robot.limits.table, config)["grasp"]
+        grasp = waypoints(action, robot.limits.table, config)["grasp"]
         lift, outcome = self._lift(action), PickPlaceOutcome.ABORTED
         return PickPlaceResult(outcome, grasp, None, None, None, lift, force)

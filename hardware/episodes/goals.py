@@ -18,14 +18,14 @@ from ..support.json_file import write_whole
 from ..vision.chain_from_mask import estimate_chain
 from ..vision.top_down_view import TopDownView
 
-__all__ = ["GoalSeen", "read_goal", "sampled_goal", "write_goal", "write_picture"]
+__all__ = ["GoalMask", "read_goal", "sampled_goal", "write_goal", "write_picture"]
 
 _GOAL_STREAM = 1
 
 
 @dataclass(frozen=True, eq=False)
-class GoalSeen:
-    """A goal.
+class GoalMask:
+    """A mask to reach.
 
     Attributes:
         mask: (320, 160) bool
@@ -36,17 +36,17 @@ class GoalSeen:
     targets: np.ndarray | None
 
 
-def sampled_goal(seed: int, view: TopDownView | None = None) -> GoalSeen:
+def sampled_goal(seed: int, view: TopDownView | None = None) -> GoalMask:
     """Return a goal as the simulated task draws it: a smooth curve in the workspace."""
     rng, task = np.random.default_rng([seed, _GOAL_STREAM]), CableMaskGoal
     view = view or TopDownView()
     bend = rng.uniform(*task.goal_bend)
     beads = curved_chain(rng, task.cable, view.x, view.y, bend=bend)
     mask = strand_mask(beads[:, :2], 2 * task.cable.visual_radius, view.grid)
-    return GoalSeen(mask, beads[:, :2])
+    return GoalMask(mask, beads[:, :2])
 
 
-def read_goal(path: Path, view: TopDownView) -> GoalSeen:
+def read_goal(path: Path, view: TopDownView) -> GoalMask:
     """Return the goal that `capture-goal` wrote.
 
     Raises:
@@ -58,7 +58,7 @@ def read_goal(path: Path, view: TopDownView) -> GoalSeen:
             f"the goal {path} has {mask.shape} pixels, {np.count_nonzero(mask)} of cable; needed "
             f"is a mask of {view.shape}: capture it with `warp-deform franka capture-goal`"
         )
-    return GoalSeen(mask, estimate_chain(mask, view, CableMaskGoal.cable.beads))
+    return GoalMask(mask, estimate_chain(mask, view, CableMaskGoal.cable.beads))
 
 
 def write_goal(path: Path, mask: np.ndarray, view: np.ndarray) -> Path:

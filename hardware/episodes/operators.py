@@ -1,4 +1,4 @@
-"""Whoever watches the robot during an episode, or a setup: confirms plans and clears problems."""
+"""Whoever watches the robot, in an episode or a setup: confirms proposals, clears problems."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from ..arm.pick_place import PickPlaceAction
 from ..arm.robot import MotionError, ReflexError, SafetyViolation
 from ..arm.safe_robot import SafeRobot
 
-__all__ = ["Answer", "Operator", "Plan", "Unattended", "until_cleared"]
+__all__ = ["Answer", "Operator", "Proposal", "Unattended", "until_cleared"]
 
 T = TypeVar("T")
 
 
 class Answer(StrEnum):
-    """What an operator says to a plan."""
+    """What an operator says to a proposal."""
 
     DO = "do"
     SKIP = "skip"
@@ -31,8 +31,8 @@ class Answer(StrEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """What is about to happen.
+class Proposal:
+    """A motion that waits for the operator: the next action, or the way home.
 
     Attributes:
         action: the action; None for the way to the home pose
@@ -55,8 +55,8 @@ class Operator(Protocol):
     attends: bool
     """Whether a person answers. What a person has cleared is no recovery without an operator."""
 
-    def confirm(self, plan: Plan) -> Answer:
-        """Whether a plan may go ahead."""
+    def confirm(self, proposal: Proposal) -> Answer:
+        """Whether what is proposed may go ahead."""
         ...
 
     def go_on(self, problem: WarpDeformError) -> bool:
@@ -65,11 +65,11 @@ class Operator(Protocol):
 
 
 class Unattended:
-    """Nobody watches: every plan goes ahead, and a reflex is recovered from; nothing else is."""
+    """Nobody watches: all proposals go ahead, and a reflex is recovered from; nothing else is."""
 
     attends = False
 
-    def confirm(self, plan: Plan) -> Answer:
+    def confirm(self, proposal: Proposal) -> Answer:
         """Go ahead."""
         return Answer.DO
 

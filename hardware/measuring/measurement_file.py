@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 
 from warp_deform.errors import InputError
 
-from ..agents.human import Terminal
+from ..agents.human import TerminalOperator
 from ..calibration.poor_fit import PoorFit
 
 __all__ = ["MeasurementFile", "gather"]
@@ -89,7 +89,7 @@ def gather(
     wanted: int,
     take: Callable[[int], T],
     fit: Callable[[list[T]], R],
-    operator: Terminal,
+    operator: TerminalOperator,
 ) -> R:
     """Return what `wanted` or more measurements give, taking those that are not kept yet.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from ..agents.human import Terminal
+from ..agents.human import TerminalOperator
 from ..arm.safe_robot import SafeRobot
 from ..arm.table_plane import TablePlane
 from ..calibration.calibration import Calibration
@@ -27,7 +27,7 @@ from ..support.json_file import read_json, read_numbers
 __all__ = ["confirm", "keep", "lens_of", "make_calibration", "marked", "open_arm", "touched_table"]
 
 
-def confirm(operator: Terminal, text: str) -> None:
+def confirm(operator: TerminalOperator, text: str) -> None:
     """Wait until something is done by hand; InputError where the operator stops instead."""
     if not operator.wait(text):
         raise InputError("stopped; nothing was written")

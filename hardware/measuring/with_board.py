@@ -19,7 +19,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from ..agents.human import Terminal
+from ..agents.human import TerminalOperator
 from ..arm.safe_robot import SafeRobot
 from ..arm.table_plane import TablePlane, fit_table_plane
 from ..calibration.charuco import (
@@ -74,7 +74,7 @@ def measure_lens(
     views: int = 15,
     size: tuple[int, int] = (1280, 720),
     camera: Camera | None = None,
-    operator: Terminal | None = None,
+    operator: TerminalOperator | None = None,
 ) -> dict[str, Any]:
     """Measure a video device's intrinsics from views of the board, one an Enter.
 
@@ -86,7 +86,7 @@ def measure_lens(
         CameraError: the device cannot be opened
     """
     _check_views(views, MIN_VIEWS)
-    operator = operator or Terminal()
+    operator = operator or TerminalOperator()
     rough = CameraIntrinsics(
         size,
         np.array([[size[0], 0.0, size[0] / 2], [0.0, size[0], size[1] / 2], [0.0, 0.0, 1.0]]),
@@ -121,7 +121,7 @@ def measure_table(
     provisional_z: float | None,
     touch: Callable[..., np.ndarray] = touch_off,
     robot: SafeRobot | None = None,
-    operator: Terminal | None = None,
+    operator: TerminalOperator | None = None,
 ) -> dict[str, Any]:
     """Home the fingers, touch the foam at the workspace's corners and fit a plane; the arm moves.
 
@@ -135,7 +135,7 @@ def measure_table(
         raise InputError(
             "give --table-z, a height [m] in the base frame that is 1 to 3 cm below the foam's top"
         )
-    operator = operator or Terminal()
+    operator = operator or TerminalOperator()
     with robot or open_arm(config, TablePlane(provisional_z)) as arm:
         (x0, x1), (y0, y1) = arm.limits.x, arm.limits.y
         corners = [(x0, y0), (x0, y1), (x1, y1), (x1, y0), ((x0 + x1) / 2, 0.0)]
@@ -185,7 +185,7 @@ def measure_camera(
     corner_ids: tuple[int, ...],
     camera: Camera | None = None,
     robot: SafeRobot | None = None,
-    operator: Terminal | None = None,
+    operator: TerminalOperator | None = None,
 ) -> dict[str, Any]:
     """Find the board on the table and the arm's touches of its corners; fit and save.
 
@@ -196,7 +196,7 @@ def measure_camera(
         InputError: the board is not seen, or the fit is worse than 3 mm
         RobotError, CameraError: robot or camera fail
     """
-    operator = operator or Terminal()
+    operator = operator or TerminalOperator()
     table = touched_table(config)
     lens = lens_of(config)
     with robot or open_arm(config, table) as arm:
@@ -240,7 +240,7 @@ def measure_hand_eye(
     views: int = 15,
     camera: Camera | None = None,
     robot: SafeRobot | None = None,
-    operator: Terminal | None = None,
+    operator: TerminalOperator | None = None,
 ) -> dict[str, Any]:
     """Find a camera on the hand from pictures of a board that stands still; save.
 
@@ -253,7 +253,7 @@ def measure_hand_eye(
         RobotError, CameraError: robot or camera fail
     """
     _check_views(views, MIN_POSES)
-    operator = operator or Terminal()
+    operator = operator or TerminalOperator()
     table = touched_table(config)
     lens = lens_of(config)
     with (

@@ -19,7 +19,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from ..agents.human import Terminal
+from ..agents.human import TerminalOperator
 from ..arm.limits import FINGERTIP_BELOW_TCP, SafetyLimits
 from ..arm.safe_robot import SafeRobot
 from ..arm.table_plane import TablePlane
@@ -37,7 +37,9 @@ from .touch_off import close_fingers
 
 __all__ = ["Show", "click_point", "measure_points", "points_from_file", "type_point"]
 
-Show = Callable[[np.ndarray, str, Terminal], tuple[float, float] | None]
+PicturePixel = tuple[float, float]
+"""Column and row in the camera's picture [px]."""
+Show = Callable[[np.ndarray, str, TerminalOperator], PicturePixel | None]
 """Returns column and row of a mark in a picture (H, W, 3), asked for by a text; None to stop."""
 
 _BEYOND = 0.1  # how far beyond the workspace a point is believed [m]: more is another unit
@@ -53,7 +55,7 @@ def measure_points(
     show: Show | None = None,
     camera: Camera | None = None,
     robot: SafeRobot | None = None,
-    operator: Terminal | None = None,
+    operator: TerminalOperator | None = None,
 ) -> dict[str, Any]:
     """Find the table in the camera's picture from marks on it that are shown and touched; save.
 
@@ -73,7 +75,7 @@ def measure_points(
         raise InputError(f"--points is {points}; {MIN_POINTS} are needed, 9 are better")
     if show is None:
         _pyplot()  # a missing display is said before the arm moves
-    operator, show = operator or Terminal(), show or click_point
+    operator, show = operator or TerminalOperator(), show or click_point
     table = touched_table(config)
     lens = lens_of(config)
     with robot or open_arm(config, table) as arm:
@@ -207,7 +209,9 @@ def _fit(
     return fit
 
 
-def click_point(picture: np.ndarray, text: str, operator: Terminal) -> tuple[float, float] | None:
+def click_point(
+    picture: np.ndarray, text: str, operator: TerminalOperator
+) -> tuple[float, float] | None:
     """Return column and row of a click on a picture in a window; None where it is closed.
 
     Raises:
@@ -233,7 +237,9 @@ def _pyplot() -> Any:
     return plt
 
 
-def type_point(picture: np.ndarray, text: str, operator: Terminal) -> tuple[float, float] | None:
+def type_point(
+    picture: np.ndarray, text: str, operator: TerminalOperator
+) -> tuple[float, float] | None:
     """Return column and row as the operator types them, asked again until there are two numbers."""
     while True:
         said = operator.answer(text, "its column and row [px]")
@@ -243,7 +249,7 @@ def type_point(picture: np.ndarray, text: str, operator: Terminal) -> tuple[floa
             return numbers
 
 
-def _touched(arm: SafeRobot, operator: Terminal, name: str) -> tuple[float, float] | None:
+def _touched(arm: SafeRobot, operator: TerminalOperator, name: str) -> tuple[float, float] | None:
     """Return x and y [m] of the fingertips on a point, or as typed; None to stop."""
     text = f"{name}: guide the closed fingertips onto it, down to the foam"
     while True:

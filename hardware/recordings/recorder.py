@@ -120,7 +120,7 @@ class EpisodeRecorder(Closing):
             frame: the camera's picture
             view: the workspace from above, (H, W, 3) uint8
             mask: the cable in it, (H, W) bool
-            overlay: a picture for people, (h, w, 3) uint8; `show` replaces it by a plan
+            overlay: a picture for people, (h, w, 3) uint8; `show` replaces it by a proposal
         """
         if self._observations != self._actions:
             raise InputError("an observation follows an action; record the action first")
@@ -147,15 +147,14 @@ class EpisodeRecorder(Closing):
     def show(self, overlay: np.ndarray) -> Path:
         """Replace the last observation's overlay (h, w, 3) uint8; returns its file.
 
-        The file always shows one plan, whole: people look at it while they are asked.
+        The file always shows one proposal, whole: people look at it while they are asked.
         """
-        if self._observations != self._actions + 1:
-            raise InputError("a plan follows an observation; record the observation first")
+        self._check_observed("a plan")
         path = _named(self.folder / "frames" / f"{self._observations - 1:03d}", "overlay")
         write_whole(path, _png(_bgr(overlay)))
         return path
 
-    def plan(
+    def begin_action(
         self,
         action: PickPlaceAction,
         lift_m: float,
@@ -169,12 +168,11 @@ class EpisodeRecorder(Closing):
             lift_m: height of carrying [m]
             pick_pixel, place_pixel: row and column in the view, where they were chosen there
         """
-        if self._observations != self._actions + 1:
-            raise InputError("a plan follows an observation; record the observation first")
+        self._check_observed("a plan")
         row = {"kind": "plan", "index": self._actions, "action": _numbers(action, lift_m)}
         self._append(self._steps, {**row, "pick_pixel": pick_pixel, "place_pixel": place_pixel})
 
-    def act(
+    def end_action(
         self,
         action: PickPlaceAction,
         result: PickPlaceResult,
@@ -187,8 +185,7 @@ class EpisodeRecorder(Closing):
         Args:
             pick_pixel, place_pixel: row and column in the view, where they were chosen there
         """
-        if self._observations != self._actions + 1:
-            raise InputError("an action follows an observation; record the observation first")
+        self._check_observed("an action")
         place = result.base_T_place
         self._append(
             self._steps,
@@ -208,6 +205,18 @@ class EpisodeRecorder(Closing):
         )
         self._actions += 1
 
+    def _check_observed(self, what: str) -> None:
+        """Refuse what can only follow an observation.
+
+        Args:
+            what: is recorded now, for the message: "an action"
+
+        Raises:
+            InputError: since the last action nothing was observed
+        """
+        if self._observations != self._actions + 1:
+            raise InputError(f"{what} follows an observation; record the observation first")
+
     def log_robot(self, state: RobotState) -> None:
         """Record a reading of the robot; from any thread.
 
@@ -226,7 +235,7 @@ class EpisodeRecorder(Closing):
 
         Raises:
             InputError: a rate that is none; or the readings could not be written, which `observe`,
-                `plan` and `act` raise, too
+                `begin_action` and `end_action` raise, too
         """
         if not 0.0 < rate_hz <= 100.0:
             raise InputError(f"rate_hz: above 0, at most 100 Hz, not {rate_hz}")

@@ -14,14 +14,14 @@ import pytest
 from fixtures.franka_arm import FAR, Arm, Person, episode
 from fixtures.franka_episodes import ACTION, GOAL
 
-from hardware.agents.human import Terminal
+from hardware.agents.human import TerminalOperator
 from hardware.cameras.camera import read_image
 from hardware.episodes.episode import EpisodeConfig
-from hardware.episodes.operators import Answer, Plan
+from hardware.episodes.operators import Answer, Proposal
 from hardware.recordings.recording import Recording
 from hardware.vision.overlay import draw_action
 
-PLAN = Plan(ACTION, {}, None, 1)
+PROPOSAL = Proposal(ACTION, {}, None, 1)
 
 
 class Answering:
@@ -47,10 +47,10 @@ def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.Mon
         os.write(keyboard, b"\n\n")
         assert select.select([screen], [], [], 10.0)[0]
         monkeypatch.setattr(sys, "stderr", Answering(keyboard, b"q\n"))
-        assert Terminal().confirm(PLAN) is Answer.STOP
+        assert TerminalOperator().confirm(PROPOSAL) is Answer.STOP
         os.write(keyboard, b"\n")
         assert select.select([screen], [], [], 10.0)[0]
-        assert Terminal().wait("lay the board flat") is False
+        assert TerminalOperator().wait("lay the board flat") is False
 
 
 def test_answers_through_a_pipe_are_all_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,7 +60,7 @@ def test_answers_through_a_pipe_are_all_kept(monkeypatch: pytest.MonkeyPatch) ->
     os.close(into)
     with os.fdopen(out) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
-        said = [Terminal().confirm(PLAN) for _ in range(3)]
+        said = [TerminalOperator().confirm(PROPOSAL) for _ in range(3)]
     assert said == [Answer.SKIP, Answer.DO, Answer.STOP]
 
 
@@ -71,12 +71,12 @@ class Viewer(Person):
         super().__init__(*answers)
         self.files, self.pictures = list[Path | None](), list[np.ndarray]()
 
-    def confirm(self, plan: Plan) -> Answer:
-        assert plan.picture is not None
-        self.files.append(plan.picture)
-        self.pictures.append(read_image(plan.picture, color=True))
-        assert (self.pictures[-1] == plan.overlay).all()
-        return super().confirm(plan)
+    def confirm(self, proposal: Proposal) -> Answer:
+        assert proposal.picture is not None
+        self.files.append(proposal.picture)
+        self.pictures.append(read_image(proposal.picture, color=True))
+        assert (self.pictures[-1] == proposal.overlay).all()
+        return super().confirm(proposal)
 
 
 def test_the_overlay_is_of_the_plan_that_is_asked_for_and_stays_that_of_the_one_done(
@@ -100,6 +100,6 @@ def test_the_overlay_is_of_the_plan_that_is_asked_for_and_stays_that_of_the_one_
 
 def test_the_prompt_names_the_picture(tmp_path: Path) -> None:
     asked: list[str] = []
-    terminal = Terminal(lambda text: asked.append(text) or "")
-    terminal.confirm(replace(PLAN, picture=tmp_path / "000_overlay.png"))
+    terminal = TerminalOperator(lambda text: asked.append(text) or "")
+    terminal.confirm(replace(PROPOSAL, picture=tmp_path / "000_overlay.png"))
     assert str(tmp_path / "000_overlay.png") in asked[0]

@@ -17,7 +17,7 @@ from hardware.arm.pick_place import (
     PickPlaceConfig,
     PickPlaceOutcome,
     execute,
-    way_points,
+    waypoints,
 )
 from hardware.arm.safe_robot import SafeRobot
 from hardware.arm.table_plane import TablePlane
@@ -45,9 +45,9 @@ class LosingRobot(SpyRobot):
         return result
 
 
-def test_way_points_point_down_along_the_tangents() -> None:
+def test_waypoints_point_down_along_the_tangents() -> None:
     config = PickPlaceConfig()
-    poses = way_points(ACTION, TABLE)
+    poses = waypoints(ACTION, TABLE)
     heights = {name: height(T) for name, T in poses.items()}
     assert list(poses) == ["hover", "grasp", "lift", "carry", "place", "retreat"]
     assert heights == pytest.approx(
@@ -75,7 +75,7 @@ def test_way_points_point_down_along_the_tangents() -> None:
     y=st.floats(-0.3, 0.3),
 )
 def test_the_hand_turns_the_cable_as_asked(pick: float, turn: float, x: float, y: float) -> None:
-    poses = way_points(PickPlaceAction((x, y), pick, (0.5, 0.0), pick + turn), TABLE)
+    poses = waypoints(PickPlaceAction((x, y), pick, (0.5, 0.0), pick + turn), TABLE)
     a, b = poses["lift"][:3, :3], poses["carry"][:3, :3]
     relative = b @ a.T
     assert np.arctan2(relative[1, 0], relative[0, 0]) == pytest.approx(turn, abs=1e-9)
@@ -83,7 +83,7 @@ def test_the_hand_turns_the_cable_as_asked(pick: float, turn: float, x: float, y
 
 def test_a_short_move_is_lifted_less() -> None:
     near = PickPlaceAction((0.45, 0.0), 0.0, (0.45, 0.06), 0.0)
-    assert height(way_points(near, TABLE)["carry"]) == pytest.approx(PickPlaceConfig().short_lift_m)
+    assert height(waypoints(near, TABLE)["carry"]) == pytest.approx(PickPlaceConfig().short_lift_m)
 
 
 def test_placing() -> None:
@@ -139,7 +139,7 @@ def test_a_contact_high_up_is_an_obstacle() -> None:
     assert_within(level, spy)
 
 
-def test_nothing_moves_when_any_way_point_is_refused() -> None:
+def test_nothing_moves_when_any_waypoint_is_refused() -> None:
     for action in (
         PickPlaceAction((0.42, -0.12), 0.0, (0.55, 0.34), 0.0),
         PickPlaceAction((0.72, -0.12), 0.0, (0.55, 0.30), 0.0),
@@ -152,7 +152,7 @@ def test_nothing_moves_when_any_way_point_is_refused() -> None:
 
 def test_a_turn_that_the_last_joint_cannot_make_is_refused() -> None:
     half_turn = PickPlaceAction((0.42, 0.0), 0.1, (0.42, 0.1), 0.1 + np.pi)
-    way_points(half_turn, TABLE)
+    waypoints(half_turn, TABLE)
     with pytest.raises(InputError, match="finite"):
         PickPlaceAction((0.42, np.nan), 0.1, (0.42, 0.1), 0.1)
 
@@ -252,6 +252,6 @@ def test_the_whole_workspace_is_within_reach(
     robot.check_lines(
         [
             (T, 0.05, 8.0 if name in down else None)
-            for name, T in way_points(action, TablePlane(0.0)).items()
+            for name, T in waypoints(action, TablePlane(0.0)).items()
         ]
     )

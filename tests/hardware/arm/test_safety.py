@@ -72,7 +72,7 @@ def test_the_floor_follows_the_measured_plane() -> None:
         assert_within(limits, spy)
 
 
-def test_a_joint_path_is_checked_between_its_way_points() -> None:
+def test_a_joint_path_is_checked_between_its_waypoints() -> None:
     """Both ends keep the side limit, and the arc between them does not."""
     limits = SafetyLimits(table=TablePlane(0.0), x=(0.28, 0.445), margin_m=0.0)
     ends = [joints_at(pose(0.44, y, 0.2)) for y in (-0.105, 0.105)]
@@ -215,7 +215,7 @@ def test_an_arm_a_little_outside_may_come_back_but_not_go_on() -> None:
     assert_within(limits, spy)
 
 
-def test_joint_way_points_keep_the_height_that_a_start_may_miss() -> None:
+def test_joint_waypoints_keep_the_height_that_a_start_may_miss() -> None:
     low = joints_at(pose(0.5, 0.0, 0.048))
     robot, _ = safe(q=low)
     with pytest.raises(SafetyViolation, match="contact_height_m"):

@@ -91,7 +91,7 @@ def test_a_rounded_corner_is_checked_on_its_inner_side() -> None:
     assert corner_cuts(np.array([HOME, corner, HOME])) == [], "the arm rests there"
 
 
-def test_way_points_that_return_are_no_step() -> None:
+def test_waypoints_that_return_are_no_step() -> None:
     """To and fro by less than a standstill is a waypoint on its start, which stalls the vendor."""
     e = np.eye(7)[0]
     assert path_pieces(HOME, np.array([HOME + 1.5e-3 * e, HOME + 0.6e-3 * e])) == []

@@ -102,7 +102,7 @@ def test_state_is_fresh(emulator: EmulatorProcess, robot: PandaRobot) -> None:
     np.testing.assert_array_equal(robot.state().q, OFF_HOME)
 
 
-def test_way_points_and_home_end_within_half_a_millimetre(
+def test_waypoints_and_home_end_within_half_a_millimetre(
     emulator: EmulatorProcess, robot: PandaRobot
 ) -> None:
     points = np.array([OFF_HOME, OFF_HOME + 0.2, [0.5, -0.4, 0.1, -2.3, 0.2, 2.0, 0.6]])
@@ -116,7 +116,7 @@ def test_way_points_and_home_end_within_half_a_millimetre(
             assert np.linalg.norm(passed - pose[:3, 3], axis=1).min() < 1e-2
 
 
-def test_way_points_at_sharp_corners_are_met(emulator: EmulatorProcess, robot: PandaRobot) -> None:
+def test_waypoints_at_sharp_corners_are_met(emulator: EmulatorProcess, robot: PandaRobot) -> None:
     corner = HOME + 0.2 * np.eye(7)[0]
     robot.move_joints(np.array([corner, corner + 0.2 * np.eye(7)[1], HOME]), speed=0.3)
     passed = emulator.call_world("take")["position"]

@@ -14,7 +14,7 @@ from fixtures.franka_arm import Arm, episode
 from fixtures.franka_episodes import ACTION, CALIBRATION, LIMITS
 from fixtures.guided_robot import Homing
 
-from hardware.agents.human import Terminal
+from hardware.agents.human import TerminalOperator
 from hardware.arm.panda import HOME_Q, PandaKinematics
 from hardware.arm.safe_robot import SafeRobot
 from hardware.arm.table_plane import TablePlane
@@ -194,7 +194,7 @@ def test_the_table_is_touched_within_the_workspace_and_stores_it(tmp_path: Path)
         config,
         provisional_z=-0.015,
         robot=SafeRobot(spy, limits, home_q=TILTED),
-        operator=Terminal(lambda text: ""),
+        operator=TerminalOperator(lambda text: ""),
     )
     later = replace(config, home=None, workspace=None)
     stored = workplace_of(later)

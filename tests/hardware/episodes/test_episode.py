@@ -39,11 +39,11 @@ from hardware import (
     UserStopped,
 )
 from hardware.agents.choosers import PolicyChooser
-from hardware.agents.human import Terminal
+from hardware.agents.human import TerminalOperator
 from hardware.arm.safe_robot import SafeRobot
 from hardware.emulator import EmulatorProcess
 from hardware.episodes.episode import EpisodeConfig, run_episode
-from hardware.episodes.operators import Answer, Plan
+from hardware.episodes.operators import Answer, Proposal
 from hardware.recordings.recording import Recording
 from hardware.recordings.replay import replay_recording
 from hardware.recordings.scoring import StartAtGoal, score_recording
@@ -188,9 +188,9 @@ def test_an_operator_confirms_skips_stops_and_clears(tmp_path: Path) -> None:
     assert result.outcome == "stopped" and result.outcomes == ("aborted",)
     assert [len(seen.refused) for seen in chooser.seen] == [0, 1, 0]
     assert [type(problem) for problem in person.problems] == [UserStopped]
-    plan = person.plans[0]
-    assert plan.action == ACTION and plan.number == 1 and plan.overlay is not None
-    assert plan.poses["grasp"][2, 3] == pytest.approx(TWIN.foam_height_m + 0.010)
+    proposal = person.proposals[0]
+    assert proposal.action == ACTION and proposal.number == 1 and proposal.overlay is not None
+    assert proposal.poses["grasp"][2, 3] == pytest.approx(TWIN.foam_height_m + 0.010)
 
 
 def test_the_way_home_is_confirmed_too(tmp_path: Path) -> None:
@@ -260,9 +260,9 @@ def test_the_terminal_asks_until_it_understands() -> None:
         asked.append(text)
         return next(said)
 
-    terminal = Terminal(ask)
-    plan = Plan(ACTION, {"grasp": np.eye(4)}, None, 1)
-    assert [terminal.confirm(plan) for _ in range(3)] == [Answer.SKIP, Answer.DO, Answer.STOP]
+    terminal = TerminalOperator(ask)
+    proposal = Proposal(ACTION, {"grasp": np.eye(4)}, None, 1)
+    assert [terminal.confirm(proposal) for _ in range(3)] == [Answer.SKIP, Answer.DO, Answer.STOP]
     assert "(0.450, 0.000)" in asked[0] and "deg" in asked[0]
     assert terminal.go_on(ReflexError("met")) and not terminal.go_on(ReflexError("met"))
 

@@ -39,9 +39,9 @@ class Presser(Person):
         super().__init__()
         self.arm, self.at = arm, at
 
-    def confirm(self, plan: object) -> Answer:
-        self.arm.pressed |= len(self.plans) == self.at
-        return super().confirm(plan)
+    def confirm(self, proposal: object) -> Answer:
+        self.arm.pressed |= len(self.proposals) == self.at
+        return super().confirm(proposal)
 
     def go_on(self, problem: Exception) -> bool:
         self.arm.pressed = len(self.problems) < 2

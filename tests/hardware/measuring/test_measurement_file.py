@@ -14,7 +14,7 @@ from fixtures.board_photographs import BOARD, INTRINSICS, TABLE, rotation
 from fixtures.guided_robot import BASE_T_BOARD, TCP_T_CAMERA, GuidedRobot, setup
 from fixtures.safety_spy import HOME, SpyRobot
 
-from hardware.agents.human import Terminal
+from hardware.agents.human import TerminalOperator
 from hardware.arm.limits import SafetyLimits
 from hardware.arm.safe_robot import SafeRobot
 from hardware.calibration.calibration import Calibration
@@ -29,6 +29,7 @@ from hardware.support.json_file import write_json
 from warp_deform.errors import InputError
 
 VIEWS = 10
+AGREES = TerminalOperator(lambda _: "")
 
 # Gathering.
 
@@ -59,7 +60,7 @@ def test_the_worst_is_taken_again_and_the_old_one_kept_until_then(tmp_path: Path
 
     def run(measured: MeasurementFile[int]) -> int:
         with measured.guarded():
-            return gather(measured, wanted=3, take=take, fit=fit, operator=Terminal(lambda _: ""))
+            return gather(measured, wanted=3, take=take, fit=fit, operator=AGREES)
 
     with pytest.raises(InputError, match=r"stopped; 3 numbers are kept in .*n\.json: the same"):
         run(measured)
@@ -83,7 +84,9 @@ def test_a_result_that_blames_none_gets_one_more(tmp_path: Path) -> None:
         return len(items)
 
     measured = numbers(tmp_path / "n.json")
-    result = gather(measured, wanted=3, take=lambda i: i, fit=fit, operator=Terminal(answer))
+    result = gather(
+        measured, wanted=3, take=lambda i: i, fit=fit, operator=TerminalOperator(answer)
+    )
     assert result == 5 and measured.items == [0, 1, 2, 3, 4]
     assert [text.split("\n")[0] for text in said] == ["all alike", "all alike"]
 
@@ -101,7 +104,7 @@ def test_the_same_one_is_not_taken_again_for_ever(tmp_path: Path) -> None:
         return len(items)
 
     measured = numbers(tmp_path / "n.json")
-    assert gather(measured, wanted=4, take=take, fit=fit, operator=Terminal(lambda _: "")) == 6
+    assert gather(measured, wanted=4, take=take, fit=fit, operator=AGREES) == 6
     assert taken == [0, 1, 2, 3, 1, 4, 1, 5]
 
 
@@ -165,7 +168,7 @@ class Bench:
             views=VIEWS,
             camera=BlindCamera(),
             robot=SafeRobot(self.robot, SafetyLimits(table=TABLE)),
-            operator=Terminal(self.answer),
+            operator=TerminalOperator(self.answer),
         )
 
     @property
@@ -335,7 +338,7 @@ class Desk:
             BOARD,
             views=VIEWS,
             camera=BlindCamera(),
-            operator=Terminal(self.answer),
+            operator=TerminalOperator(self.answer),
         )
 
     @property
@@ -382,4 +385,6 @@ def test_a_stopped_lens_goes_on_and_a_refused_one_keeps_its_views(
 def test_views_of_another_video_device_are_refused(tmp_path: Path) -> None:
     write_json(tmp_path / "lens_views.json", {"schema": 1, "camera_id": "uvc 3", "views": []})
     with pytest.raises(InputError, match=r"lens_views\.json are of the camera_id uvc 3, not uvc;"):
-        measure_lens(RigConfig(setup=tmp_path, camera="uvc"), BOARD, operator=Terminal(input))
+        measure_lens(
+            RigConfig(setup=tmp_path, camera="uvc"), BOARD, operator=TerminalOperator(input)
+        )

@@ -13,7 +13,7 @@ from fixtures.safety_spy import ARM, HOME, SpyRobot, joints_at, pose
 from fixtures.touched_table import TouchedTable
 
 from hardware import GraspError, RobotMode
-from hardware.agents.human import Terminal
+from hardware.agents.human import TerminalOperator
 from hardware.arm.limits import SafetyLimits
 from hardware.arm.safe_robot import SafeRobot
 from hardware.arm.table_plane import TablePlane
@@ -75,7 +75,7 @@ def test_a_camera_on_the_hand_is_found_by_someone_who_forgets_the_user_stop(tmp_
         views=VIEWS,
         camera=HandCamera(robot, rng),
         robot=SafeRobot(robot, SafetyLimits(table=TABLE)),
-        operator=Terminal(guide),
+        operator=TerminalOperator(guide),
     )
     assert len(said) >= VIEWS + 2 and robot.log.count("move_joints") == 1
     assert "release the user stop; the arm then goes home" in said[-2]
@@ -95,7 +95,7 @@ def test_too_few_views_are_refused_before_the_first(tmp_path: Path) -> None:
 
     for measure in (measure_hand_eye, measure_lens):
         with pytest.raises(InputError, match="--views is 7; 8 are needed"):
-            measure(RigConfig(setup=tmp_path), BOARD, views=7, operator=Terminal(never))
+            measure(RigConfig(setup=tmp_path), BOARD, views=7, operator=TerminalOperator(never))
 
 
 class TouchingRobot(SpyRobot):
@@ -127,7 +127,7 @@ def test_the_board_s_corners_are_touched_with_closed_fingers(tmp_path: Path) -> 
             corner_ids=(0, 5, 18, 23),
             camera=camera,
             robot=SafeRobot(robot, SafetyLimits(table=TABLE)),
-            operator=Terminal(robot.answer),
+            operator=TerminalOperator(robot.answer),
         )
         if width:
             with pytest.raises(GraspError, match="not closed; take out"):
@@ -144,7 +144,9 @@ def test_stopping_writes_nothing(tmp_path: Path) -> None:
     safe = SafeRobot(robot, SafetyLimits(table=TABLE))
     camera = HandCamera(robot, np.random.default_rng(0))
     with pytest.raises(InputError, match="nothing was written"):
-        measure_hand_eye(config, BOARD, camera=camera, robot=safe, operator=Terminal(lambda _: "q"))
+        measure_hand_eye(
+            config, BOARD, camera=camera, robot=safe, operator=TerminalOperator(lambda _: "q")
+        )
     with pytest.raises(InputError, match="--execute"):
         measure_hand_eye(config, BOARD)
     assert [path.name for path in tmp_path.iterdir()] == ["table.json"]
@@ -166,7 +168,7 @@ def test_the_table_is_asked_for_then_touched_with_homed_fingers(
         RigConfig(setup=tmp_path, robot="fr3"),
         provisional_z=-0.015,
         robot=SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015))),
-        operator=Terminal(answer),
+        operator=TerminalOperator(answer),
     )
     table = read_table(tmp_path / "table.json")
     assert table.z(np.array([0.5, 0.1])) == pytest.approx(
@@ -191,6 +193,6 @@ def test_a_table_that_is_not_confirmed_moves_nothing(tmp_path: Path) -> None:
             RigConfig(setup=tmp_path),
             provisional_z=-0.015,
             robot=safe,
-            operator=Terminal(lambda _: "q"),
+            operator=TerminalOperator(lambda _: "q"),
         )
     assert spy.log == ["recover", "stop", "close"] and not list(tmp_path.iterdir())

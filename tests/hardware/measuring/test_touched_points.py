@@ -15,7 +15,7 @@ from fixtures.board_photographs import INTRINSICS, TABLE, camera_above
 from fixtures.guided_robot import setup
 from fixtures.safety_spy import HOME, SpyRobot, joints_at, pose
 
-from hardware.agents.human import Terminal
+from hardware.agents.human import TerminalOperator
 from hardware.arm.limits import SafetyLimits
 from hardware.arm.safe_robot import SafeRobot
 from hardware.calibration.calibration import Calibration
@@ -64,7 +64,9 @@ class Person:
         self.off: dict[int, np.ndarray] = {}
         self.say: Callable[[str], str | None] = lambda text: None
 
-    def show(self, picture: np.ndarray, text: str, operator: Terminal) -> tuple[float, float]:
+    def show(
+        self, picture: np.ndarray, text: str, operator: TerminalOperator
+    ) -> tuple[float, float]:
         index = int(text.split()[1]) - 1
         self.shown.append(index + 1)
         column, row = seen(MARKS)[index]
@@ -94,7 +96,7 @@ class Person:
             setup(folder, None),
             camera=BlindCamera(),
             robot=robot,
-            operator=Terminal(self.answer),
+            operator=TerminalOperator(self.answer),
             **{"show": self.show, **options},
         )
 
@@ -233,7 +235,7 @@ def test_a_click_is_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     for clicks, expected in (([(412.25, 230.5)], (412.25, 230.5)), ([], None)):
         monkeypatch.setattr(plt, "ginput", lambda n, timeout, clicks=clicks: clicks)
         picture = np.zeros((72, 128, 3), np.uint8)
-        assert click_point(picture, "point 1", Terminal(lambda _: "")) == expected
+        assert click_point(picture, "point 1", TerminalOperator(lambda _: "")) == expected
     assert not plt.get_fignums()
 
 

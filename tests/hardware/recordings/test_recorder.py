@@ -46,7 +46,7 @@ def record(
             observe(recorder, number, shift)
             if number < len(shifts) - 1:
                 missed = PickPlaceOutcome.MISSED_GRASP if number else PickPlaceOutcome.PLACED
-                recorder.act(ACTION, result(missed), pick_pixel=(12.0, 7.5))
+                recorder.end_action(ACTION, result(missed), pick_pixel=(12.0, 7.5))
         if finish:
             recorder.finish("success")
 
@@ -216,15 +216,15 @@ def test_missing_files_and_folders(tmp_path: Path) -> None:
 def test_steps_come_in_turn(tmp_path: Path) -> None:
     with EpisodeRecorder(tmp_path / "a", CONFIG) as recorder:
         with pytest.raises(InputError, match="observation first"):
-            recorder.act(ACTION, result())
+            recorder.end_action(ACTION, result())
         with pytest.raises(InputError, match="observation first"):
             recorder.show(np.zeros((4, 4, 3), np.uint8))
         with pytest.raises(InputError, match="observation first"):
-            recorder.plan(ACTION, 0.05)
+            recorder.begin_action(ACTION, 0.05)
         assert observe(recorder, 0, 1) is None
         with pytest.raises(InputError, match="action first"):
             observe(recorder, 1, 1)
-        recorder.act(ACTION, result())
+        recorder.end_action(ACTION, result())
         with pytest.raises(InputError, match="differ in size"):
             recorder.observe(frame(0), np.zeros((4, 4, 3), np.uint8), mask(0))
         recorder.finish("limit")
@@ -262,9 +262,9 @@ def test_an_action_that_does_not_end_leaves_its_plan(tmp_path: Path) -> None:
     with EpisodeRecorder(tmp_path / "a", CONFIG, goal_mask=GOAL) as recorder:
         for number in range(2):
             observe(recorder, number, 4 - number)
-            recorder.plan(ACTION, 0.08, pick_pixel=(1.0, 2.0))
+            recorder.begin_action(ACTION, 0.08, pick_pixel=(1.0, 2.0))
             if number == 0:
-                recorder.act(ACTION, result())
+                recorder.end_action(ACTION, result())
         recorder.finish("error: MotionError: ended elsewhere")
     recording = Recording.read(tmp_path / "a")
     assert len(recording.actions) == 1 and len(recording.plans) == 2
@@ -339,7 +339,7 @@ def test_a_full_disk_is_said(tmp_path: Path) -> None:
                     break
                 time.sleep(0.01)
             with pytest.raises(InputError, match="No space left"):
-                recorder.plan(ACTION, 0.05)
+                recorder.begin_action(ACTION, 0.05)
     with (
         Path("/dev/full").open("wb") as full,
         pytest.raises(InputError, match="No space left on device; make room"),
