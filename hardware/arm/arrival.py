@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
-from .limits import SafetyLimits
 from .robot import MotionError, MoveResult, RobotMode, RobotState
 from .straight_line import distance
 
-__all__ = ["check_arrival", "pressed_contact"]
+__all__ = [
+    "ArrivalTolerance",
+    "check_arrival",
+    "check_joints_arrival",
+    "has_arrived",
+    "pressed_contact",
+]
 
 # How far a soft arm that presses may slide from its line [m].
 _SLIDE = 6e-3
@@ -16,19 +23,52 @@ _SLIDE = 6e-3
 _PRESSING = 0.25
 
 
-def check_arrival(limits: SafetyLimits, reached: np.ndarray, target: np.ndarray) -> None:
+class ArrivalTolerance(Protocol):
+    """What says how far from its target a motion may end: `SafetyLimits`, a backend's config."""
+
+    @property
+    def arrival_tolerance_m(self) -> float:
+        """Of the TCP's position [m]."""
+        ...
+
+    @property
+    def arrival_tolerance_rad(self) -> float:
+        """Of its orientation, or of a joint [rad]."""
+        ...
+
+
+def has_arrived(tolerance: ArrivalTolerance, reached: np.ndarray, target: np.ndarray) -> bool:
+    """Return whether a measured pose (4, 4) [m] is as near its target as an arrival has to be."""
+    off, turned = distance(reached, target)
+    return off <= tolerance.arrival_tolerance_m and turned <= tolerance.arrival_tolerance_rad
+
+
+def check_arrival(tolerance: ArrivalTolerance, reached: np.ndarray, target: np.ndarray) -> None:
     """Refuse a measured pose (4, 4) [m] that is not at its target.
 
     Raises:
         MotionError: it is farther off than an arrival may be
     """
-    off, turned = distance(reached, target)
-    tolerance = limits.arrival_tolerance_m, limits.arrival_tolerance_rad
-    if off > tolerance[0] or turned > tolerance[1]:
+    if not has_arrived(tolerance, reached, target):
+        off, turned = distance(reached, target)
         raise MotionError(
             f"the TCP ended {1e3 * off:.1f} mm and {turned:.3f} rad from its target "
-            f"(allowed: {1e3 * tolerance[0]:.1f} mm, {tolerance[1]:.3f} rad)"
+            f"(allowed: {1e3 * tolerance.arrival_tolerance_m:.1f} mm, "
+            f"{tolerance.arrival_tolerance_rad:.3f} rad)"
         )
+
+
+def check_joints_arrival(
+    tolerance: ArrivalTolerance, reached: np.ndarray, target: np.ndarray
+) -> None:
+    """Refuse measured joint positions (7,) [rad] that are not at their target.
+
+    Raises:
+        MotionError: a joint is farther off than an arrival may be
+    """
+    off = float(np.abs(reached - target).max())
+    if not off <= tolerance.arrival_tolerance_rad:  # also when it is not a number
+        raise MotionError(f"a joint ended {off:.3f} rad from its target")
 
 
 def pressed_contact(

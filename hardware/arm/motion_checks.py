@@ -22,29 +22,28 @@ from .joint_path import corner_cuts, path_pieces
 from .limits import LIMIT_NAMES, PATH_TOLERANCE, SafetyLimits, dense_path
 from .panda import PandaKinematics
 from .path_speed import fitting_share
-from .robot import SafetyViolation
+from .robot import RobotState, SafetyViolation
+from .sinking import LEVEL, sunk_after
 from .straight_line import StraightLine, distance, straight_line
 
 __all__ = [
-    "LEVEL",
     "CheckedLine",
     "CheckedPath",
+    "LineSolver",
     "MotionChecks",
-    "Planner",
     "as_lines",
-    "sunk_after",
 ]
 
-Planner = Callable[..., StraightLine]
-"""What solves a straight line: the signature of `straight_line`."""
+LineSolver = Callable[..., StraightLine]
+"""What finds the joint positions along a straight line: the signature of `straight_line`."""
 
-# How far from the straight line the planner's joint positions may put the TCP.
+# How far the robot's own pose may be from the nominal arm's: more means that another hand or
+# another end effector is set in Desk, and the floor would be wrong by as much.
+_MODEL_TOLERANCE = 3e-3, 0.02  # [m], [rad]
+# How far from the straight line the solver's joint positions may put the TCP.
 _LINE_TOLERANCE, _END_TOLERANCE, _END_TURN = 1e-3, 2e-4, 1e-3  # [m], [m], [rad]
 # Rounding, and what an inverse kinematics leaves over: counted as within.
 _ROUNDING, _SOLVED = 1e-9, 3e-5  # [m], [rad]
-LEVEL = 1e-3
-"""What a hand may sink in all without a stop force [m]: an arm that has arrived a little high goes
-on to where it was to be. Below `contact_height_m` sinkings add up until it has risen again."""
 # Lowest speeds that are meant [m/s], [share], and forces [N]: less is a slip, and never ends.
 _SLOWEST, _SLOWEST_SHARE, _SOFTEST = 1e-4, 1e-4, 0.1
 
@@ -54,7 +53,7 @@ class CheckedLine:
     """A straight line that keeps the limits.
 
     Attributes:
-        q: where the planner's answer ends [rad], (7,)
+        q: where the solver's answer ends [rad], (7,)
         speed: of the TCP [m/s], at most what was commanded
         sunk: how far the hand has then sunk without a stop force [m]
     """
@@ -84,12 +83,25 @@ class MotionChecks:
     Attributes:
         limits: what is let through
         arm: the nominal kinematics
-        planner: inverse kinematics of straight lines; its answers are checked, not believed
+        line_solver: inverse kinematics of straight lines; its answers are checked, not believed
     """
 
     limits: SafetyLimits
     arm: PandaKinematics
-    planner: Planner = straight_line
+    line_solver: LineSolver = straight_line
+
+    def check_reading(self, state: RobotState) -> None:
+        """Refuse a reading that is not finite, or whose pose is not that of the nominal arm."""
+        if not (np.isfinite(state.q).all() and np.isfinite(state.base_T_tcp).all()):
+            raise SafetyViolation("the robot's reading is not finite", advice="restart the robot")
+        off, turned = distance(self.arm.pose(state.q), state.base_T_tcp)
+        if off > _MODEL_TOLERANCE[0] or turned > _MODEL_TOLERANCE[1]:
+            raise SafetyViolation(
+                f"end effector: the robot's TCP is {1e3 * off:.1f} mm and {turned:.3f} rad from "
+                f"the Franka hand's (allowed: {1e3 * _MODEL_TOLERANCE[0]:g} mm, "
+                f"{_MODEL_TOLERANCE[1]:g} rad)",
+                advice="choose the Franka hand as the end effector in Desk",
+            )
 
     def check_share(self, speed: float) -> float:
         """Return a share of the joints' speeds; refuse one beyond `max_joint_speed`."""
@@ -144,8 +156,9 @@ class MotionChecks:
         speed = self.check_share(speed)
         self.check_waypoints(points)
         pieces = [piece for _, piece in path_pieces(start, points)]
-        kept = np.vstack(pieces) if pieces else points[-1:]  # which the arm has all but reached
-        path = np.vstack([start, kept])
+        # Without pieces the arm has all but reached the last waypoint.
+        waypoints = np.vstack(pieces) if pieces else points[-1:]
+        path = np.vstack([start, waypoints])
         self._check_steps(path)
         dense = dense_path(path)
         poses = self.arm.poses(dense)
@@ -157,7 +170,7 @@ class MotionChecks:
         if (
             heights[0] < low - limits.arrival_tolerance_m
             or heights.min() < min(low, heights[0]) - PATH_TOLERANCE
-            or limits.height(self.arm.poses(kept)).min() < low - _ROUNDING
+            or limits.height(self.arm.poses(waypoints)).min() < low - _ROUNDING
         ):
             raise SafetyViolation(
                 f"contact_height_m: a motion in joint space comes within {heights.min():.3f} m "
@@ -167,7 +180,7 @@ class MotionChecks:
         fits = fitting_share(
             dense, poses, max_speed=limits.max_speed, max_descent_speed=limits.max_descent_speed
         )
-        return CheckedPath(kept, min(speed, fits))
+        return CheckedPath(waypoints, min(speed, fits))
 
     def check_line(
         self,
@@ -183,14 +196,15 @@ class MotionChecks:
 
         Args:
             q: joint positions at the start [rad], (7,)
-            start, target: poses, (4, 4)
+            start: pose at the start [m], (4, 4)
+            target: pose at the end [m], (4, 4)
             speed: of the TCP [m/s]
             stop_force_N: force that ends it [N], or None
             sunk: how far the hand has sunk without a stop force [m]
 
         Raises:
-            SafetyViolation: a limit is broken, or the planner's answer is not this line
-            UnreachablePose: the planner found none
+            SafetyViolation: a limit is broken, or the solver's answer is not this line
+            UnreachablePose: the solver found none
             InputError: a speed or force is no number
         """
         limits = self.limits
@@ -222,12 +236,12 @@ class MotionChecks:
         if drop > 0.0:
             length = float(np.linalg.norm(target[:3, 3] - start[:3, 3]))
             speed = min(speed, limits.max_descent_speed * length / drop)
-        points = np.asarray(self.planner(self.arm, q, target, speed=speed).q, dtype=np.float64)
+        points = np.asarray(self.line_solver(self.arm, q, target, speed=speed).q, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 7 or not len(points):
             raise SafetyViolation(
                 f"inverse kinematics: its answer has shape {points.shape}, not (N, 7)"
             )
-        # The pose itself was checked exactly; the planner meets it to a hundredth of a millimetre.
+        # The pose itself was checked exactly; the solver meets it to a hundredth of a millimetre.
         already = np.maximum(limits.excess(self.arm.poses(q[None]))[0].max(), 0.0)
         poses = self.check_waypoints(points, rounding=already + _SOLVED)
         path = np.vstack([q, points])
@@ -287,23 +301,6 @@ class MotionChecks:
             raise SafetyViolation(
                 f"inverse kinematics: its answer leaves the line by {1e3 * aside:.1f} mm"
             )
-
-
-def sunk_after(
-    limits: SafetyLimits, start: np.ndarray, end: np.ndarray, *, sunk: float, stops: bool
-) -> float:
-    """Return how far the hand has sunk without a stop force after a motion [m].
-
-    Heights above `contact_height_m` count as that; rising takes back what it has sunk.
-
-    Args:
-        start, end: poses of the motion, (4, 4)
-        sunk: before it [m]
-        stops: whether it stops on contact
-    """
-    low = limits.contact_height_m
-    drop = min(float(limits.height(start)), low) - min(float(limits.height(end)), low)
-    return max(sunk + (min(drop, 0.0) if stops else drop), 0.0)
 
 
 def _within(limit: str, name: str, value: float, low: float, high: float, unit: str = "") -> float:

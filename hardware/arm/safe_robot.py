@@ -25,9 +25,9 @@ from warp_deform.errors import InputError
 
 from ..support.closing import Closing
 from .arguments import check_joints, check_pose, check_range, shown
-from .arrival import check_arrival, pressed_contact
+from .arrival import check_arrival, has_arrived, pressed_contact
 from .limits import SafetyLimits
-from .motion_checks import LEVEL, MotionChecks, Planner, as_lines, sunk_after
+from .motion_checks import LineSolver, MotionChecks, as_lines
 from .panda import GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
 from .robot import (
     HomesGripper,
@@ -36,25 +36,22 @@ from .robot import (
     MoveResult,
     ReflexError,
     Robot,
-    RobotError,
     RobotMode,
     RobotState,
     SafetyViolation,
     UserStopped,
 )
+from .sinking import Sinking
 from .stop_latch import StopLatch
-from .straight_line import distance, straight_line
+from .straight_line import straight_line
+from .way_home import home_waypoints, pose_above
 
 __all__ = ["SafeRobot"]
 
 T = TypeVar("T")
-# How far the robot's own pose may be from the nominal arm's: more means that another hand or
-# another end effector is set in Desk, and the floor would be wrong by as much.
-_MODEL_TOLERANCE = 3e-3, 0.02  # [m], [rad]
-_HOME_STEP = 0.25  # [rad]
 _MIN_HELD = 5e-4  # [m]: less than that between the fingers is nothing
 _MIN_WIDTH = 1e-5  # [m]: less is a slip
-_FIXED = frozenset({"_arm", "_checks", "_home", "_latch", "_limits", "_lock", "_robot"})
+_FIXED = frozenset({"_arm", "_checks", "_home", "_latch", "_limits", "_lock", "_robot", "_sinking"})
 
 
 class SafeRobot(Closing):
@@ -68,7 +65,7 @@ class SafeRobot(Closing):
         robot: the backend; nobody else should command it from now on
         limits: what is let through
         home_q: joint positions of the home pose [rad]
-        planner: inverse kinematics of straight lines; its answers are checked, not believed
+        line_solver: inverse kinematics of straight lines; its answers are checked, not believed
         kinematics: the nominal arm
 
     Raises:
@@ -83,7 +80,7 @@ class SafeRobot(Closing):
         limits: SafetyLimits,
         *,
         home_q: Sequence[float] = HOME_Q,
-        planner: Planner = straight_line,
+        line_solver: LineSolver = straight_line,
         kinematics: PandaKinematics | None = None,
     ) -> None:
         if not isinstance(limits, SafetyLimits):
@@ -93,11 +90,11 @@ class SafeRobot(Closing):
         self._lock = threading.RLock()
         self._latch = StopLatch()
         self._arm = kinematics or PandaKinematics()
-        self._checks = MotionChecks(limits, self._arm, planner)
+        self._checks = MotionChecks(limits, self._arm, line_solver)
         self._home = check_joints(home_q)[0]
         self._home.flags.writeable = False
         self._recoveries = 0
-        self._sunk = 0.0
+        self._sinking = Sinking(limits)
         try:
             self._checks.check_waypoints(self._home[None])
         except SafetyViolation as error:
@@ -123,16 +120,7 @@ class SafeRobot(Closing):
             SafetyViolation: the reading is not finite, or its pose is not that of the nominal arm
         """
         state = self._robot.state()
-        if not (np.isfinite(state.q).all() and np.isfinite(state.base_T_tcp).all()):
-            raise SafetyViolation("the robot's reading is not finite", advice="restart the robot")
-        off, turned = distance(self._arm.pose(state.q), state.base_T_tcp)
-        if off > _MODEL_TOLERANCE[0] or turned > _MODEL_TOLERANCE[1]:
-            raise SafetyViolation(
-                f"end effector: the robot's TCP is {1e3 * off:.1f} mm and {turned:.3f} rad from "
-                f"the Franka hand's (allowed: {1e3 * _MODEL_TOLERANCE[0]:g} mm, "
-                f"{_MODEL_TOLERANCE[1]:g} rad)",
-                advice="choose the Franka hand as the end effector in Desk",
-            )
+        self._checks.check_reading(state)
         return state
 
     # Moving.
@@ -180,7 +168,7 @@ class SafeRobot(Closing):
                 target,
                 speed=speed,
                 stop_force_N=stop_force_N,
-                sunk=self._sunk,
+                sunk=self._sinking.sunk_m,
             )
             try:
                 result = self._move(
@@ -216,12 +204,12 @@ class SafeRobot(Closing):
         Raises:
             SafetyViolation, UnreachablePose, InputError: one of them would be refused
         """
-        wanted = as_lines(lines)
+        triples = as_lines(lines)
         with self._lock:
             state = self._ready()
-            q, pose, sunk = state.q, state.base_T_tcp, self._sunk
+            q, pose, sunk = state.q, state.base_T_tcp, self._sinking.sunk_m
             ends = []
-            for target, speed, force in wanted:
+            for target, speed, force in triples:
                 line = self._checks.check_line(
                     q, pose, target, speed=speed, stop_force_N=force, sunk=sunk
                 )
@@ -239,29 +227,19 @@ class SafeRobot(Closing):
             SafetyViolation, UnreachablePose, MotionError, InputError: see `move_joints`
         """
         limits = self.limits
-        wanted = limits.max_joint_speed if speed is None else self._checks.check_share(speed)
+        share = limits.max_joint_speed if speed is None else self._checks.check_share(speed)
         with self._lock:
             state = self._ready()
-            rise = limits.contact_height_m - float(limits.height(state.base_T_tcp))
-            if rise > 0.0:
-                above = state.base_T_tcp.copy()
-                # A millimetre more: the arm may end short, and has to start above the limit next.
-                above[2, 3] += rise + 1e-3
-                self.move_linear(_orthonormal(above), speed=limits.max_speed)
+            above = pose_above(limits, state.base_T_tcp)
+            if above is not None:
+                self.move_linear(above, speed=limits.max_speed)
                 state = self._ready()
-            count = max(int(np.ceil(np.abs(self._home - state.q).max() / _HOME_STEP)), 1)
-            points = state.q + np.arange(1, count + 1)[:, None] / count * (self._home - state.q)
-            points[-1] = self._home
-            # A start within a joint's margin is allowed, waypoints there are not.
-            outside = (points < limits.q_min) | (points > limits.q_max)
-            kept = points[int(np.argmin(outside.any(axis=1))) :]
-            return self.move_joints(kept, speed=wanted)
+            return self.move_joints(home_waypoints(limits, state.q, self._home), speed=share)
 
     def stands_at(self, q: np.ndarray) -> bool:
         """Whether the TCP is where joint positions q (7,) [rad] put it, as near as an arrival."""
-        off, turned = distance(self.state().base_T_tcp, self._arm.pose(check_joints(q)[0]))
-        most = self.limits.arrival_tolerance_m, self.limits.arrival_tolerance_rad
-        return off <= most[0] and turned <= most[1]
+        target = self._arm.pose(check_joints(q)[0])
+        return has_arrived(self.limits, self.state().base_T_tcp, target)
 
     # The gripper.
 
@@ -367,24 +345,20 @@ class SafeRobot(Closing):
         return state
 
     def _move(self, before: RobotState, call: Callable[[], T], *, stops: bool) -> T:
-        """Have the backend move the arm, and note how far the hand has sunk without a stop."""
-        # Until it is read where the motion has ended, the hand may have sunk.
-        sunk, self._sunk = self._sunk, max(self._sunk, LEVEL)
-        try:
-            with self._latch.motion():
-                return call()
-        except KeyboardInterrupt:
-            self.stop()
-            raise
-        finally:
-            self._note_sunk(before, sunk, stops=stops)
+        """Have the backend move the arm, and measure how far the hand has sunk without a stop.
 
-    def _note_sunk(self, before: RobotState, sunk: float, *, stops: bool) -> None:
-        try:
-            after = self._robot.state().base_T_tcp
-        except RobotError:
-            return  # the motion's own error says more; nothing sinks further without a stop force
-        self._sunk = sunk_after(self.limits, before.base_T_tcp, after, sunk=sunk, stops=stops)
+        Args:
+            before: the reading before the motion
+            call: the backend's motion
+            stops: whether it stops on contact
+        """
+        with self._sinking.measured(self._robot, before.base_T_tcp, stops=stops):
+            try:
+                with self._latch.motion():
+                    return call()
+            except KeyboardInterrupt:
+                self.stop()
+                raise
 
     def _fingers(self, call: Callable[[], T]) -> T:
         """Have the backend move the fingers; a stop ends no motion of theirs, but prevents one."""
@@ -398,12 +372,3 @@ class SafeRobot(Closing):
 
     def _check_arrival(self, target: np.ndarray) -> None:
         check_arrival(self.limits, self.state().base_T_tcp, target)
-
-
-def _orthonormal(base_T_tcp: np.ndarray) -> np.ndarray:
-    """Return a measured pose with its rotation made exact."""
-    u, _, v = np.linalg.svd(base_T_tcp[:3, :3])
-    exact = base_T_tcp.copy()
-    exact[:3, :3] = u @ v
-    exact[3] = 0.0, 0.0, 0.0, 1.0
-    return exact

@@ -17,6 +17,7 @@ from __future__ import annotations
 import functools
 import threading
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,6 +26,7 @@ from warp_deform.errors import InputError
 from warp_deform.support.extras import install_extra
 
 from ..arm.arguments import check_joints, check_line, check_range
+from ..arm.arrival import check_arrival, check_joints_arrival
 from ..arm.panda import DQ_MAX, GRIPPER_MAX_WIDTH
 from ..arm.robot import (
     BackendMissing,
@@ -41,7 +43,6 @@ from ..arm.robot import (
     UserStopped,
 )
 from ..arm.stop_latch import StopLatch
-from ..arm.straight_line import distance
 from ..support.bounded import run_bounded
 from ..support.closing import Closing
 from .franka_config import RECOVERY_TIMEOUT, NetworkedConfig
@@ -142,17 +143,13 @@ class FR3Robot(Closing):
                 f"q: joint {joint + 1} is beyond an FR3's limits {FR3_Q_MIN[joint]} to "
                 f"{FR3_Q_MAX[joint]}; choose another waypoint"
             )
-        at = self.state().q
-        for point in points:
-            self._straight(at, point, speed)
-            at = point
-        off = float(np.abs(self.state().q - points[-1]).max())
-        if off > self.config.arrival_tolerance_rad:
-            raise MotionError(f"a joint ended {off:.3f} rad from its target")
+        for start, end in pairwise([self.state().q, *points]):
+            self._straight(start, end, speed)
+        check_joints_arrival(self.config, self.state().q, points[-1])
 
-    def _straight(self, start: np.ndarray, point: np.ndarray, speed: float) -> None:
-        """Go from `start` to `point` (7,) [rad] with the joints in proportion."""
-        ways = np.abs(point - start)
+    def _straight(self, start: np.ndarray, end: np.ndarray, speed: float) -> None:
+        """Go from `start` to `end` (7,) [rad] with the joints in proportion."""
+        ways = np.abs(end - start)
         if ways.max() < _STANDSTILL:
             return
         franky, robot = self._franky, self._robot
@@ -169,7 +166,7 @@ class FR3Robot(Closing):
             for limit, top in zip(limits, tops, strict=True):
                 shares = (ways * float((top / ways).min())).tolist()
                 self._quick(functools.partial(limit.set, shares))
-            self._move(franky.JointMotion(franky.JointState(point.tolist())))
+            self._move(franky.JointMotion(franky.JointState(end.tolist())))
         finally:
             if not self._closed:
                 for limit, value in zip(limits, before, strict=True):
@@ -199,13 +196,7 @@ class FR3Robot(Closing):
         reached = self.state().base_T_tcp
         if met.is_set():
             return MoveResult(reached, contact=True)
-        off, turned = distance(reached, target)
-        tolerance = self.config.arrival_tolerance_m, self.config.arrival_tolerance_rad
-        if off > tolerance[0] or turned > tolerance[1]:
-            raise MotionError(
-                f"the TCP ended {1e3 * off:.1f} mm and {turned:.3f} rad from its target "
-                f"(allowed: {1e3 * tolerance[0]:.1f} mm, {tolerance[1]:.3f} rad)"
-            )
+        check_arrival(self.config, reached, target)
         return MoveResult(reached, contact=False)
 
     def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:

@@ -20,11 +20,13 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
 
 from ..arm.arguments import check_joints, check_line, check_range
+from ..arm.arrival import check_arrival, check_joints_arrival, has_arrived
 from ..arm.panda import DQ_MAX, GRIPPER_MAX_WIDTH
 from ..arm.robot import (
     BackendMissing,
@@ -85,7 +87,7 @@ class FrankapyRobot(Closing):
     Args:
         config: what to expect
         sleep: waits [s]
-        say: told what is still being waited for; default: prints it on stderr
+        say: takes a line about what is still being waited for; default: prints it on stderr
 
     Raises:
         BackendMissing: frankapy or ROS 1 is not installed
@@ -192,19 +194,16 @@ class FrankapyRobot(Closing):
         """Move through joint waypoints; see `Robot.move_joints`. The arm rests at each."""
         points = check_joints(q)
         check_range("speed", speed, low=0.0, high=1.0, unit="of the greatest speed")
-        at = self.state().q
-        for point in points:
-            self._joint_skill(point, at, speed)
-            at = point
-        off = float(np.abs(self.state().q - points[-1]).max())
-        if off > self.config.arrival_tolerance_rad:
-            raise MotionError(f"a joint ended {off:.3f} rad from its target")
+        for start, end in pairwise([self.state().q, *points]):
+            self._joint_skill(start, end, speed)
+        check_joints_arrival(self.config, self.state().q, points[-1])
 
-    def _joint_skill(self, point: np.ndarray, start: np.ndarray, speed: float) -> None:
-        seconds = _PEAK * float((np.abs(point - start) / (speed * DQ_MAX)).max())
+    def _joint_skill(self, start: np.ndarray, end: np.ndarray, speed: float) -> None:
+        """Go from `start` to `end` (7,) [rad], no joint faster than its share of its speed."""
+        seconds = _PEAK * float((np.abs(end - start) / (speed * DQ_MAX)).max())
         self._skill(
             lambda: self._arm.goto_joints(
-                point.tolist(),
+                end.tolist(),
                 duration=max(seconds, _SHORTEST),
                 use_impedance=False,
                 block=True,
@@ -241,18 +240,14 @@ class FrankapyRobot(Closing):
             )
         )
         state = self.state()
-        off, turned = distance(state.base_T_tcp, target)
-        config = self.config
-        if off <= config.arrival_tolerance_m and turned <= config.arrival_tolerance_rad:
-            return MoveResult(state.base_T_tcp, contact=False)
         # frankapy does not say that a threshold ended the skill: the force, still there, does.
-        if stop_force_N is not None and np.abs(state.force_N[:3]).max() > 0.5 * stop_force_N:
-            return MoveResult(state.base_T_tcp, contact=True)
-        raise MotionError(
-            f"the TCP ended {1e3 * off:.1f} mm and {turned:.3f} rad from its target "
-            f"(allowed: {1e3 * config.arrival_tolerance_m:.1f} mm, "
-            f"{config.arrival_tolerance_rad:.3f} rad)"
+        pressing = stop_force_N is not None and (
+            float(np.abs(state.force_N[:3]).max()) > 0.5 * stop_force_N
         )
+        if pressing and not has_arrived(self.config, state.base_T_tcp, target):
+            return MoveResult(state.base_T_tcp, contact=True)
+        check_arrival(self.config, state.base_T_tcp, target)
+        return MoveResult(state.base_T_tcp, contact=False)
 
     def open_gripper(self, width_m: float = GRIPPER_MAX_WIDTH) -> None:
         """Move the fingers; see `Robot.open_gripper`."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..arm.arguments import check_joints, check_line, check_range
+from ..arm.arrival import check_arrival
 from ..arm.joint_path import path_pieces
 from ..arm.panda import GRIPPER_MAX_WIDTH
 from ..arm.robot import (
@@ -25,7 +26,7 @@ from ..arm.robot import (
     RobotState,
     UserStopped,
 )
-from ..arm.straight_line import distance, straight_line
+from ..arm.straight_line import straight_line
 from ..support.closing import Closing
 from .franka_config import RECOVERY_TIMEOUT, NetworkedConfig
 from .libfranka_errors import reflex_names
@@ -228,13 +229,7 @@ class PandaRobot(Closing):
                     if BUSY not in str(error) or not left:
                         raise
         reached = np.array(self._link.read().O_T_EE).reshape(4, 4).T
-        off, turned = distance(reached, target)
-        tolerance = self.config.arrival_tolerance_m, self.config.arrival_tolerance_rad
-        if off > tolerance[0] or turned > tolerance[1]:
-            raise MotionError(
-                f"the TCP ended {1e3 * off:.1f} mm and {turned:.3f} rad from its target "
-                f"(allowed: {1e3 * tolerance[0]:.1f} mm, {tolerance[1]:.3f} rad)"
-            )
+        check_arrival(self.config, reached, target)
 
     def _move_until(
         self, force: float, points: np.ndarray, factor: float, target: np.ndarray

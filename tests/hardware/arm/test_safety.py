@@ -138,7 +138,7 @@ def test_a_command_beyond_a_limit_is_refused_by_name(
 )
 def test_a_wrong_answer_of_the_planner_is_refused(answer: np.ndarray, message: str) -> None:
     spy = SpyRobot()
-    robot = SafeRobot(spy, FLAT, planner=lambda *_, **__: StraightLine(answer, 0.1))
+    robot = SafeRobot(spy, FLAT, line_solver=lambda *_, **__: StraightLine(answer, 0.1))
     with pytest.raises(SafetyViolation, match=message):
         robot.move_linear(pose(z=0.3), speed=0.05)
     assert not spy.lines
@@ -151,7 +151,7 @@ def test_a_planner_that_jumps_or_strays_is_refused() -> None:
         (np.linspace(HOME, end, 6), "leaves the line by"),
     ):
         spy = SpyRobot()
-        robot = SafeRobot(spy, FLAT, planner=lambda *_, p=points, **__: StraightLine(p, 0.1))
+        robot = SafeRobot(spy, FLAT, line_solver=lambda *_, p=points, **__: StraightLine(p, 0.1))
         with pytest.raises(SafetyViolation, match=message):
             robot.move_linear(ARM.pose(end), speed=0.05)
 

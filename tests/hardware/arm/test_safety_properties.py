@@ -40,7 +40,7 @@ steps = st.tuples(
 TOLD = (RobotError, InputError)
 
 
-class LyingPlanner:
+class LyingSolver:
     """Answers as it is told to, honestly or not."""
 
     def __init__(self) -> None:
@@ -61,10 +61,10 @@ class LyingPlanner:
         return StraightLine(points, 0.1)
 
 
-def tell(robot: SafeRobot, planner: LyingPlanner, step: tuple) -> None:
+def tell(robot: SafeRobot, solver: LyingSolver, step: tuple) -> None:
     """Give one command; what it answers is of no concern here."""
     kind, target, speed, force, answer, seed = step
-    planner.kind, planner.rng = answer, np.random.default_rng(seed)
+    solver.kind, solver.rng = answer, np.random.default_rng(seed)
     q = robot.state().q
     try:
         if kind == "line":
@@ -76,7 +76,7 @@ def tell(robot: SafeRobot, planner: LyingPlanner, step: tuple) -> None:
         else:
             count = 1 + seed % 4
             scale = (0.05, 0.2, 0.6)[seed % 3]
-            turns = planner.rng.uniform(-scale, scale, (count, 7))
+            turns = solver.rng.uniform(-scale, scale, (count, 7))
             robot.move_joints(q + np.cumsum(turns, axis=0), speed=speed)
     except TOLD as refused:
         assert "\n" not in str(refused)
@@ -88,11 +88,11 @@ def test_no_command_gets_past_the_limits(
     table: TablePlane, start: int, miss: float, step: tuple
 ) -> None:
     limits = SafetyLimits(table=table)
-    planner = LyingPlanner()
+    solver = LyingSolver()
     spy = SpyRobot(q=STARTS[start].copy(), miss=miss)
-    robot = SafeRobot(spy, limits, planner=planner)
+    robot = SafeRobot(spy, limits, line_solver=solver)
     kind = "chord" if step[4] == "honest" else step[4]  # honest lines are solved below: they cost
-    tell(robot, planner, (*step[:4], kind, step[5]))
+    tell(robot, solver, (*step[:4], kind, step[5]))
     assert_within(limits, spy)
 
 
@@ -102,11 +102,11 @@ def test_no_sequence_of_commands_gets_past_the_limits(
     table: TablePlane, miss: float, told: list[tuple]
 ) -> None:
     limits = SafetyLimits(table=table)
-    planner = LyingPlanner()
+    solver = LyingSolver()
     spy = SpyRobot(miss=miss, contact_at=table.height_m + 0.012)
-    robot = SafeRobot(spy, limits, planner=planner)
+    robot = SafeRobot(spy, limits, line_solver=solver)
     for step in told:
-        tell(robot, planner, (*step[:4], "honest", step[5]))
+        tell(robot, solver, (*step[:4], "honest", step[5]))
     assert_within(limits, spy)
 
 

@@ -18,9 +18,9 @@ from fixtures.watched_sim import DT, Watched, watched
 from hardware import RobotError
 from hardware.arm.joint_path import corner_cuts, path_pieces
 from hardware.arm.limits import SafetyLimits, dense_path
-from hardware.arm.motion_checks import LEVEL
 from hardware.arm.panda import DQ_MAX
 from hardware.arm.path_speed import MAX_TURN_SPEED, OVERSHOOT, fitting_share
+from hardware.arm.sinking import LEVEL
 from hardware.arm.table_plane import TablePlane
 from warp_deform.errors import InputError
 

@@ -126,7 +126,7 @@ def test_what_is_checked_is_what_is_sent() -> None:
         target[2, 3] = -0.5
         return straight_line(ARM, q, T, speed=speed)
 
-    SafeRobot(spy, FLAT, planner=meddling).move_linear(target, speed=0.05)
+    SafeRobot(spy, FLAT, line_solver=meddling).move_linear(target, speed=0.05)
     assert spy.lines[0][1][2, 3] == 0.3
 
 
