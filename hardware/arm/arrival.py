@@ -81,7 +81,8 @@ def pressed_contact(
 
     Args:
         state: after the motion
-        start, target: of the line, (4, 4) [m]
+        start: pose at the start of the line [m], (4, 4)
+        target: pose at its end [m], (4, 4)
         stop_force_N: at which it was to stop
     """
     line = target[:3, 3] - start[:3, 3]

@@ -35,22 +35,22 @@ def path_pieces(start: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray,
         for each piece where it begins, (7,), and its waypoints, (M, 7); none where the arm is
         already there
     """
-    kept = [start]
+    waypoints = [start]
     for point in points:
-        if np.abs(point - kept[-1]).max() > STANDSTILL:
-            kept.append(point)
-    if len(kept) == 1:
+        if np.abs(point - waypoints[-1]).max() > STANDSTILL:
+            waypoints.append(point)
+    if len(waypoints) == 1:
         return []
-    kept[-1] = points[-1]  # at most STANDSTILL away
-    while len(kept) > 1 and np.abs(kept[-1] - kept[-2]).max() <= STANDSTILL:
-        if len(kept) == 2:
+    waypoints[-1] = points[-1]  # at most STANDSTILL away
+    while len(waypoints) > 1 and np.abs(waypoints[-1] - waypoints[-2]).max() <= STANDSTILL:
+        if len(waypoints) == 2:
             return []
-        del kept[-2]
-    steps = np.diff(kept, axis=0)
+        del waypoints[-2]
+    steps = np.diff(waypoints, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
     corners = np.flatnonzero((steps[1:] * steps[:-1]).sum(axis=1) < SHARP) + 1
-    bounds = [0, *corners.tolist(), len(kept) - 1]
-    return [(kept[i], np.array(kept[i + 1 : j + 1])) for i, j in pairwise(bounds)]
+    bounds = [0, *corners.tolist(), len(waypoints) - 1]
+    return [(waypoints[i], np.array(waypoints[i + 1 : j + 1])) for i, j in pairwise(bounds)]
 
 
 def corner_cuts(path: np.ndarray) -> list[np.ndarray]:

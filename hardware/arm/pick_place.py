@@ -32,6 +32,7 @@ __all__ = [
     "PickPlaceOutcome",
     "PickPlaceResult",
     "execute",
+    "hand_down",
     "waypoints",
 ]
 
@@ -160,12 +161,12 @@ def waypoints(
     pick_yaw, place_yaw = _yaws(action)
     lift = _lift(action, config)
     return {
-        "hover": _down(action.pick_xy, config.hover_m, pick_yaw, table),
-        "grasp": _down(action.pick_xy, config.grasp_m, pick_yaw, table),
-        "lift": _down(action.pick_xy, lift, pick_yaw, table),
-        "carry": _down(action.place_xy, lift, place_yaw, table),
-        "place": _down(action.place_xy, config.place_m, place_yaw, table),
-        "retreat": _down(action.place_xy, config.hover_m, place_yaw, table),
+        "hover": hand_down(action.pick_xy, config.hover_m, pick_yaw, table),
+        "grasp": hand_down(action.pick_xy, config.grasp_m, pick_yaw, table),
+        "lift": hand_down(action.pick_xy, lift, pick_yaw, table),
+        "carry": hand_down(action.place_xy, lift, place_yaw, table),
+        "place": hand_down(action.place_xy, config.place_m, place_yaw, table),
+        "retreat": hand_down(action.place_xy, config.hover_m, place_yaw, table),
     }
 
 
@@ -306,8 +307,15 @@ def _yaws(action: PickPlaceAction) -> tuple[float, float]:
     return best, best + turn
 
 
-def _down(xy: tuple[float, float], height: float, yaw: float, table: TablePlane) -> np.ndarray:
-    """Return the pose `height` above the table whose x axis lies along `yaw`, the hand down."""
+def hand_down(xy: tuple[float, float], height: float, yaw: float, table: TablePlane) -> np.ndarray:
+    """Return the pose (4, 4) [m] above a point of the table, the hand straight down.
+
+    Args:
+        xy: the point, x and y in the base frame [m]
+        height: of the TCP above the table [m]
+        yaw: direction of the hand's x axis [rad]
+        table: the measured table
+    """
     c, s = math.cos(yaw), math.sin(yaw)
     z = float(table.z(np.array(xy))) + height
     return np.array([[c, s, 0, xy[0]], [s, -c, 0, xy[1]], [0, 0, -1, z], [0, 0, 0, 1.0]])

@@ -38,7 +38,8 @@ class Calibration:
         intrinsics: of the camera
         base_H_pixel: from undistorted pixels (column, row, 1) to base x, y [m], shape (3, 3)
         table: the touched-off plane
-        x, y: ends of the workspace [m]
+        x: ends of the workspace along x [m]
+        y: ends of the workspace along y [m]
         method: what gave the homography: "charuco", "touched points" or "hand-eye"
         error_m: error to expect, as the method measures it [m]
         details: further figures, JSON types: residuals, the board, tcp_T_camera

@@ -113,13 +113,13 @@ def board_pose(corners: Corners, board: BoardSpec, intrinsics: CameraIntrinsics)
     """
     points = board.corners_m[corners.ids]
     K, distortion = intrinsics.matrix, intrinsics.distortion
-    found, r, t = cv2.solvePnP(points, corners.pixels, K, distortion, flags=cv2.SOLVEPNP_IPPE)
-    if found:
+    solved, r, t = cv2.solvePnP(points, corners.pixels, K, distortion, flags=cv2.SOLVEPNP_IPPE)
+    if solved:
         r, t = cv2.solvePnPRefineLM(points, corners.pixels, K, distortion, r, t)
         again, _ = cv2.projectPoints(points, r, t, K, distortion)
         errors = again.reshape(-1, 2) - corners.pixels
         rms = math.sqrt(float((errors**2).sum(axis=1).mean()))
-    if not found or not rms <= _MAX_POSE_ERROR:
+    if not solved or not rms <= _MAX_POSE_ERROR:
         raise InputError(
             "the corners fit no pose of the board; check its squares' size and the intrinsics"
         )
@@ -135,6 +135,7 @@ def calibrate_intrinsics(
 
     Args:
         views: eight or more, from different sides, near and far, into the corners of the picture
+        board: as it is printed
         size: width and height of the pictures [px]
 
     Raises:

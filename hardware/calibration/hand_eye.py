@@ -95,20 +95,20 @@ def calibrate_hand_eye(base_T_tcp: np.ndarray, camera_T_board: np.ndarray) -> Ha
         raise InputError("the poses do not tell where the camera is; tilt the hand about two axes")
     tcp_T_camera, base_T_board = _refine(hand, seen, start)
     errors = _errors(hand, seen, tcp_T_camera, base_T_board)
-    found = HandEye(
+    hand_eye = HandEye(
         tcp_T_camera,
         base_T_board,
         np.linalg.norm(errors[:, :3], axis=1),
         np.linalg.norm(errors[:, 3:], axis=1),
     )
-    if not found.error_m <= MAX_ERROR:
-        worst = int(np.argmax(found.residuals_m))
+    if not hand_eye.error_m <= MAX_ERROR:
+        worst = int(np.argmax(hand_eye.residuals_m))
         raise PoorFit(
-            f"{found.report()}; allowed: {1e3 * MAX_ERROR:g} mm rms, so it is refused; take "
+            f"{hand_eye.report()}; allowed: {1e3 * MAX_ERROR:g} mm rms, so it is refused; take "
             f"picture {worst + 1} again first, and fix board and camera",
             worst=worst,
         )
-    return found
+    return hand_eye
 
 
 def _check_turns(hand: np.ndarray) -> None:

@@ -11,7 +11,7 @@ from warp_deform.errors import InputError
 
 from ..arm.limits import LIMIT_NAMES, SafetyLimits
 from ..arm.panda import PandaKinematics
-from ..arm.pick_place import PickPlaceConfig
+from ..arm.pick_place import PickPlaceConfig, hand_down
 from ..arm.robot import UnreachablePose
 from ..arm.straight_line import straight_line
 from ..arm.table_plane import TablePlane
@@ -79,31 +79,28 @@ def unreached(
     its last joint in the middle; how far a tangent turns it from there is checked with each action.
     """
     arm, limits = PandaKinematics(), workplace.limits(table, joint_margin=joint_margin)
+
+    def joints_at(x: float, y: float, start: np.ndarray) -> np.ndarray:
+        target = hand_down((x, y), PickPlaceConfig().grasp_m, math.atan2(y, x), table)
+        return straight_line(arm, start, target, speed=0.1).q[-1]
+
     xs, ys = np.linspace(*workplace.x, _COLUMNS), np.linspace(*workplace.y, _ROWS)
     q = np.array(workplace.home_q)
     try:  # begun in the middle, and gone on from point to neighbouring point
-        q = straight_line(arm, q, _down(xs[_COLUMNS // 2], ys[_ROWS // 2], table), speed=0.1).q[-1]
+        q = joints_at(xs[_COLUMNS // 2], ys[_ROWS // 2], q)
     except UnreachablePose:
         return tuple((float(x), float(y)) for y in ys for x in xs)
     missed = []
     middle = _ROWS // 2
     for rows in (ys[middle:], ys[:middle][::-1]):
-        at = q
+        neighbour = q
         for index, y in enumerate(rows):
             for x in xs if index % 2 else xs[::-1]:
                 try:
-                    found = straight_line(arm, at, _down(x, y, table), speed=0.1).q[-1]
+                    neighbour = joints_at(x, y, neighbour)
                 except UnreachablePose:
                     missed.append((float(x), float(y)))
                     continue
-                at = found
-                if (found < limits.q_min).any() or (found > limits.q_max).any():
+                if (neighbour < limits.q_min).any() or (neighbour > limits.q_max).any():
                     missed.append((float(x), float(y)))
     return tuple(missed)
-
-
-def _down(x: float, y: float, table: TablePlane) -> np.ndarray:
-    yaw = math.atan2(y, x)
-    c, s = math.cos(yaw), math.sin(yaw)
-    z = float(table.z(np.array([x, y]))) + PickPlaceConfig().grasp_m
-    return np.array([[c, s, 0, x], [s, -c, 0, y], [0, 0, -1, z], [0, 0, 0, 1.0]])

@@ -68,7 +68,7 @@ class CameraIntrinsics:
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Return where pixels (n, 2), column and row, would be without distortion."""
         points = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
-        found = cv2.undistortPointsIter(
+        undistorted = cv2.undistortPointsIter(
             points,
             self.matrix,
             self.distortion if len(self.distortion) else None,
@@ -76,14 +76,16 @@ class CameraIntrinsics:
             self.matrix,
             (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9),
         )
-        return np.asarray(found).reshape(-1, 2)
+        return np.asarray(undistorted).reshape(-1, 2)
 
     def distort(self, pixels: np.ndarray) -> np.ndarray:
         """Return where undistorted pixels (n, 2), column and row, are in the camera's picture."""
         points = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
         rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(self.matrix).T
-        found, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.matrix, self.distortion)
-        return np.asarray(found).reshape(-1, 2)
+        distorted, _ = cv2.projectPoints(
+            rays, np.zeros(3), np.zeros(3), self.matrix, self.distortion
+        )
+        return np.asarray(distorted).reshape(-1, 2)
 
     def to_record(self) -> dict[str, Any]:
         """Return the intrinsics as JSON types."""

@@ -47,16 +47,16 @@ class _RealSense:
 
     def intrinsics(self) -> CameraIntrinsics:
         stream = self._profile.get_stream(self._rs.stream.color).as_video_stream_profile()
-        found: Any = stream.get_intrinsics()
-        if any(found.coeffs) and found.model != self._rs.distortion.brown_conrady:
+        lens: Any = stream.get_intrinsics()
+        if any(lens.coeffs) and lens.model != self._rs.distortion.brown_conrady:
             # D405 and D455 tell those of the inverse model: from distorted pixels to straight ones.
             raise CameraError(
-                f"the RealSense describes its lens by {found.model}, not by OpenCV's Brown-Conrady "
+                f"the RealSense describes its lens by {lens.model}, not by OpenCV's Brown-Conrady "
                 "model; use it as --camera uvc, and measure its lens first with `warp-deform "
                 "franka calibrate lens --camera uvc`"
             )
-        K = np.array([[found.fx, 0.0, found.ppx], [0.0, found.fy, found.ppy], [0.0, 0.0, 1.0]])
-        return CameraIntrinsics((found.width, found.height), K, np.array(found.coeffs, dtype=float))
+        K = np.array([[lens.fx, 0.0, lens.ppx], [0.0, lens.fy, lens.ppy], [0.0, 0.0, 1.0]])
+        return CameraIntrinsics((lens.width, lens.height), K, np.array(lens.coeffs, dtype=float))
 
     def grab(self) -> tuple[np.ndarray, np.ndarray]:
         try:

@@ -1,7 +1,8 @@
 """Any camera that the system offers as a video device: OpenCV, no vendor's package.
 
 The colour stream of an Azure Kinect or a Femto is such a device, too. A video device does not tell
-its intrinsics: they come from `hardware.intrinsics`. Never tried on a device by the authors.
+its intrinsics: `warp-deform franka calibrate lens` measures them. Never tried on a device by the
+authors.
 """
 
 from __future__ import annotations

@@ -98,6 +98,8 @@ def examine(robot: RobotName, *, host: str | None, setup: Path) -> list[Check]:
 
     Args:
         robot: what is to work; what it needs is marked so
+        host: address of the robot; None leaves network and robot alone
+        setup: folder of the calibration
     """
     checks = [_simulation()]
     for module, distribution, backend, purpose, advice in _PACKAGES:

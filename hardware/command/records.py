@@ -35,7 +35,7 @@ def score(options: ScoreOptions) -> Outcome:
     failed: list[dict[str, Any]] = []
     for folder in options.episodes:
         try:
-            found = score_recording(folder)
+            result = score_recording(folder)
         except InputError as error:
             failed.append({"folder": folder, "error": str(error)})
             lines.append(f"{folder}  not scored: {error}")
@@ -43,19 +43,19 @@ def score(options: ScoreOptions) -> Outcome:
         rows.append(
             {
                 "folder": folder,
-                "success": found.success,
-                "actions": len(found.iou) - 1,
-                "actions_to_success": found.actions_to_success,
-                "iou": list(found.iou),
-                "at_start": found.at_start,
-                "best": found.best[-1],
-                "warnings": list(found.warnings),
-                "differences": list(found.differences),
+                "success": result.success,
+                "actions": len(result.iou) - 1,
+                "actions_to_success": result.actions_to_success,
+                "iou": list(result.iou),
+                "at_start": result.at_start,
+                "best": result.best[-1],
+                "warnings": list(result.warnings),
+                "differences": list(result.differences),
             }
         )
-        verdict = f"success after {found.actions_to_success}" if found.success else "no success"
-        lines.append(f"{folder}  {verdict}, best overlap {found.best[-1]:.3f}")
-        lines += [f"  {line}" for line in (*found.warnings, *found.differences)]
+        verdict = f"success after {result.actions_to_success}" if result.success else "no success"
+        lines.append(f"{folder}  {verdict}, best overlap {result.best[-1]:.3f}")
+        lines += [f"  {line}" for line in (*result.warnings, *result.differences)]
     counted = [row for row in rows if not row["at_start"]]
     won = [row["actions_to_success"] for row in counted if row["success"]]
     mean = sum(won) / len(won) if won else None
@@ -96,29 +96,33 @@ def replay(options: ReplayOptions) -> Outcome:
     """Replay an episode."""
     from ..recordings.replay import replay_recording, write_film
 
-    found = replay_recording(options.episode)
+    comparison = replay_recording(options.episode)
     if options.video is not None:
         write_film(options.episode, options.video)
     lines = []
-    for row in found.rows:
+    for row in comparison.rows:
         overlap = "" if row["iou"] is None else f"overlap {row['iou']:.3f}"
         lines.append(f"{row['index']:>3}  {overlap}  {row['outcome'] or ''}".rstrip())
-    lines += [f"  {line}" for line in (*found.warnings, *found.differences)]
-    lines.append(f"outcome: {found.outcome}; {found.mismatches} of {len(found.rows)} masks differ")
+    lines += [f"  {line}" for line in (*comparison.warnings, *comparison.differences)]
+    lines.append(
+        f"outcome: {comparison.outcome}; {comparison.mismatches} of {len(comparison.rows)} masks differ"
+    )
     data = {
         "folder": options.episode,
-        "outcome": found.outcome,
-        "observations": len(found.rows),
-        "actions": found.actions,
-        "mismatches": found.mismatches,
-        "rows": found.rows,
-        "warnings": list(found.warnings),
-        "differences": list(found.differences),
+        "outcome": comparison.outcome,
+        "observations": len(comparison.rows),
+        "actions": comparison.actions,
+        "mismatches": comparison.mismatches,
+        "rows": comparison.rows,
+        "warnings": list(comparison.warnings),
+        "differences": list(comparison.differences),
         "video": options.video,
     }
     failure = None
-    if found.differences:
-        more = len(found.differences) - 1
+    if comparison.differences:
+        more = len(comparison.differences) - 1
         others = f", and {more} more" if more else ""
-        failure = f"what is recorded and what is computed differ: {found.differences[0]}{others}"
+        failure = (
+            f"what is recorded and what is computed differ: {comparison.differences[0]}{others}"
+        )
     return Outcome(data=data, text="\n".join(lines), failure=failure)

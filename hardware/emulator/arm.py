@@ -42,12 +42,19 @@ class Arm:
     """Seven joints and the end effector frame.
 
     Attributes:
-        q, dq: joint positions [rad] and velocities [rad/s], shape (7,)
-        q_d, dq_d, ddq_d: what the motion generator commanded last, shape (7,)
+        q: joint positions [rad], shape (7,)
+        dq: joint velocities [rad/s], shape (7,)
+        q_d: joint positions that the motion generator commanded last [rad], shape (7,)
+        dq_d: joint velocities that it commanded last [rad/s], shape (7,)
+        ddq_d: joint accelerations that it commanded last [rad/s^2], shape (7,)
         tau_d: torques that the client commanded last [N m], shape (7,)
         O_T_EE: pose of the end effector, shape (16,), column-major
-        O_T_EE_c, O_dP_EE_c, O_ddP_EE_c: what the Cartesian generator commanded last
-        elbow, delbow, ddelbow: angle of joint 3 that it commanded last [rad], and its derivatives
+        O_T_EE_c: pose that the Cartesian generator commanded last, as `O_T_EE`
+        O_dP_EE_c: twist that it commanded last [m/s, rad/s], shape (6,)
+        O_ddP_EE_c: that twist's derivative [m/s^2, rad/s^2], shape (6,)
+        elbow: angle of joint 3 that it commanded last [rad]
+        delbow: that angle's velocity [rad/s]
+        ddelbow: that angle's acceleration [rad/s^2]
         wrench: contact on the end effector, in the base frame [N, N m], shape (6,)
     """
 
@@ -101,7 +108,8 @@ class Arm:
 
         Args:
             command: a ROBOT_COMMAND record
-            generator, controller: the modes of the motion in progress
+            generator: what the motion in progress follows
+            controller: what turns that into torques
             first: whether this is the motion's first command
         """
         with np.errstate(over="ignore", invalid="ignore"):  # such numbers are beyond every limit

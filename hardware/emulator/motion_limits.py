@@ -49,7 +49,9 @@ def joint_excess(
     """Return the names by which joint velocities, accelerations and jerks (7,) are too much.
 
     Args:
-        dq, ddq, dddq: [rad/s], [rad/s^2], [rad/s^3]; NaN is too much
+        dq: velocities [rad/s]; here and below NaN is too much
+        ddq: accelerations [rad/s^2]
+        dddq: jerks [rad/s^3]
         by: what the names begin with
     """
     return tuple(
@@ -99,7 +101,8 @@ def excess_at_end(velocity: np.ndarray, acceleration: np.ndarray, check: Check) 
     still moved faster than the limits let it stop within a sample was no end.
 
     Args:
-        velocity, acceleration: of the last sample
+        velocity: of the last sample
+        acceleration: of the last sample
         check: of the limits
     """
     still = np.zeros_like(velocity)

@@ -189,7 +189,13 @@ def run_episode(
     """Run an episode; the recorder is finished afterwards.
 
     Args:
+        robot: acts
+        camera: sees the workspace from the home pose
+        calibration: of this robot and this camera
+        chooser: decides what to do
+        recorder: keeps all of it
         goal: the mask to reach, (H, W) bool; without one there is no score
+        config: how the episode goes
         operator: who confirms every proposal; default: nobody, see `Unattended`
         empty: the view of the foam without a cable, (H, W, 3) uint8, see `segment_cable`
         toss: tosses a simulated cable again, given how often it was; see the module

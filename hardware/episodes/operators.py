@@ -91,6 +91,8 @@ def until_cleared(
     before the user stop was released.
 
     Args:
+        robot: is recovered
+        operator: is asked about each problem
         attempt: what to do with the robot; may be made several times
         problem: one that has come up already
 

@@ -97,8 +97,11 @@ def gather(
     just that one, one more. The old one stays in the file until the new one is there.
 
     Args:
+        measured: what was taken already, and the file that keeps it
+        wanted: how many measurements at least
         take: asks for the measurement of an index and returns it
         fit: their result; InputError, a `PoorFit` if one can be named, where it is refused
+        operator: whether to go on with kept ones, and after a refusal
 
     Raises:
         InputError: stopped

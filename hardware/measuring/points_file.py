@@ -64,6 +64,7 @@ def read_points(path: Path, origin: str) -> list[TouchedPoint]:
     """Return the points in a file.
 
     Args:
+        path: the file
         origin: what its line of origin must be, if it has one; see `origin_line`
 
     Raises:

@@ -19,18 +19,49 @@ from ..calibration.picture_coverage import check_picture
 from ..calibration.reach import check_workplace
 from ..calibration.workplace import Workplace
 from ..cameras.camera import CameraIntrinsics
+from ..episodes.operators import until_cleared
 from ..rig.config import REAL_ROBOTS, RigConfig
 from ..rig.rig import open_robot, read_intrinsics, read_table
 from ..rig.workplace import workplace_of
 from ..support.json_file import read_json, read_numbers
+from .touch_off import close_fingers
 
-__all__ = ["confirm", "keep", "lens_of", "make_calibration", "marked", "open_arm", "touched_table"]
+__all__ = [
+    "close_at_home",
+    "confirm",
+    "keep",
+    "lens_of",
+    "make_calibration",
+    "marked",
+    "open_arm",
+    "touched_table",
+]
 
 
 def confirm(operator: TerminalOperator, text: str) -> None:
     """Wait until something is done by hand; InputError where the operator stops instead."""
     if not operator.wait(text):
         raise InputError("stopped; nothing was written")
+
+
+def close_at_home(arm: SafeRobot, operator: TerminalOperator, text: str) -> None:
+    """Send the arm home and close its fingers, as soon as the operator has made ready.
+
+    Args:
+        arm: moves
+        operator: is asked first, and again until what stops the arm is cleared
+        text: what is to be done before, for the operator
+
+    Raises:
+        InputError: the operator stops
+        RobotError: see `until_cleared`
+    """
+    confirm(
+        operator,
+        f"{text}, nothing between the fingers; the arm then goes home and closes them",
+    )
+    until_cleared(arm, operator, arm.home)
+    close_fingers(arm)
 
 
 def open_arm(config: RigConfig, table: TablePlane) -> SafeRobot:

@@ -4,7 +4,7 @@
 
 The camera is found by touching corners of a board that it sees from home (`measure_camera`), or by
 looking at a board that nobody touches from many sides (`measure_hand_eye`); without a board see
-`touching_points`.
+`hardware.measuring.with_points`.
 
 The lens is measured for video devices alone: RealSense and Azure Kinect tell their intrinsics.
 """
@@ -42,8 +42,17 @@ from ..rig.workplace import workplace_of
 from ..support.json_file import write_json
 from .board_views import HandView, hand_view_file, lens_view_file
 from .measurement_file import gather
-from .steps import confirm, keep, lens_of, make_calibration, marked, open_arm, touched_table
-from .touch_off import close_fingers, touch_off
+from .steps import (
+    close_at_home,
+    confirm,
+    keep,
+    lens_of,
+    make_calibration,
+    marked,
+    open_arm,
+    touched_table,
+)
+from .touch_off import touch_off
 
 __all__ = [
     "measure_camera",
@@ -200,13 +209,7 @@ def measure_camera(
     table = touched_table(config)
     lens = lens_of(config)
     with robot or open_arm(config, table) as arm:
-        confirm(
-            operator,
-            "lay the board flat into the workspace, nothing between the fingers; the arm then goes "
-            "home and closes them",
-        )
-        until_cleared(arm, operator, arm.home)
-        close_fingers(arm)
+        close_at_home(arm, operator, "lay the board flat into the workspace")
         with camera or open_camera(config, lens) as device:
             frame = device.read()
         corners = find_corners(frame.rgb, board)

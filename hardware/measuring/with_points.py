@@ -26,14 +26,12 @@ from ..arm.table_plane import TablePlane
 from ..calibration.homography import MIN_POINTS, HomographyFit, solve_homography
 from ..cameras.camera import Camera, CameraIntrinsics
 from ..episodes.goals import write_picture
-from ..episodes.operators import until_cleared
 from ..rig.config import REAL_ROBOTS, RigConfig
 from ..rig.rig import open_camera
 from ..rig.workplace import workplace_of
 from .measurement_file import MeasurementFile, gather
 from .points_file import TouchedPoint, origin_line, read_points, write_points
-from .steps import confirm, keep, lens_of, make_calibration, marked, open_arm, touched_table
-from .touch_off import close_fingers
+from .steps import close_at_home, keep, lens_of, make_calibration, marked, open_arm, touched_table
 
 __all__ = ["Show", "click_point", "measure_points", "points_from_file", "type_point"]
 
@@ -64,8 +62,12 @@ def measure_points(
     to take again; points kept from a call that was stopped are gone on from.
 
     Args:
+        config: robot, camera and setup
         points: how many, five or more
         show: how a mark is shown; default: `click_point`
+        camera: default: the one that `config` names, opened and closed here
+        robot: default: the one that `config` names, opened and closed here
+        operator: the person at the robot; default: at this terminal
 
     Raises:
         InputError: too few points, stopped, or kept points that are not of this setup
@@ -79,31 +81,28 @@ def measure_points(
     table = touched_table(config)
     lens = lens_of(config)
     with robot or open_arm(config, table) as arm:
-        confirm(
-            operator,
+        text = (
             f"lay {points} small flat marks onto the foam: near the workspace's corners, in the "
-            "middle of its sides, in its middle; hold the hand 10 cm above them, nothing between "
-            "the fingers; the arm then goes home and closes them",
+            "middle of its sides, in its middle; hold the hand 10 cm above them"
         )
-        until_cleared(arm, operator, arm.home)
-        close_fingers(arm)
+        close_at_home(arm, operator, text)
         with camera or open_camera(config, lens) as device:
             frame = device.read()
         measured = _measurement_file(config, frame.intrinsics, arm.limits)
-        seen = config.setup / "points_seen.png"
+        marks_file = config.setup / "points_seen.png"
 
         def take(index: int) -> TouchedPoint:
             before, after = measured.items[:index], measured.items[index + 1 :]
             circles = np.array([point[:2] for point in [*before, *after]]).reshape(-1, 2)
             picture = marked(frame.rgb, circles)
-            write_picture(seen, picture)
+            write_picture(marks_file, picture)
             name = f"point {index + 1} of {max(points, len(measured.items), index + 1)}"
             while True:
-                at = show(picture, f"{name}, a mark without a circle in {seen}", operator)
-                xy = None if at is None else _touched(arm, operator, name)
-                if at is None or xy is None:
+                pixel = show(picture, f"{name}, a mark without a circle in {marks_file}", operator)
+                xy = None if pixel is None else _touched(arm, operator, name)
+                if pixel is None or xy is None:
                     raise InputError("stopped before all points were taken")
-                point = TouchedPoint(*at, *xy)
+                point = TouchedPoint(*pixel, *xy)
                 try:
                     _check([*before, point, *after], frame.intrinsics, arm.limits)
                 except InputError as error:
@@ -116,8 +115,8 @@ def measure_points(
             return _fit(taken, frame.intrinsics, arm.limits)
 
         with measured.guarded():
-            found = gather(measured, wanted=points, take=take, fit=fit, operator=operator)
-            data = _save(config, measured.items, found, frame.intrinsics, table)
+            homography = gather(measured, wanted=points, take=take, fit=fit, operator=operator)
+            data = _save(config, measured.items, homography, frame.intrinsics, table)
         measured.remove()
     return data
 
@@ -209,9 +208,7 @@ def _fit(
     return fit
 
 
-def click_point(
-    picture: np.ndarray, text: str, operator: TerminalOperator
-) -> tuple[float, float] | None:
+def click_point(picture: np.ndarray, text: str, operator: TerminalOperator) -> PicturePixel | None:
     """Return column and row of a click on a picture in a window; None where it is closed.
 
     Raises:
@@ -237,15 +234,13 @@ def _pyplot() -> Any:
     return plt
 
 
-def type_point(
-    picture: np.ndarray, text: str, operator: TerminalOperator
-) -> tuple[float, float] | None:
+def type_point(picture: np.ndarray, text: str, operator: TerminalOperator) -> PicturePixel | None:
     """Return column and row as the operator types them, asked again until there are two numbers."""
     while True:
-        said = operator.answer(text, "its column and row [px]")
-        if said is None:
+        reply = operator.answer(text, "its column and row [px]")
+        if reply is None:
             return None
-        if (numbers := _two_numbers(said)) is not None:
+        if (numbers := _two_numbers(reply)) is not None:
             return numbers
 
 
@@ -253,11 +248,11 @@ def _touched(arm: SafeRobot, operator: TerminalOperator, name: str) -> tuple[flo
     """Return x and y [m] of the fingertips on a point, or as typed; None to stop."""
     text = f"{name}: guide the closed fingertips onto it, down to the foam"
     while True:
-        said = operator.answer(text, "Enter: they are there, or type its x and y [mm]")
-        if said is None:
+        reply = operator.answer(text, "Enter: they are there, or type its x and y [mm]")
+        if reply is None:
             return None
-        if said:
-            if (typed := _two_numbers(said)) is not None:
+        if reply:
+            if (typed := _two_numbers(reply)) is not None:
                 return typed[0] / 1e3, typed[1] / 1e3
             continue
         T = arm.state().base_T_tcp
@@ -274,9 +269,9 @@ def _touched(arm: SafeRobot, operator: TerminalOperator, name: str) -> tuple[flo
             return None
 
 
-def _two_numbers(said: str) -> tuple[float, float] | None:
+def _two_numbers(text: str) -> tuple[float, float] | None:
     try:
-        a, b = (float(word) for word in re.split(r"[,\s]+", said.strip()))
+        a, b = (float(word) for word in re.split(r"[,\s]+", text.strip()))
     except ValueError:
         return None
     return (a, b) if math.isfinite(a) and math.isfinite(b) else None

@@ -165,8 +165,10 @@ class EpisodeRecorder(Closing):
         """Record an action that is about to begin: one that an error ends has no other line.
 
         Args:
+            action: what is to be done
             lift_m: height of carrying [m]
-            pick_pixel, place_pixel: row and column in the view, where they were chosen there
+            pick_pixel: row and column of the pick in the view, where it was chosen there
+            place_pixel: the same of the place
         """
         self._check_observed("a plan")
         row = {"kind": "plan", "index": self._actions, "action": _numbers(action, lift_m)}
@@ -183,7 +185,10 @@ class EpisodeRecorder(Closing):
         """Record an action that has ended, taken on the last observation.
 
         Args:
-            pick_pixel, place_pixel: row and column in the view, where they were chosen there
+            action: what was to be done
+            result: what became of it
+            pick_pixel: row and column of the pick in the view, where it was chosen there
+            place_pixel: the same of the place
         """
         self._check_observed("an action")
         place = result.base_T_place

@@ -47,6 +47,7 @@ def read_json(path: Path, *, what: str, schema: int) -> dict[str, Any]:
     """Return the JSON object in a file.
 
     Args:
+        path: the file
         what: what the file is, for the message: "calibration"
         schema: the value its key `schema` must have
 

@@ -95,8 +95,8 @@ def _pieces(thin: np.ndarray) -> list[np.ndarray]:
         ends = near[tuple(piece[0])], near[tuple(piece[-1])]
         return len(piece) < _SHORT and not all(ends)
 
-    kept = [piece for piece in pieces if not spur(piece)]
-    return kept or pieces
+    without_spurs = [piece for piece in pieces if not spur(piece)]
+    return without_spurs or pieces
 
 
 def _walked(pixels: np.ndarray) -> np.ndarray:

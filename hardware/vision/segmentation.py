@@ -68,6 +68,8 @@ def segment_cable(
     """Return the cable's mask (H, W) bool of a picture (H, W, 3) uint8; it may be empty.
 
     Args:
+        rgb: the picture
+        config: what counts as cable
         empty: the same view without the cable, (H, W, 3) uint8; better than the median where the
             foam has marks or edges
         region: (H, W) bool, where to look; default everywhere
@@ -126,7 +128,7 @@ def _clean(mask: np.ndarray, config: SegmentationConfig) -> np.ndarray:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (config.close_px, config.close_px))
     closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     _, labels, figures, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    kept = figures[:, cv2.CC_STAT_AREA] >= config.min_area_px
-    kept[0] = False  # the background
-    cleaned: np.ndarray = kept[labels]
+    large_enough = figures[:, cv2.CC_STAT_AREA] >= config.min_area_px
+    large_enough[0] = False  # the background
+    cleaned: np.ndarray = large_enough[labels]
     return cleaned

@@ -81,6 +81,8 @@ class TopDownView:
         """Return a camera's picture (h, w, 3) or (h, w) uint8 seen from above, `shape` (, 3).
 
         Args:
+            image: the picture
+            projection: where points of the table are in it
             supersample: samples a pixel and side; they are averaged, so thin cables keep their
                 width
 
