@@ -35,6 +35,12 @@ def pytest_ignore_collect(collection_path, config):
     return None
 
 
+def pytest_runtest_setup(item):
+    """The emulator compiles the robot's model library when it starts."""
+    if item.get_closest_marker("emulator") and shutil.which("cc") is None:
+        pytest.skip("the emulator needs a C compiler")
+
+
 @pytest.fixture(scope="module")
 def emulator():
     """An emulated Panda before a table, in a process of its own."""
@@ -72,6 +78,20 @@ def connection(emulator):
 
     with PandaRobot(NetworkedConfig(host=emulator.host)) as robot:
         yield robot
+
+
+@pytest.fixture
+def ready_panda(emulator, connection):
+    """Our backend of an arm at home, with nothing between its open fingers."""
+    from fixtures.emulator_client import HOME
+
+    emulator.user_stop(False)
+    connection.recover()
+    emulator.place(HOME)
+    emulator.call_world("place_object", width=0.0)
+    connection.open_gripper()
+    emulator.call_world("take")
+    return connection
 
 
 @pytest.fixture(scope="module")

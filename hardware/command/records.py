@@ -104,9 +104,8 @@ def replay(options: ReplayOptions) -> Outcome:
         overlap = "" if row["iou"] is None else f"overlap {row['iou']:.3f}"
         lines.append(f"{row['index']:>3}  {overlap}  {row['outcome'] or ''}".rstrip())
     lines += [f"  {line}" for line in (*comparison.warnings, *comparison.differences)]
-    lines.append(
-        f"outcome: {comparison.outcome}; {comparison.mismatches} of {len(comparison.rows)} masks differ"
-    )
+    masks = f"{comparison.mismatches} of {len(comparison.rows)} masks differ"
+    lines.append(f"outcome: {comparison.outcome}; {masks}")
     data = {
         "folder": options.episode,
         "outcome": comparison.outcome,

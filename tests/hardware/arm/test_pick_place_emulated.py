@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -19,39 +18,25 @@ from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.measuring.touch_off import TouchOffConfig, touch_off
 
-pytestmark = [
-    pytest.mark.emulator,
-    pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
-    pytest.mark.timeout(240),
-]
+pytestmark = [pytest.mark.emulator, pytest.mark.timeout(240)]
 # The emulated table meets the TCP itself, the limits' table the fingertips 9 mm below it.
 SURFACE = TABLE_Z - 0.009
 ACTION = PickPlaceAction((0.42, -0.12), 0.4, (0.55, 0.10), 0.9)
-
-
-@pytest.fixture
-def backend(emulator: EmulatorProcess, connection: PandaRobot) -> PandaRobot:
-    connection.recover()
-    emulator.place(HOME)
-    emulator.call_world("place_object", width=0.0)
-    connection.open_gripper()
-    emulator.call_world("take")
-    return connection
 
 
 def limits(height: float = SURFACE) -> SafetyLimits:
     return SafetyLimits(table=TablePlane(height))
 
 
-def test_a_cable_is_placed(emulator: EmulatorProcess, backend: PandaRobot) -> None:
+def test_a_cable_is_placed(emulator: EmulatorProcess, ready_panda: PandaRobot) -> None:
     emulator.call_world("place_object", width=0.004)
-    result = execute(SafeRobot(backend, limits()), ACTION)
+    result = execute(SafeRobot(ready_panda, limits()), ACTION)
     assert result.outcome == PickPlaceOutcome.PLACED
     assert result.width_after_lift_m == pytest.approx(0.004, abs=1e-4)
     assert result.base_T_place is not None
     assert np.linalg.norm(result.base_T_pick[:2, 3] - ACTION.pick_xy) < 5e-4
     assert np.linalg.norm(result.base_T_place[:2, 3] - ACTION.place_xy) < 5e-4
-    np.testing.assert_allclose(backend.state().q, HOME, atol=1e-3)
+    np.testing.assert_allclose(ready_panda.state().q, HOME, atol=1e-3)
     # What the hand really did, every millisecond.
     record = emulator.call_world("take")
     x, y, z = record["position"].T
@@ -62,33 +47,36 @@ def test_a_cable_is_placed(emulator: EmulatorProcess, backend: PandaRobot) -> No
     assert record["speed"][moving].max() < 0.12
 
 
-def test_a_missed_grasp_goes_home(backend: PandaRobot) -> None:
-    result = execute(SafeRobot(backend, limits()), ACTION)
+def test_a_missed_grasp_goes_home(ready_panda: PandaRobot) -> None:
+    result = execute(SafeRobot(ready_panda, limits()), ACTION)
     assert result.outcome == PickPlaceOutcome.MISSED_GRASP
-    np.testing.assert_allclose(backend.state().q, HOME, atol=1e-3)
+    np.testing.assert_allclose(ready_panda.state().q, HOME, atol=1e-3)
 
 
 def test_a_table_that_is_higher_than_thought_is_felt(
-    emulator: EmulatorProcess, backend: PandaRobot
+    emulator: EmulatorProcess, ready_panda: PandaRobot
 ) -> None:
     """By 6 mm: the descent stops on contact and the cable is placed all the same."""
     emulator.call_world("place_object", width=0.004)
-    result = execute(SafeRobot(backend, limits(SURFACE - 0.006)), ACTION)
+    result = execute(SafeRobot(ready_panda, limits(SURFACE - 0.006)), ACTION)
     assert result.outcome == PickPlaceOutcome.PLACED
     assert emulator.call_world("take")["force"].max() < 30.0
-    assert backend.state().mode == RobotMode.IDLE
+    assert ready_panda.state().mode == RobotMode.IDLE
 
 
-def test_an_action_outside_moves_nothing(emulator: EmulatorProcess, backend: PandaRobot) -> None:
+def test_an_action_outside_moves_nothing(
+    emulator: EmulatorProcess, ready_panda: PandaRobot
+) -> None:
     with pytest.raises(SafetyViolation, match="workspace y"):
-        execute(SafeRobot(backend, limits()), PickPlaceAction((0.5, 0.4), 0.0, (0.5, 0.0), 0.0))
+        outside = PickPlaceAction((0.5, 0.4), 0.0, (0.5, 0.0), 0.0)
+        execute(SafeRobot(ready_panda, limits()), outside)
     assert len(emulator.call_world("take")["speed"]) == 0
 
 
-def test_touch_off_measures_the_table(backend: PandaRobot) -> None:
+def test_touch_off_measures_the_table(ready_panda: PandaRobot) -> None:
     corners = [(0.40, -0.2), (0.40, 0.2), (0.6, 0.2), (0.6, -0.2)]
     quick = replace(limits(SURFACE - 0.02), max_joint_speed=0.2)
-    points = touch_off(SafeRobot(backend, quick), corners, TouchOffConfig(hover_m=0.045))
+    points = touch_off(SafeRobot(ready_panda, quick), corners, TouchOffConfig(hover_m=0.045))
     plane, residuals = fit_table_plane(points)
     errors = plane.z(np.array(corners)) - SURFACE
     assert np.abs(errors).max() < 1e-3 and np.abs(residuals).max() < 5e-4

@@ -61,6 +61,17 @@ def frankapy(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
     assert signal.getsignal(signal.SIGINT) is handler, "Ctrl-C still reaches us"
 
 
+def refuses_to_move(robot: Robot) -> None:
+    """Assert that a stop holds: no motion of arm or fingers begins."""
+    for call in (
+        lambda: robot.move_joints(HOME + 0.1, speed=0.1),
+        lambda: robot.move_linear(LOWER, speed=0.1),
+        robot.open_gripper,
+    ):
+        with pytest.raises(MotionError, match="holds until recover"):
+            call()
+
+
 def slow_free() -> FrankapyRobot:
     return FrankapyRobot(sleep=lambda seconds: None, say=lambda line: None)
 
@@ -194,13 +205,7 @@ def test_an_fr3_recovers_whatever_its_state_says_and_not_from_the_user_stop(
     assert franky.recoveries == 3
     robot.stop()
     assert franky.stops == 1
-    for call in (
-        lambda: robot.move_joints(HOME + 0.1, speed=0.1),
-        lambda: robot.move_linear(LOWER, speed=0.1),
-        robot.open_gripper,
-    ):
-        with pytest.raises(MotionError, match="holds until recover"):
-            call()
+    refuses_to_move(robot)
     assert franky.moves == []
     franky.mode = "Idle"
     robot.recover()
@@ -260,13 +265,7 @@ def test_frankapys_stop_holds(frankapy: SimpleNamespace) -> None:
     robot = slow_free()
     robot.stop()
     made = len(frankapy.calls)
-    for call in (
-        lambda: robot.move_joints(HOME + 0.1, speed=0.1),
-        lambda: robot.move_linear(LOWER, speed=0.1),
-        robot.open_gripper,
-    ):
-        with pytest.raises(MotionError, match="holds until recover"):
-            call()
+    refuses_to_move(robot)
     assert len(frankapy.calls) == made
     robot.recover()
     robot.move_linear(LOWER, speed=0.1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -35,11 +34,7 @@ from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.server import EmulatorConfig
 
-pytestmark = [
-    pytest.mark.emulator,
-    pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
-    pytest.mark.timeout(180),
-]
+pytestmark = [pytest.mark.emulator, pytest.mark.timeout(180)]
 
 
 def test_a_robot_in_reflex_can_be_connected_to() -> None:

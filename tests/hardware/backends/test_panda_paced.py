@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 from dataclasses import dataclass, field
 
@@ -16,11 +15,7 @@ from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.server import EmulatorConfig
 
-pytestmark = [
-    pytest.mark.emulator,
-    pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
-    pytest.mark.timeout(180),
-]
+pytestmark = [pytest.mark.emulator, pytest.mark.timeout(180)]
 RATE = 50.0  # [Hz], five times that of a recording
 # Of the commands. A busy machine without real-time kernel misses up to a tenth; a reader that held
 # the control loop up would cost most of them, or the motion.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pytest
 from fixtures.emulator_client import HOME
@@ -15,11 +13,7 @@ from hardware.arm.table_plane import TablePlane
 from hardware.backends.panda import PandaRobot
 from hardware.emulator import EmulatorProcess
 
-pytestmark = [
-    pytest.mark.emulator,
-    pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
-    pytest.mark.timeout(180),
-]
+pytestmark = [pytest.mark.emulator, pytest.mark.timeout(180)]
 LIMITS = SafetyLimits(table=TablePlane(TABLE_Z), max_joint_speed=0.2)
 REACHED = HOME + np.array([0.35, 0.35, 0.1, 0.1, 0.1, 0.3, 0.2])
 

@@ -14,6 +14,7 @@ from fixtures.board_photographs import (
     TABLE,
     camera_above,
     photograph,
+    projected,
     rotation,
     transform,
 )
@@ -158,14 +159,8 @@ def test_intrinsics_from_views() -> None:
         middle = BOARD.corners_m.mean(axis=0)
         T = transform(R, [*rng.uniform([-0.12, -0.06], [0.12, 0.06]), rng.uniform(0.35, 0.6)])
         T[:3, 3] -= R @ middle
-        points, _ = cv2.projectPoints(
-            BOARD.corners_m,
-            cv2.Rodrigues(T[:3, :3])[0],
-            T[:3, 3],
-            INTRINSICS.matrix,
-            INTRINSICS.distortion,
-        )
-        views.append(Corners(np.arange(24), points.reshape(-1, 2) + rng.normal(0, 0.1, (24, 2))))
+        pixels = projected(BOARD.corners_m, T)
+        views.append(Corners(np.arange(24), pixels + rng.normal(0, 0.1, (24, 2))))
     found, rms = calibrate_intrinsics(views, BOARD, SIZE)
     assert rms < 0.2
     np.testing.assert_allclose(found.matrix, INTRINSICS.matrix, atol=8.0)
@@ -244,14 +239,7 @@ def test_hand_eye_gives_the_same_homography_as_touching() -> None:
     xy = np.random.default_rng(0).uniform([0.33, -0.2], [0.6, 0.2], (8, 2))
     points = np.column_stack([xy, TABLE.z(xy)])
     camera_T_base = np.linalg.inv(base_T_camera)
-    pixels, _ = cv2.projectPoints(
-        points,
-        cv2.Rodrigues(camera_T_base[:3, :3])[0],
-        camera_T_base[:3, 3],
-        INTRINSICS.matrix,
-        INTRINSICS.distortion,
-    )
-    found = apply_homography(H, INTRINSICS.undistort(pixels.reshape(-1, 2)))
+    found = apply_homography(H, INTRINSICS.undistort(projected(points, camera_T_base)))
     np.testing.assert_allclose(found, xy, atol=1e-7)
     upwards = base_T_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
     with pytest.raises(InputError, match="does not look down"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -22,10 +21,7 @@ from hardware.arm.panda import Q_MAX, Q_MIN, PandaKinematics
 from hardware.emulator import EmulatorProcess
 from hardware.emulator.protocol import ERRORS
 
-pytestmark = [
-    pytest.mark.emulator,
-    pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
-]
+pytestmark = pytest.mark.emulator
 
 
 def test_clients_model_is_the_emulators(panda: SimpleNamespace, emulator: EmulatorProcess) -> None:

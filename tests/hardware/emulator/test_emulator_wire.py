@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
 import struct
 from collections.abc import Iterator
@@ -26,11 +25,7 @@ from hardware.emulator.protocol import (
     SetStatus,
 )
 
-pytestmark = [
-    pytest.mark.emulator,
-    pytest.mark.skipif(shutil.which("cc") is None, reason="the emulator needs a C compiler"),
-    pytest.mark.timeout(120),
-]
+pytestmark = [pytest.mark.emulator, pytest.mark.timeout(120)]
 PORTS = (ROBOT_COMMAND_PORT, GRIPPER_COMMAND_PORT)
 
 

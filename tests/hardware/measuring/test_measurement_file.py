@@ -6,11 +6,10 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from fixtures.blind_camera import BlindCamera
-from fixtures.board_photographs import BOARD, INTRINSICS, TABLE, rotation
+from fixtures.board_photographs import BOARD, INTRINSICS, TABLE, projected, rotation, transform
 from fixtures.guided_robot import BASE_T_BOARD, TCP_T_CAMERA, GuidedRobot, setup
 from fixtures.safety_spy import HOME, SpyRobot
 
@@ -140,15 +139,9 @@ class Bench:
         T = BASE_T_BOARD.copy()
         T[0, 3] += 0.03 * (self.seen in self.pushed)
         seen = np.linalg.inv(self.robot.state().base_T_tcp @ TCP_T_CAMERA) @ T
-        pixels, _ = cv2.projectPoints(
-            BOARD.corners_m,
-            cv2.Rodrigues(seen[:3, :3])[0],
-            seen[:3, 3],
-            INTRINSICS.matrix,
-            INTRINSICS.distortion,
-        )
+        pixels = projected(BOARD.corners_m, seen)
         noise = self.rng.normal(0.0, 0.15, (len(pixels), 2))
-        return Corners(np.arange(len(pixels)), pixels.reshape(-1, 2) + noise)
+        return Corners(np.arange(len(pixels)), pixels + noise)
 
     def answer(self, text: str) -> str:
         self.asked.append(text.split("\n")[0])
@@ -317,15 +310,9 @@ class Desk:
         self.seen += 1
         R = rotation(*self.rng.uniform(-0.5, 0.5, 3))
         at = [*self.rng.uniform([-0.12, -0.06], [0.12, 0.06]), self.rng.uniform(0.35, 0.6)]
-        pixels, _ = cv2.projectPoints(
-            BOARD.corners_m,
-            cv2.Rodrigues(R)[0],
-            at - R @ BOARD.corners_m.mean(axis=0),
-            INTRINSICS.matrix,
-            INTRINSICS.distortion,
-        )
+        pixels = projected(BOARD.corners_m, transform(R, at - R @ BOARD.corners_m.mean(axis=0)))
         noise = self.rng.normal(0.0, 20.0 if self.seen in self.moved else 0.1, (len(pixels), 2))
-        return Corners(np.arange(len(pixels)), pixels.reshape(-1, 2) + noise)
+        return Corners(np.arange(len(pixels)), pixels + noise)
 
     def answer(self, text: str) -> str:
         self.asked.append(text)
