@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import assert_never
 
 import numpy as np
 
@@ -58,5 +59,8 @@ def make_chooser(
 
         config = PlannerConfig() if budget is None else PlannerConfig(budget=budget)
         return PlannerChooser(seed=seed, view=rig.view, config=config)
-    show = click_pick_and_place if agent == "human" else type_pick_and_place
-    return HumanChooser(show, view=rig.view)
+    if agent == "human":
+        return HumanChooser(click_pick_and_place, view=rig.view)
+    if agent == "typed":
+        return HumanChooser(type_pick_and_place, view=rig.view)
+    assert_never(agent)

@@ -17,7 +17,7 @@ from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
 from warp_deform.support.extras import install_extra
 
-from ..rig.config import RobotName, SetupFlag
+from ..rig.config import NETWORKED_ROBOTS, REAL_ROBOTS, RobotName, SetupFlag
 
 __all__ = ["Check", "DoctorOptions", "doctor", "examine"]
 
@@ -104,12 +104,12 @@ def examine(robot: RobotName, *, host: str | None, setup: Path) -> list[Check]:
     checks = [_simulation()]
     for module, distribution, backend, purpose, advice in _PACKAGES:
         checks.append(_package(module, distribution, purpose, advice, needed=backend == robot))
-    real = robot in ("panda", "fr3")
-    checks += [_compiler(), _kernel(real=real), _priority(real=real), _cameras()]
-    checks.append(_calibration(setup, needed=robot in ("panda", "fr3", "frankapy")))
+    networked = robot in NETWORKED_ROBOTS
+    checks += [_compiler(), _kernel(needed=networked), _priority(needed=networked), _cameras()]
+    checks.append(_calibration(setup, needed=robot in REAL_ROBOTS))
     if host is not None:
         checks += [_network(host), _robot(robot, host)]
-    elif robot in ("panda", "fr3"):
+    elif networked:
         advice = "name it with --host; it is read and not moved"
         checks.append(Check("robot", False, False, "not asked", advice))
     return checks
@@ -171,7 +171,7 @@ def _network(host: str) -> Check:
     return Check("network", ok, False, found, advice)
 
 
-def _priority(*, real: bool) -> Check:
+def _priority(*, needed: bool) -> Check:
     """Whether a process may have real-time priority, which the vendor's control loop asks for."""
     code, _, complaint = _run((sys.executable, "-c", _TAKE_PRIORITY), _IMPORT_LIMIT)
     found = "may be had" if code == 0 else f"refused: {complaint}"
@@ -179,7 +179,7 @@ def _priority(*, real: bool) -> Check:
         "without it a busy machine stops the arm; as root put `USER - rtprio 99` into "
         "/etc/security/limits.d/99-realtime.conf, with your name for USER, and log in again"
     )
-    return Check("real-time priority", code == 0 or not real, False, found, advice)
+    return Check("real-time priority", code == 0 or not needed, False, found, advice)
 
 
 def _compiler() -> Check:
@@ -190,7 +190,7 @@ def _compiler() -> Check:
     return Check("C compiler", path is not None, False, path or "none", advice)
 
 
-def _kernel(*, real: bool) -> Check:
+def _kernel(*, needed: bool) -> Check:
     """A real-time kernel is not needed to connect, but without it the robot stops now and then."""
     realtime = Path("/sys/kernel/realtime")
     ok = realtime.is_file() and realtime.read_text().strip() == "1"
@@ -199,7 +199,7 @@ def _kernel(*, real: bool) -> Check:
         "expect communication_constraints_violation; install a PREEMPT_RT kernel and connect the "
         "robot to a network card of its own"
     )
-    return Check("kernel", ok or not real, False, found, advice)
+    return Check("kernel", ok or not needed, False, found, advice)
 
 
 def _cameras() -> Check:
@@ -234,7 +234,7 @@ def _robot(robot: RobotName, host: str) -> Check:
     from ..rig.config import RigConfig
     from ..rig.rig import open_robot
 
-    backend: RobotName = robot if robot in ("panda", "fr3", "frankapy") else "panda"
+    backend: RobotName = robot if robot in REAL_ROBOTS else "panda"
     config = RigConfig(robot=backend, host=host, execute=True)
     try:
         with open_robot(config) as connected:

@@ -20,7 +20,7 @@ from ..calibration.reach import check_workplace
 from ..calibration.workplace import Workplace
 from ..cameras.camera import CameraIntrinsics
 from ..episodes.operators import until_cleared
-from ..rig.config import REAL_ROBOTS, RigConfig
+from ..rig.config import REAL_ROBOTS, SILENT_LENSES, RigConfig
 from ..rig.rig import open_robot, read_intrinsics, read_table
 from ..rig.workplace import workplace_of
 from ..support.json_file import read_json, read_numbers
@@ -111,8 +111,10 @@ def keep(config: RigConfig, calibration: Calibration) -> Path:
 
 
 def lens_of(config: RigConfig) -> CameraIntrinsics | None:
-    """Intrinsics of a video device; other cameras tell their own."""
-    return read_intrinsics(config.setup / "lens.json") if config.camera == "uvc" else None
+    """Return the measured intrinsics of a camera that does not tell its own; None for others."""
+    if config.camera not in SILENT_LENSES:
+        return None
+    return read_intrinsics(config.setup / "lens.json")
 
 
 def make_calibration(

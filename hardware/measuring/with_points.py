@@ -26,7 +26,7 @@ from ..arm.table_plane import TablePlane
 from ..calibration.homography import MIN_POINTS, HomographyFit, solve_homography
 from ..cameras.camera import Camera, CameraIntrinsics
 from ..episodes.goals import write_picture
-from ..rig.config import REAL_ROBOTS, RigConfig
+from ..rig.config import NETWORKED_ROBOTS, REAL_ROBOTS, RigConfig
 from ..rig.rig import open_camera
 from ..rig.workplace import workplace_of
 from .measurement_file import MeasurementFile, gather
@@ -134,7 +134,8 @@ def points_from_file(
         PoorFit: they do not fit together to 3 mm rms
         CameraError: the camera fails
     """
-    if config.robot not in REAL_ROBOTS or (config.host is None and config.robot != "frankapy"):
+    without_address = config.robot in NETWORKED_ROBOTS and config.host is None
+    if config.robot not in REAL_ROBOTS or without_address:
         raise InputError("whose are the points? give --robot and --host, as later for run")
     table = touched_table(config)
     intrinsics = lens_of(config)

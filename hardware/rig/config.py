@@ -11,7 +11,9 @@ from tyro.conf import arg
 from warp_deform.support.flag_range import SEED, FlagRange
 
 __all__ = [
+    "NETWORKED_ROBOTS",
     "REAL_ROBOTS",
+    "SILENT_LENSES",
     "AgentName",
     "CameraName",
     "HomeFlag",
@@ -37,6 +39,10 @@ WorkspaceFlag = Annotated[
 
 REAL_ROBOTS: tuple[RobotName, ...] = ("panda", "fr3", "frankapy")
 """Those that are outside of this process."""
+NETWORKED_ROBOTS: tuple[RobotName, ...] = ("panda", "fr3")
+"""Those of them whose control box is spoken to directly, at `RigConfig.host`."""
+SILENT_LENSES: tuple[CameraName, ...] = ("uvc",)
+"""Cameras that do not tell their intrinsics: `calibrate lens` measures them."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import assert_never
 
 import numpy as np
 
@@ -137,7 +138,8 @@ def open_robot(
         InputError: a real robot without an address
         ConnectionFailed: it cannot be reached, or the vendor's package is missing
     """
-    if config.robot == "sim":
+    name = config.robot
+    if name == "sim":
         from ..twin.robot import SimRobot, SimRobotConfig
 
         if world is None:
@@ -145,22 +147,24 @@ def open_robot(
         return SimRobot(
             world, SimRobotConfig() if home_q is None else SimRobotConfig(q=tuple(home_q))
         )
-    if config.robot == "dry_run" or not config.execute:
+    if name == "dry_run" or not config.execute:
         start = DryRunConfig() if home_q is None else DryRunConfig(q=tuple(home_q))
         return DryRunRobot(start, on_command=_tell)
-    if config.robot == "frankapy":
+    if name == "frankapy":
         from ..backends.frankapy import FrankapyRobot
 
         return FrankapyRobot()
     if config.host is None:
         raise InputError(f"--robot {config.robot} needs --host, the address of its control box")
-    if config.robot == "panda":
+    if name == "panda":
         from ..backends.panda import PandaRobot
 
         return PandaRobot(NetworkedConfig(host=config.host))
-    from ..backends.fr3 import FR3Robot
+    if name == "fr3":
+        from ..backends.fr3 import FR3Robot
 
-    return FR3Robot(NetworkedConfig(host=config.host))
+        return FR3Robot(NetworkedConfig(host=config.host))
+    assert_never(name)
 
 
 def _tell(command: RecordedCommand) -> None:
@@ -186,7 +190,10 @@ def open_camera(config: RigConfig, intrinsics: CameraIntrinsics | None) -> Camer
         InputError: what it needs to know is missing
         CameraError: it cannot be opened
     """
-    if config.camera == "file":
+    name = config.camera
+    if name == "sim":
+        raise InputError("the camera sim exists in simulation alone")
+    if name == "file":
         if config.frames is None or intrinsics is None:
             raise InputError("--camera file needs --frames, and a calibration in --setup")
         if config.real:
@@ -194,21 +201,21 @@ def open_camera(config: RigConfig, intrinsics: CameraIntrinsics | None) -> Camer
                 "--camera file shows recorded pictures; a robot that moves needs a live camera"
             )
         return FileCamera(config.frames, intrinsics)
-    if config.camera == "uvc":
+    if name == "uvc":
         from ..cameras.uvc import UVCCamera
 
         if intrinsics is None:
             raise InputError("--camera uvc needs intrinsics: warp-deform franka calibrate lens")
         return UVCCamera(intrinsics, index=_number(config.device))
-    if config.camera == "realsense":
+    if name == "realsense":
         from ..cameras.realsense import RealSenseCamera
 
         return RealSenseCamera(serial=config.device)
-    if config.camera == "azure-kinect":
+    if name == "azure-kinect":
         from ..cameras.azure_kinect import AzureKinectCamera
 
         return AzureKinectCamera(device_id=_number(config.device))
-    raise InputError(f"the camera {config.camera} exists in simulation alone")
+    assert_never(name)
 
 
 def _number(device: str | None) -> int:
