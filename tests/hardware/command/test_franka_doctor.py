@@ -99,11 +99,11 @@ def test_a_host_is_pinged_and_no_other(folder: Path, monkeypatch: pytest.MonkeyP
 
 def test_real_time_priority(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_run", lambda command, limit: (1, "", "PermissionError: [1]"))
-    check = doctor._priority(real=True)
+    check = doctor._priority(needed=True)
     assert not check.ok and "refused: PermissionError" in check.found and "rtprio" in check.advice
-    assert doctor._priority(real=False).ok, "only a real arm needs it"
+    assert doctor._priority(needed=False).ok, "only a real arm needs it"
     monkeypatch.setattr(doctor, "_run", lambda command, limit: (0, "", ""))
-    assert doctor._priority(real=True).ok
+    assert doctor._priority(needed=True).ok
 
 
 @pytest.mark.parametrize("name", ["cc", "gcc", "clang"])
