@@ -248,7 +248,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         lower_start: wp.array(dtype=S)  # between these times contact ends the descent [s]
         lower_end: wp.array(dtype=S)
         shift: wp.array(dtype=R3)  # added to the path once contact has ended the descent
-        push: wp.array(dtype=int)  # local number of a perturbed particle or -1, PUSHES a slot
+        push: wp.array(dtype=int)  # local number of a pushed particle or -1, MOST_PUSHES a world
         push_acceleration: wp.array(dtype=R3)  # [m/s^2]
         push_steps: wp.array(dtype=int)
 
@@ -300,7 +300,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         xp: wp.array(dtype=V3)  # by position at the start of the substep
         w: wp.array(dtype=V)  # not a derivative: inverse masses as they were in the substep
         mass: wp.array(dtype=V)  # by free inverse mass
-        damping: wp.array(dtype=V)  # by the share of velocity kept; per group, as those below
+        damping: wp.array(dtype=V)  # by `Pace.damping_factor`; per group, as those below
         table_friction: wp.array(dtype=V)
         contact_friction: wp.array(dtype=V)
         stiffness: wp.array(dtype=V)  # by 1 / (stiffness dt^2)

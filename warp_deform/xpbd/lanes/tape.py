@@ -1,8 +1,8 @@
 """The tape of a differentiated rollout, and how often constraints of each kind acted on it.
 
-A taped launch pushes what the derivative of each constraint needs (its inputs, as differences where
-those suffice) onto one of four stacks of its group: V3, V, whole numbers, and scalars of one lane.
-Constraints that always act push no more; those that act now and then push who they were as well,
+A taped launch leaves what the derivative of each constraint needs (its inputs, as differences where
+those suffice) on one of four stacks of its group: V3, V, whole numbers, and scalars of one lane.
+Constraints that always act leave no more; those that act now and then leave who they were as well,
 numbered within their world, and every phase of a substep ends with their number. The backward sweep
 pops in reverse, so it finds the very inputs, and takes the very branches, of the forward pass.
 Nothing else of the state is needed: the sweep restores none.

@@ -73,9 +73,13 @@ class Sheets:
         sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
         meeting = np.unique(np.sort(sides[self.edge_gap[sides].min(axis=1) > 0], axis=1), axis=0)
         return {
-            "sheet_triangle": local[triangles], "sheet_friction": self.friction[mine],
-            "sheet_skin": self.skin[ids], "sheet_rest": self.rest[ids],
-            "sheet_owner": self.owner[ids], "sheet_exclusion": self.exclusion[ids],
-            "sheet_edge": local[meeting], "sheet_edge_gap": self.edge_gap[ids],
+            "sheet_triangle": local[triangles],
+            "sheet_friction": self.friction[mine],
+            "sheet_skin": self.skin[ids],
+            "sheet_rest": self.rest[ids],
+            "sheet_owner": self.owner[ids],
+            "sheet_exclusion": self.exclusion[ids],
+            "sheet_edge": local[meeting],
+            "sheet_edge_gap": self.edge_gap[ids],
             "sheet_cell": float(np.median(edges)),
-        }  # fmt: skip
+        }

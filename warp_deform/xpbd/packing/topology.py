@@ -160,10 +160,11 @@ def _refuse_unsupported(model: newton.Model) -> None:
     """Raise for content that would otherwise be left out without a word."""
     for what, amount in (
         ("tetrahedra", model.tet_count),
-        ("bending edges", model.edge_count), ("muscles", model.muscle_count),
+        ("bending edges", model.edge_count),
+        ("muscles", model.muscle_count),
         ("tendons", model.tendon_count),
         ("particles attached to bodies", model.attachment_particle_body_count),
-    ):  # fmt: skip
+    ):
         if amount:
             raise InputError(f"SolverFusedXPBD does not simulate {what} ({amount} in the model)")
     if model.shape_count:
@@ -228,12 +229,15 @@ class _Springs:
         if not np.isin(self.middle[bent], ids).all():
             raise InputError("a BEND spring needs spring_middle, a particle of its own world")
         return {
-            "spring_ij": local[self.ij[mine]], "spring_length": self.length[mine],
-            "spring_compliance": self.compliance[mine], "spring_limit": self.limit[mine],
+            "spring_ij": local[self.ij[mine]],
+            "spring_length": self.length[mine],
+            "spring_compliance": self.compliance[mine],
+            "spring_limit": self.limit[mine],
             "spring_floor": self.floor[mine],
-            "spring_mode": self.mode[mine], "spring_watched": self.watched[mine],
+            "spring_mode": self.mode[mine],
+            "spring_watched": self.watched[mine],
             "spring_middle": local[self.middle[mine]],
-        }  # fmt: skip
+        }
 
 
 class _Shapes:
