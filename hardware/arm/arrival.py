@@ -87,10 +87,10 @@ def pressed_contact(
     """
     line = target[:3, 3] - start[:3, 3]
     length = max(float(np.linalg.norm(line)), 1e-9)
-    done = float((state.base_T_tcp[:3, 3] - start[:3, 3]) @ line) / length
-    aside = np.linalg.norm(state.base_T_tcp[:3, 3] - start[:3, 3] - done * line / length)
+    advance = float((state.base_T_tcp[:3, 3] - start[:3, 3]) @ line) / length
+    aside = np.linalg.norm(state.base_T_tcp[:3, 3] - start[:3, 3] - advance * line / length)
     force = -float(state.force_N[:3] @ line) / length
-    on_line = 0.0 <= done <= length and aside <= _SLIDE
+    on_line = 0.0 <= advance <= length and aside <= _SLIDE
     if state.mode != RobotMode.IDLE or not on_line or force < _PRESSING * stop_force_N:
         return None
     return MoveResult(state.base_T_tcp, contact=True)

@@ -81,8 +81,10 @@ def camera_pose(calibration: Calibration) -> np.ndarray:
     centre = [np.mean(calibration.workplace.x), np.mean(calibration.workplace.y), 1.0]
     columns = columns / math.copysign(float(scale), float(columns[2] @ centre))
     normal = np.cross(ex, ey)
-    seen = np.column_stack([columns[:, 0], columns[:, 1], np.cross(columns[:, 0], columns[:, 1])])
-    u, _, v = np.linalg.svd(seen @ np.linalg.inv(np.column_stack([ex, ey, normal])))
+    directions = np.column_stack(
+        [columns[:, 0], columns[:, 1], np.cross(columns[:, 0], columns[:, 1])]
+    )
+    u, _, v = np.linalg.svd(directions @ np.linalg.inv(np.column_stack([ex, ey, normal])))
     camera_R_base = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
     pose = np.eye(4)
     pose[:3, :3] = camera_R_base.T
@@ -119,10 +121,10 @@ def _shows(calibration: Calibration, base_T_camera: np.ndarray) -> bool:
     xy = _rim(calibration.workplace)
     points = np.column_stack([xy, calibration.table.z(xy)])
     camera_T_base = np.linalg.inv(base_T_camera)
-    seen = points @ camera_T_base[:3, :3].T + camera_T_base[:3, 3]
-    if seen[:, 2].min() <= 0.0:
+    in_camera = points @ camera_T_base[:3, :3].T + camera_T_base[:3, 3]
+    if in_camera[:, 2].min() <= 0.0:
         return False
-    straight = seen @ calibration.intrinsics.matrix.T
+    straight = in_camera @ calibration.intrinsics.matrix.T
     pixels = calibration.intrinsics.distort(straight[:, :2] / straight[:, 2:])
     return bool(_beyond(pixels, calibration.intrinsics.size).max() <= -_MARGIN_PX)
 

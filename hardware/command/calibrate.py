@@ -210,8 +210,8 @@ def _empty(options: EmptyOptions) -> Outcome:
 
 def _outcome(data: Mapping[str, Any]) -> Outcome:
     """What was measured, and as text what of it fits on a line each."""
-    said = {key: value for key, value in data.items() if not isinstance(value, list)}
-    return Outcome(data=data, text="\n".join(f"{key}  {value}" for key, value in said.items()))
+    figures = {key: value for key, value in data.items() if not isinstance(value, list)}
+    return Outcome(data=data, text="\n".join(f"{key}  {value}" for key, value in figures.items()))
 
 
 CALIBRATE: dict[type, Callable[[Any], Outcome]] = {

@@ -130,9 +130,9 @@ def _package(module: str, distribution: str, purpose: str, advice: str, *, neede
     except importlib.metadata.PackageNotFoundError:
         version = "of unknown version"
     # Found is not loaded: a library of the system, or a numpy that fits, may be missing.
-    code, _, said = _run((sys.executable, "-c", f"import {module}"), _IMPORT_LIMIT)
+    code, _, complaint = _run((sys.executable, "-c", f"import {module}"), _IMPORT_LIMIT)
     if code != 0:
-        found = f"{version}, but does not load: {said}"
+        found = f"{version}, but does not load: {complaint}"
         return Check(distribution, False, needed, found, advice)
     return Check(distribution, True, needed, f"{version} ({purpose})", "")
 
@@ -140,15 +140,15 @@ def _package(module: str, distribution: str, purpose: str, advice: str, *, neede
 def _run(command: tuple[str, ...], limit_s: float) -> tuple[int, str, str]:
     """Return exit code, output and the last line of complaint of a command."""
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             command, capture_output=True, text=True, timeout=limit_s, stdin=subprocess.DEVNULL
         )
     except subprocess.TimeoutExpired:
         return 1, "", f"no end in {limit_s:g} s"
     except OSError as error:
         return 1, "", str(error.strerror)
-    complaint = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-    return done.returncode, done.stdout, complaint[-1].strip()
+    complaint = process.stderr.strip().splitlines() or [f"exit code {process.returncode}"]
+    return process.returncode, process.stdout, complaint[-1].strip()
 
 
 def _network(host: str) -> Check:
@@ -157,9 +157,9 @@ def _network(host: str) -> Check:
         "connect the robot's control box to a network card of its own, by cable, and turn that "
         "card's power saving off; a camera belongs on another"
     )
-    _, said, complaint = _run((*_PING, host), _PING_LIMIT)
-    lost = re.search(r"(\d+(?:\.\d+)?)% packet loss", said)
-    times = re.search(r"= [\d.]+/([\d.]+)/([\d.]+)(?:/[\d.]+)? ms", said)
+    _, report, complaint = _run((*_PING, host), _PING_LIMIT)
+    lost = re.search(r"(\d+(?:\.\d+)?)% packet loss", report)
+    times = re.search(r"= [\d.]+/([\d.]+)/([\d.]+)(?:/[\d.]+)? ms", report)
     if lost is None:
         missing = "see whether the name is right, and install ping (apt install iputils-ping)"
         return Check("network", False, False, f"not measured: {complaint}", missing)

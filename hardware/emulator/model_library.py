@@ -177,9 +177,9 @@ def model_library() -> ModelLibrary:
         try:
             subprocess.run(command, check=True, capture_output=True, text=True, timeout=_COMPILING)
         except subprocess.CalledProcessError as error:
-            said = error.stderr.strip().splitlines() or [f"exit code {error.returncode}"]
+            complaint = error.stderr.strip().splitlines() or [f"exit code {error.returncode}"]
             raise CompilerMissing(
-                f"{compiler} does not compile the robot's model library: {said[-1].strip()}; "
+                f"{compiler} does not compile the robot's model library: {complaint[-1].strip()}; "
                 f"{_INSTALL}"
             ) from error
         except (OSError, subprocess.TimeoutExpired) as error:

@@ -266,17 +266,17 @@ class _Episode:
                 return "stopped"
             until_cleared(self.robot, self.operator, self.robot.home)
         while True:
-            done = len(self.outcomes)
-            frame, view, mask = self._look() if done else self._look_at_start()
+            actions = len(self.outcomes)
+            frame, view, mask = self._look() if actions else self._look_at_start()
             self.masks.append(mask)
-            last = self.outcomes[-1] if done else None
-            seen = Observation(done, view, mask, self.goal, last)
+            last = self.outcomes[-1] if actions else None
+            seen = Observation(actions, view, mask, self.goal, last)
             self._record(frame, seen)
             overlap = self._overlap(mask)
             solved = overlap > SUCCESS_IOU
-            if solved and not done:
+            if solved and not actions:
                 raise StartAtGoal(overlap)
-            if done >= self.config.max_actions or (solved and self.config.until_success):
+            if actions >= self.config.max_actions or (solved and self.config.until_success):
                 return "success" if self._succeeded() else "limit"
             action = self._choose(seen)
             if action is None:

@@ -74,9 +74,9 @@ def open_arm(config: RigConfig, table: TablePlane) -> SafeRobot:
         raise InputError("this calibration moves an arm: give --robot panda and --execute")
     workplace = workplace_of(config)
     limits = workplace.limits(table, max_joint_speed=config.joint_speed)
-    part = check_workplace(workplace, limits)
-    if part is not None:
-        print(part, file=sys.stderr, flush=True)
+    warning = check_workplace(workplace, limits)
+    if warning is not None:
+        print(warning, file=sys.stderr, flush=True)
     return SafeRobot(open_robot(config), limits, home_q=workplace.home_q)
 
 

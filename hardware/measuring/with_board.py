@@ -283,13 +283,15 @@ def measure_hand_eye(
             raise InputError("stopped before all views were taken")
 
         def fit(taken: list[HandView]) -> HandEye:
-            seen = []
+            camera_T_boards = []
             for index, view in enumerate(taken):
                 try:
-                    seen.append(board_pose(view.corners, board, intrinsics))
+                    camera_T_boards.append(board_pose(view.corners, board, intrinsics))
                 except InputError as error:  # of a kept view, after another lens
                     raise PoorFit(f"view {index + 1}: {error}", worst=index) from error
-            return calibrate_hand_eye(np.array([v.base_T_tcp for v in taken]), np.array(seen))
+            return calibrate_hand_eye(
+                np.array([v.base_T_tcp for v in taken]), np.array(camera_T_boards)
+            )
 
         with measured.guarded():
             hand_eye = gather(measured, wanted=views, take=take, fit=fit, operator=operator)

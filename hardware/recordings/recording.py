@@ -77,8 +77,8 @@ class Recording:
             if rows is None:
                 raise InputError(f"{what}: kind {step.get('kind')!r} is unknown")
             # Observation, plan, action, observation, ...: all three belong to the first of them.
-            seen = len(observations) - len(actions)
-            if kind == before or seen != (0 if rows is observations else 1):
+            without_action = len(observations) - len(actions)
+            if kind == before or without_action != (0 if rows is observations else 1):
                 raise InputError(f"{what}: two {kind}s in a row; lines are missing")
             due = len(observations if rows is observations else actions)
             if require(step, "index", int, what=what) != due:

@@ -102,8 +102,8 @@ def open_rig(config: RigConfig) -> Iterator[Rig]:
             camera = open_camera(config, calibration.intrinsics)
         stack.enter_context(camera)
         empty = config.setup / "empty_view.png"
-        seen = config.camera != "sim" and empty.is_file()
-        picture = read_image(empty, color=True) if seen else None
+        has_empty = config.camera != "sim" and empty.is_file()
+        picture = read_image(empty, color=True) if has_empty else None
         workplace = calibration.workplace
         limits = workplace.limits(calibration.table, max_joint_speed=config.joint_speed)
         backend = open_robot(config, world=world, home_q=calibration.home_q)
@@ -123,9 +123,9 @@ def _check_simulated(calibration: Calibration) -> None:
         InputError: out of reach, or out of the simulated camera's picture
     """
     limits = calibration.workplace.limits(calibration.table)
-    part = check_workplace(calibration.workplace, limits)
-    if part is not None:
-        print(part, file=sys.stderr, flush=True)
+    warning = check_workplace(calibration.workplace, limits)
+    if warning is not None:
+        print(warning, file=sys.stderr, flush=True)
     check_picture(calibration, limits)
 
 
@@ -232,22 +232,22 @@ def read_calibration(config: RigConfig) -> Calibration:
             another robot, camera, home pose or workspace
     """
     calibration = Calibration.load(config.setup / "calibration.json")
-    theirs = calibration.workplace
+    workplace = calibration.workplace
     flags = "leave the flag out, or calibrate camera (or points, or hand) with it"
     stored = Workplace.load(config.setup)
-    again = "calibrate camera (or points, or hand) again"
+    calibrate_again = "calibrate camera (or points, or hand) again"
     for wanted, advice in (
-        (theirs.with_flags(config.home, config.workspace), flags),
-        (stored or theirs, again),
+        (workplace.with_flags(config.home, config.workspace), flags),
+        (stored or workplace, calibrate_again),
     ):
-        difference = theirs.difference(wanted)
+        difference = workplace.difference(wanted)
         if difference is not None:
             raise InputError(f"the calibration in {config.setup} is of {difference}; {advice}")
     touched = config.setup / "table.json"
     if touched.is_file() and read_table(touched) != calibration.table:
         raise InputError(
             f"{touched} and the calibration hold different tables, so the safety floor would be "
-            f"wrong; {again}"
+            f"wrong; {calibrate_again}"
         )
     if config.robot in REAL_ROBOTS:
         pairs = [("robot", "--robot and --host", calibration.robot_id, config.robot_id)]

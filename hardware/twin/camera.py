@@ -199,19 +199,19 @@ class SimCamera(Closing):
         for point, wide in zip(np.rint(large * 2**_BITS).astype(int), widths, strict=True):
             radius = round(0.33 * float(wide) * _SAMPLES * 2**_BITS)
             cv2.circle(spots, point.tolist(), radius, 255, -1, cv2.LINE_8, _BITS)
-        part = image[low[1] : high[1], low[0] : high[0]]
+        patch = image[low[1] : high[1], low[0] : high[0]]
         dark = np.multiply(config.chain, 0.8)
         for mask, color in ((strand, dark), (spots, np.array(config.chain))):
             small = cv2.resize(mask, (high - low).tolist(), interpolation=cv2.INTER_AREA)
             share = small.astype(np.float32)[..., None] / 255.0
-            part += share * (color.astype(np.float32) - part)
+            patch += share * (color.astype(np.float32) - patch)
         return image
 
     def _project(self, points: np.ndarray, base_T_tcp: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return columns, rows (n, 2) [px] and depths [m] of points (n, 3) in the base frame."""
         camera_T_base = np.linalg.inv(base_T_tcp @ self.config.tcp_T_camera)
-        seen = points @ camera_T_base[:3, :3].T + camera_T_base[:3, 3]
-        if not seen[:, 2].min() > _NEAREST:
+        in_camera = points @ camera_T_base[:3, :3].T + camera_T_base[:3, 3]
+        if not in_camera[:, 2].min() > _NEAREST:
             raise CameraError("the camera is too low to see the workspace; go to the home pose")
-        pixels = seen @ self._intrinsics.matrix.T
-        return pixels[:, :2] / pixels[:, 2:], seen[:, 2]
+        pixels = in_camera @ self._intrinsics.matrix.T
+        return pixels[:, :2] / pixels[:, 2:], in_camera[:, 2]

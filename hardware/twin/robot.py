@@ -209,9 +209,9 @@ class SimRobot(Closing):
         count = max(int(np.ceil((clock[-1] + ramp) / self.config.dt)), 1)
         t = np.linspace(0.0, clock[-1] + ramp, count + 1)[1:]
         end = clock[-1] + ramp
-        begun = np.where(t < ramp, 0.5 * t**2 / ramp, t - 0.5 * ramp)
+        rising = np.where(t < ramp, 0.5 * t**2 / ramp, t - 0.5 * ramp)
         left = end - t
-        way = np.where(left < ramp, clock[-1] - 0.5 * left**2 / ramp, begun)
-        q = np.column_stack([np.interp(way, clock, path[:, j]) for j in range(7)])
+        progress = np.where(left < ramp, clock[-1] - 0.5 * left**2 / ramp, rising)
+        q = np.column_stack([np.interp(progress, clock, path[:, j]) for j in range(7)])
         q[-1] = path[-1]
         return list(zip(q, self._arm.poses(q), strict=True))

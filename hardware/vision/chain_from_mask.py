@@ -43,8 +43,8 @@ def estimate_chain(mask: np.ndarray, view: TopDownView, beads: int) -> np.ndarra
         line = _prolonged(line, mask)[::-1]
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    at = np.linspace(0.0, along[-1], beads)
-    even = np.stack([np.interp(at, along, line[:, k]) for k in range(2)], axis=1)
+    even_along = np.linspace(0.0, along[-1], beads)
+    even = np.stack([np.interp(even_along, along, line[:, k]) for k in range(2)], axis=1)
     return view.pixel_to_base(even)
 
 

@@ -89,7 +89,7 @@ class TopDownView:
         Raises:
             InputError: part of the workspace is outside of the picture
         """
-        seen = _samples(self, projection, supersample)
+        sample_pixels = _samples(self, projection, supersample)
         height, width = image.shape[:2]
         if (width, height) != projection.picture_size:
             raise InputError(
@@ -97,14 +97,16 @@ class TopDownView:
                 f"{projection.picture_size[0]} x {projection.picture_size[1]}"
             )
         # Half a pixel beyond the outer centres still belongs to the picture.
-        outside = (seen < -0.5) | (seen > (width - 0.5, height - 0.5))
+        outside = (sample_pixels < -0.5) | (sample_pixels > (width - 0.5, height - 0.5))
         if outside.any():
             share = float(outside.any(axis=-1).mean())
             raise InputError(
                 f"{100 * share:.1f} % of the workspace is outside of the camera's picture; choose "
                 "another home pose or a smaller workspace, and calibrate anew"
             )
-        big = cv2.remap(image, seen, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        big = cv2.remap(
+            image, sample_pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         size = self.shape[::-1]
         return np.asarray(cv2.resize(big, size, interpolation=cv2.INTER_AREA))
 
@@ -119,6 +121,6 @@ def _samples(view: TopDownView, projection: Projection, supersample: int) -> np.
     rows, columns = (n * supersample for n in view.shape)
     grid = np.moveaxis(np.indices((rows, columns)), 0, -1).reshape(-1, 2)
     xy = view.pixel_to_base((grid + 0.5) / supersample - 0.5)
-    seen = projection.base_to_pixel(xy).astype(np.float32).reshape(rows, columns, 2)
-    seen.flags.writeable = False
-    return seen
+    sample_pixels = projection.base_to_pixel(xy).astype(np.float32).reshape(rows, columns, 2)
+    sample_pixels.flags.writeable = False
+    return sample_pixels
