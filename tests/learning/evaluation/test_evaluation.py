@@ -6,8 +6,6 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,17 +15,11 @@ from fixtures.training_samples import write_demonstrations
 from learning.evaluation import snapshot as evaluating
 from learning.evaluation.failures import (
     FAILURES,
-    bag_holds_items,
-    bag_opening,
-    closed,
-    failure,
-    puts_back,
 )
-from learning.evaluation.play import PlayedEpisode, goal_distance
+from learning.evaluation.play import goal_distance
 from learning.evaluation.protocol import Protocol
 from learning.evaluation.run import evaluate_run
 from learning.evaluation.snapshot import evaluate_snapshot, is_evaluated
-from learning.evaluation.summary import Evaluation, best, summarise
 from learning.policy.policy import load_policy
 from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
@@ -38,9 +30,6 @@ from warp_deform.collecting.make_goals import make_goals
 from warp_deform.command.main import main
 from warp_deform.episodes import EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
-from warp_deform.tasks.bag_items import BagItems1
-from warp_deform.tasks.cable_line import CableLineNotarget
-from warp_deform.worlds.loop import EpisodeRun
 
 TASK = "cable-line-notarget"
 SCHEDULE = Schedule(steps=2, batch=4, lr=1e-3, snapshots=2)
@@ -61,64 +50,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     )
     train(config)
     return RunFolder(root / "run")
-
-
-def played(scores: list[float], successes: int) -> list[PlayedEpisode]:
-    return [
-        PlayedEpisode(seed, seed < successes, score, 3 + seed, "solved")
-        for seed, score in enumerate(scores)
-    ]
-
-
-def test_a_summary_is_what_the_textbook_says() -> None:
-    summary = summarise(played([1.0] * 15 + [0.5] * 5, 15), task=TASK)
-    assert summary["n_episodes"] == 20 and summary["n_success"] == 15
-    # Wilson's interval for 15 of 20, in closed form
-    n, p, z = 20, 0.75, 1.959963984540054
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-    assert summary["pc_success_ci95"] == pytest.approx(
-        [100 * (centre - half), 100 * (centre + half)]
-    )
-    assert summary["mean_score"] == pytest.approx(0.875)
-    assert summary["standard_error"] == pytest.approx(
-        np.std([1] * 15 + [0.5] * 5, ddof=1) / 20**0.5
-    )
-    assert summary["mean_actions"] == pytest.approx(12.5)
-    assert summary["mean_actions_solved"] == pytest.approx(10.0)
-
-
-@pytest.mark.parametrize(("task", "value"), [(TASK, 87.5), ("cable-ring", 75.0)])
-def test_the_papers_value_is_partial_credit_for_some_tasks(task: str, value: float) -> None:
-    assert summarise(played([1.0] * 15 + [0.5] * 5, 15), task=task)["paper_value"] == value
-
-
-def test_successes_whose_items_the_bag_enclosed_are_counted_apart() -> None:
-    plain = played([1.0, 1.0, 1.0, 0.1], 3)
-    ends = (True, False, None, True)  # of the third the physics was not trusted
-    episodes = [replace(each, enclosed=held) for each, held in zip(plain, ends, strict=True)]
-    summary = summarise(episodes, task="bag-items-1")
-    assert (summary["n_success"], summary["n_success_enclosed"]) == (3, 1)
-    assert summarise(plain, task="bag-items-1")["n_success_enclosed"] is None
-
-
-def test_without_successes_and_with_one_episode() -> None:
-    summary = summarise(played([0.25], 0), task=TASK)
-    assert summary["mean_actions_solved"] is None and summary["standard_error"] is None
-    assert summary["pc_success_ci95"][0] == pytest.approx(0.0, abs=1e-9)
-    json.dumps(summary, allow_nan=False)
-
-
-def test_the_best_snapshot_counts_what_the_task_counts() -> None:
-    def made(step: int, scores: list[float], successes: int) -> Evaluation:
-        episodes = tuple(played(scores, successes))
-        return Evaluation(step, episodes, summarise(episodes, task=TASK))
-
-    evaluations = [made(1, [0.9, 0.9], 0), made(2, [1.0, 0.1], 1), made(3, [0.9, 0.9], 0)]
-    assert best(evaluations, task=TASK).step == 3, "of equals the latest"
-    assert best(evaluations, task="cable-ring").step == 2
-    hasty = replace(evaluations[0], summary={**evaluations[0].summary, "mean_actions": 1.0})
-    assert best([hasty, *evaluations[1:]], task=TASK).step == 1, "of equals that with fewer actions"
 
 
 def test_splits_do_not_overlap_with_training_or_each_other() -> None:
@@ -302,96 +233,6 @@ def test_distance_to_the_goal() -> None:
     assert goal_distance(color, color) == 0.0
     assert goal_distance(color - 1, color) == goal_distance(color + 1, color)
     assert goal_distance(color + 3, color) == pytest.approx(3 * math.sqrt(24) / 24)
-
-
-def action(pick: tuple[float, float], place: tuple[float, float], lift: float = 0.05) -> np.ndarray:
-    return np.array([*pick, 0.0, *place, 0.0, lift])
-
-
-THERE = action((0.5, 0.0), (0.6, 0.2))
-BACK = action((0.61, 0.21), (0.5, 0.02))
-ELSEWHERE = action((0.3, -0.3), (0.4, 0.4))
-
-
-@pytest.mark.parametrize(
-    ("actions", "expected"),
-    [
-        ([THERE, BACK, THERE], True),
-        ([THERE, BACK], False),
-        ([THERE, THERE, THERE], False),
-        ([THERE, BACK, ELSEWHERE, BACK], False),
-        ([THERE, ELSEWHERE] * 3, False),
-        ([], False),
-    ],
-)
-def test_actions_that_put_back(actions: list[np.ndarray], expected: bool) -> None:
-    assert puts_back(actions) is expected
-
-
-def test_an_opening_that_was_closed_for_good() -> None:
-    assert closed([0.6, 0.3, 0.3], [True, True])
-    assert not closed([0.6, 0.3, 0.5], [True, True]), "it was opened again"
-    assert not closed([0.6, 0.3], [False]), "a carry closes any bag"
-    assert closed([0.6, 0.3, 0.1], [True, False])
-    assert not closed([0.6], [])
-
-
-class _Bag(BagItems1):
-    covered, inside = False, False
-
-    def hidden(self, *_: Any) -> bool:
-        return self.covered
-
-    def inside_bag(self, *_: Any) -> bool:
-        return self.inside
-
-
-@pytest.mark.parametrize(
-    ("expected", "lifts", "outcomes", "openings", "covered", "inside"),
-    [
-        ("missed grasp", [0.05, 0.05], ["missed", "placed"], [0.4] * 3, True, False),
-        ("missed grasp", [0.05, 0.05], ["unreachable", "missed"], [0.4] * 3, True, False),
-        ("destructive bag action", [0.05, 0.3], ["placed"] * 2, [0.6, 0.3, 0.3], True, False),
-        ("item not enclosed", [0.3, 0.4], ["placed"] * 2, [0.6, 0.6, 0.1], True, False),
-        ("opening covered", [0.05, 0.05], ["placed"] * 2, [0.3] * 3, True, False),
-        ("opening covered", [0.3, 0.4], ["placed"] * 2, [0.6, 0.6, 0.1], True, True),
-        ("other", [0.3, 0.4], ["placed"] * 2, [0.6, 0.6, 0.1], False, True),
-    ],
-)
-def test_failures_of_bags(
-    expected: str,
-    lifts: list[float],
-    outcomes: list[str],
-    openings: list[float],
-    covered: bool,
-    inside: bool,
-) -> None:
-    task = _Bag()
-    task.covered, task.inside = covered, inside
-    snapshot = SimpleNamespace(body_q=np.zeros((1, 7)))
-    episode = SimpleNamespace(physics_ok=True, snapshot=snapshot, layout=None)
-    worlds: Any = SimpleNamespace(task=task, episodes={0: episode})
-    run: EpisodeRun[Any] = EpisodeRun(0, np.random.default_rng(0))
-    run.actions = [action((0.3, 0.1 * n), (0.6, 0.0), lift) for n, lift in enumerate(lifts)]
-    run.outcomes, run.ended = outcomes, "not solved"
-    assert failure(worlds, 0, run, openings) == expected and expected in FAILURES
-    assert bag_holds_items(worlds, 0) is inside
-    run.ended = "solved"
-    assert failure(worlds, 0, run, openings) is None
-    run.ended, episode.physics_ok = "physics: stretch", False
-    assert failure(worlds, 0, run, openings) == "physics"
-
-
-def test_failures_without_a_bag() -> None:
-    episode = SimpleNamespace(physics_ok=True, snapshot=None, layout=None)
-    worlds: Any = SimpleNamespace(task=CableLineNotarget(), episodes={0: episode})
-    assert bag_opening(worlds, 0) is None and bag_holds_items(worlds, 0) is None
-    run: EpisodeRun[Any] = EpisodeRun(0, np.random.default_rng(0))
-    run.actions, run.outcomes = [THERE, BACK, THERE], ["placed"] * 3
-    run.ended = "not solved in 3 actions"
-    assert failure(worlds, 0, run, [None] * 4) == "back and forth"
-    run.actions = [ELSEWHERE] * 3
-    assert failure(worlds, 0, run, [None] * 4) == "other"
 
 
 def test_failures_are_counted(run: RunFolder) -> None:

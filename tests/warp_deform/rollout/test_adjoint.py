@@ -1,4 +1,4 @@
-"""The adjoint against finite differences and closed forms; its bits against storage and lanes."""
+"""The adjoint against finite differences; its bits against storage and lanes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fixtures.cloth_scenes import two_sheets_and_a_cable
-from fixtures.solver_scenes import LOOSE, G, add_particles, box_solver, finalize, ideal, new_builder
+from fixtures.solver_scenes import LOOSE, add_particles, box_solver, finalize, ideal, new_builder
 
 from warp_deform.errors import InputError
 from warp_deform.objects import BoxConfig, CableConfig, add_box, add_cable, cable_line
@@ -227,59 +227,6 @@ def test_sleep_passes_nothing_on() -> None:
     set_state(solver, x, v)
     again = substep_vjp(solver, [0], one, one)
     assert again.counts() == asleep.counts(), "the one awake changed nothing for later ones"
-
-
-def test_stopping_distance_of_a_sliding_particle() -> None:
-    """The way v^2 / (2 mu g) has slopes v / (mu g) and -s / mu."""
-    builder, mu, speed = new_builder(), 0.4, 0.6
-    add_particles(builder, [[0.0, 0.0, 0.005]], velocities=[[speed, 0.0, 0.0]])
-    solver = finalize(builder, ideal(table_friction=mu), precision="float64")
-    run = DifferentiableRollout(solver)
-    end = run.forward([0], [0.3])[0, 0, 0, 0]
-    gradients = run.backward(np.array([[[[1.0, 0.0, 0.0]]]]))
-    assert end == pytest.approx(speed**2 / (2 * mu * G), rel=0.01)
-    assert gradients.velocities[0, 0, 0] == pytest.approx(speed / (mu * G), rel=0.02)
-    assert gradients.table_friction[0] == pytest.approx(-end / mu, rel=0.02)
-    assert gradients.positions[0, 0, 0] == pytest.approx(1.0, rel=1e-9)
-
-
-def test_mass_and_stiffness_of_a_hanging_particle() -> None:
-    """It rests m g / k below its pin: slopes g / k by mass, -m g / k by the factor on stiffness."""
-    builder, mass, stiffness, rest, drag = new_builder(), 0.1, 100.0, 0.2, 30.0
-    pull = G * (1 - drag * DT)  # drag slows what a substep adds, too
-    add_particles(
-        builder,
-        [[0.0, 0.0, 1.0], [0.0, 0.0, 0.79]],
-        masses=[0.0, mass],
-        links=[(0, 1, rest)],
-        stiffness=stiffness,
-    )
-    solver = finalize(builder, ideal(damping=drag), precision="float64")
-    run = DifferentiableRollout(solver)
-    end = run.forward([0], [1.5])
-    gradients = run.backward(np.array([[[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]]))
-    assert end[0, 0, 1, 2] == pytest.approx(1.0 - rest - mass * pull / stiffness, abs=1e-5)
-    by_mass = -gradients.inverse_masses[0, 1] / mass**2
-    assert by_mass == pytest.approx(-pull / stiffness, rel=1e-3)
-    assert gradients.stiffness[0] == pytest.approx(mass * pull / stiffness, rel=1e-3)
-    # the pin carries it
-    assert gradients.positions[0, 0, 2] == pytest.approx(1.0, rel=1e-3)
-    assert gradients.inverse_masses[0, 0] == 0.0
-
-
-def test_fall_through_air() -> None:
-    """With drag d, where a body falls to and its slopes are closed forms."""
-    builder, drag, end = new_builder(), 2.0, 0.5
-    add_particles(builder, [[0.0, 0.0, 5.0]])
-    solver = finalize(builder, ideal(damping=drag), precision="float64")
-    run = DifferentiableRollout(solver)
-    run.forward([0], [end])
-    gradients = run.backward(np.array([[[[0.0, 0.0, 1.0]]]]))
-    decay = np.exp(-drag * end)
-    fallen = G / drag**2 * (decay - 1 + drag * end)
-    by_drag = -2 * fallen / drag + G / drag**2 * (end - end * decay)
-    assert gradients.damping[0] == pytest.approx(-by_drag, rel=1e-2)
-    assert gradients.velocities[0, 0, 2] == pytest.approx((1 - decay) / drag, rel=5e-3)
 
 
 def test_pinned_particles_give_numbers() -> None:
