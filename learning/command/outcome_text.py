@@ -21,7 +21,7 @@ def interrupted(step: int) -> str:
 
 
 def trained(report: Mapping[str, Any], *, out: Path) -> str:
-    """What `train` came to: the fields of `training.TrainReport` and the folder."""
+    """What `train` came to: the fields of `train.TrainReport` and the folder."""
     steps, planned = report["steps"], report["planned_steps"]
     lines = {
         "run": str(out),

@@ -102,7 +102,7 @@ def film_episodes(
 ) -> list[Path]:
     """Write MP4s of each of the first `count` episodes of an evaluation; returns their paths.
 
-    `TASK_SEED.mp4` shows heat maps, `TASK_SEED_arm.mp4` the arm at work, as `filming.film` shows a
+    `TASK_SEED.mp4` shows heat maps, `TASK_SEED_arm.mp4` the arm at work, as `video.film` shows a
     demonstrator's; the latter is missing where no action was done or the physics failed, and
     without `arm`.
     They are played again, and have to come out as they did.

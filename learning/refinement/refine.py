@@ -77,7 +77,7 @@ class RefineConfig(RefineSettings):
 
     search: SearchConfig = field(default_factory=SearchConfig)
     """Its budget is per action. What an action that solves the task leaves of it goes into better
-    ones, whatever `search.polish` says."""
+    ones, whatever `SearchConfig.polish` says."""
 
     def __post_init__(self) -> None:
         if self.accept not in ACCEPT:

@@ -31,7 +31,7 @@ def write_report(paths: Sequence[Path], out: Path | None) -> Report:
     """Tables of the evaluated runs in folders; with `out`, files of them and of the curves too.
 
     The object has `runs`, `cells` (the fields of `Cell`), `origins` (of each run, see
-    `report_origins.origin`), `notes` and `files` (paths).
+    `origins.origin`), `notes` and `files` (paths).
 
     Raises:
         InputError: no evaluated run, runs that cannot be told apart, or a folder that cannot be

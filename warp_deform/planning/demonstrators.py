@@ -27,7 +27,7 @@ MORE_CANDIDATES = 24
 
 
 def demonstrator(name: str) -> Act[Any]:
-    """Who acts in `episode_loop.play`: the demonstrator called `name`.
+    """Who acts in `worlds.loop.play`: the demonstrator called `name`.
 
     What it does in an episode depends on the episode alone: its state and its generator.
 
