@@ -98,7 +98,7 @@ def evaluate_run(
             for step in of:
                 solved: list[bool] = []
 
-                def heard(
+                def on_episode(
                     played: PlayedEpisode, step: int = step, solved: list[bool] = solved
                 ) -> None:
                     solved.append(played.success)
@@ -106,7 +106,7 @@ def evaluate_run(
                     advance.note = f"step {step}: {sum(solved)} of {len(solved)} solved"
 
                 evaluations.append(
-                    evaluate_snapshot(run, step, protocol, workers=count, heard=heard)
+                    evaluate_snapshot(run, step, protocol, workers=count, on_episode=on_episode)
                 )
         return evaluations
 
@@ -126,7 +126,7 @@ def evaluate_run(
         check_goals(goals, task)
     lifts = settings["agent"]["config"].get("lifts")
     several = isinstance(lifts, list) and len(lifts) > 1
-    theirs = replace(
+    paper_protocol = replace(
         test,
         episodes=_PAPER_EPISODES,
         goals="demonstrated",
@@ -136,7 +136,7 @@ def evaluate_run(
         retry=False,
         motions_must_succeed=True,
     )
-    planned = [validation, test, theirs] if paper else [validation, test]
+    planned = [validation, test, paper_protocol] if paper else [validation, test]
     check_splits(map(int, settings["demonstrations"]), planned, task=task)
     for step in steps:  # a damaged one is told of before anything is played
         load_policy(run.snapshot(step))
@@ -171,11 +171,11 @@ def evaluate_run(
         "other_seeds": earlier.get("other_seeds", {}),
     }
     if paper:
-        played = evaluate("paper's protocol", steps, theirs)
+        played = evaluate("paper's protocol", steps, paper_protocol)
         top = best([each for each in played if each.step], task=task)
         report["paper"] = {
             "protocol": "best of the snapshots on the test seeds themselves (optimistic)",
-            "stage_rule": theirs.stage_rule,
+            "stage_rule": paper_protocol.stage_rule,
             "n_snapshots": sum(step > 0 for step in steps),
             "snapshot": top.step,
             **top.summary,

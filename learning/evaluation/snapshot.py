@@ -40,7 +40,7 @@ def evaluate_snapshot(
     protocol: Protocol,
     *,
     workers: int = 1,
-    heard: Callable[[PlayedEpisode], object] | None = None,
+    on_episode: Callable[[PlayedEpisode], object] | None = None,
 ) -> Evaluation:
     """Play a protocol with a snapshot of a run, or read what was played before.
 
@@ -48,17 +48,17 @@ def evaluate_snapshot(
     interruption changes a result.
 
     Args:
-        heard: called with every episode, those that were played before first
+        on_episode: called with every episode, those that were played before first
 
     Raises:
         InputError: there is no such snapshot, it cannot play this, or a file is damaged.
     """
     results = _Results(run, step, protocol)
     missing = [seed for seed in protocol.seeds if seed not in results.played]
-    if heard is not None:
+    if on_episode is not None:
         for seed in protocol.seeds:
             if seed in results.played:
-                heard(results.played[seed])
+                on_episode(results.played[seed])
     if missing:
         goals = goals_for(run, results.task, protocol)
         count = min(workers, len(missing))
@@ -74,8 +74,8 @@ def evaluate_snapshot(
         with Workers(count) as crew:
             for played in crew.run(_play_chunk, chunks):
                 results.add(played)
-                if heard is not None:
-                    heard(played)
+                if on_episode is not None:
+                    on_episode(played)
     episodes = tuple(results.played[seed] for seed in protocol.seeds)
     return Evaluation(step, episodes, summarise(episodes, task=results.task))
 

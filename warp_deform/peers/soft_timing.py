@@ -9,9 +9,9 @@ from typing import Protocol
 
 import numpy as np
 
-from ..errors import InputError, WarpDeformError
+from ..errors import WarpDeformError
 from .soft_scene import SoftScene, soft_scene
-from .timing import FRAME_RATE, PeerTiming
+from .timing import FRAME_RATE, PeerTiming, check_measurement
 
 __all__ = ["SoftWorld", "measure_soft", "play_frames"]
 
@@ -60,10 +60,7 @@ def measure_soft(
         InputError: `seconds` is shorter than a frame or `repeats` is less than 1.
         WarpDeformError: the engine's positions became non-finite.
     """
-    if seconds is not None and not seconds * FRAME_RATE >= 1:
-        raise InputError(f"seconds must be at least one frame, 1/{FRAME_RATE} s, got {seconds}")
-    if repeats < 1:
-        raise InputError(f"repeats must be at least 1, got {repeats}")
+    check_measurement(seconds, repeats)
     with closing(make_world(soft_scene(scene))) as world:
         for _ in range(_WARM_UP):
             world.frame()

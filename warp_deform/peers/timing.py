@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError, WarpDeformError
 from .scene import PeerScene, peer_scene
 
-__all__ = ["FRAME_RATE", "PeerWorld", "measure"]
+__all__ = ["FRAME_RATE", "PeerWorld", "check_measurement", "measure"]
 
 FRAME_RATE = 60
 """Frames per simulated second; positions are read once a frame, outside the timed part."""
@@ -82,6 +82,18 @@ class PeerTiming:
         return {key: value for key, value in values.items() if value is not None}
 
 
+def check_measurement(seconds: float | None, repeats: int) -> None:
+    """Refuse what is no measurement; `seconds` is None where a scene has its own.
+
+    Raises:
+        InputError: `seconds` is shorter than a frame or `repeats` is less than 1.
+    """
+    if seconds is not None and not seconds * FRAME_RATE >= 1:
+        raise InputError(f"seconds must be at least one frame, 1/{FRAME_RATE} s, got {seconds}")
+    if repeats < 1:
+        raise InputError(f"repeats must be at least 1, got {repeats}")
+
+
 def measure(
     make_world: Callable[[PeerScene], PeerWorld],
     *,
@@ -99,10 +111,7 @@ def measure(
         InputError: `seconds` is shorter than a frame or `repeats` is less than 1.
         WarpDeformError: the engine's positions became non-finite.
     """
-    if not seconds * FRAME_RATE >= 1:
-        raise InputError(f"seconds must be at least one frame, 1/{FRAME_RATE} s, got {seconds}")
-    if repeats < 1:
-        raise InputError(f"repeats must be at least 1, got {repeats}")
+    check_measurement(seconds, repeats)
     frames = round(seconds * FRAME_RATE)
     with closing(make_world(peer_scene(scene))) as world:
         _run(world, _WARM_UP)

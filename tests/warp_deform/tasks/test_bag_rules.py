@@ -149,7 +149,7 @@ def outlook(action: np.ndarray, grade: int, after: object = None) -> Outlook:
     return Outlook(action, grade, 0.0, 0.0, after)
 
 
-class Told:
+class KnownLookahead:
     """A lookahead that knows what becomes of actions by their pick x, from the start or later."""
 
     def __init__(self, first: dict[float, int], second: dict[float, int]) -> None:
@@ -190,12 +190,12 @@ def pick_x(count: int) -> float:
 def test_a_search_goes_on_where_a_solution_would_lose_the_item() -> None:
     config = SearchConfig(method="enumerate", budget=8, depth=2, beam=1)
     rng = np.random.default_rng(0)
-    lost_or_on = Told({pick_x(0): 3, pick_x(1): 2}, {pick_x(2): 4})
+    lost_or_on = KnownLookahead({pick_x(0): 3, pick_x(1): 2}, {pick_x(2): 4})
     best = search(lost_or_on, Offers(), STATE, rng, config)[0]
     assert best.action[0] == pick_x(1)  # two actions that keep it go before one that does not
-    lost_or_nothing = Told({pick_x(0): 3, pick_x(1): 2}, {})
+    lost_or_nothing = KnownLookahead({pick_x(0): 3, pick_x(1): 2}, {})
     assert search(lost_or_nothing, Offers(), STATE, rng, config)[0].action[0] == pick_x(0)
-    lost_or_kept = Told({pick_x(0): 3, pick_x(3): 4}, {})
+    lost_or_kept = KnownLookahead({pick_x(0): 3, pick_x(3): 4}, {})
     assert search(lost_or_kept, Offers(), STATE, rng, config)[0].action[0] == pick_x(3)
     assert len(lost_or_kept.tried) == 4, "nothing is left to search for"
 
@@ -213,7 +213,7 @@ def test_a_search_goes_on_where_a_solution_would_lose_the_item() -> None:
 def test_mpc_tries_more_where_the_best_would_end_badly(
     monkeypatch, early, late, chosen, tries
 ) -> None:
-    lookahead = Told({pick_x(k): grade for k, grade in (early | late).items()}, {})
+    lookahead = KnownLookahead({pick_x(k): grade for k, grade in (early | late).items()}, {})
     monkeypatch.setattr(demonstrators, "_lookahead", lambda worlds: lookahead)
     worlds = SimpleNamespace(task=Offers(), episodes={0: EPISODE}, state=lambda slot: STATE)
     run = SimpleNamespace(rng=np.random.default_rng(0))
