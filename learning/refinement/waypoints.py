@@ -26,7 +26,7 @@ from warp_deform.collecting.replay import Recording
 from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
-from warp_deform.planning.waypoints import Bent, WayPointConfig, WayPoints
+from warp_deform.planning.waypoints import BentPath, WayPointConfig, WayPoints
 from warp_deform.rollout.rollouts import GripPath
 from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
@@ -210,7 +210,7 @@ def _recorded(worlds: Worlds, recording: Recording, seed: int) -> list[tuple[Wor
     return jobs
 
 
-def _written(bent: Bent, action: Action, state_hash: str) -> dict[str, Any]:
+def _written(bent: BentPath, action: Action, state_hash: str) -> dict[str, Any]:
     """What is written about an action.
 
     Args:

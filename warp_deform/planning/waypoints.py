@@ -31,7 +31,7 @@ from .places import MOST_GROWTH
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["Bent", "Ran", "WayPointConfig", "WayPoints"]
+__all__ = ["BentPath", "PathResult", "WayPointConfig", "WayPoints"]
 
 _LOW, _HIGH = np.array(BOUNDS[:2]).T
 
@@ -55,7 +55,7 @@ class WayPointConfig:
 
 
 @dataclass(frozen=True)
-class Ran:
+class PathResult:
     """What a path led to: the task's loss and score, and the state's hash."""
 
     loss: float
@@ -64,7 +64,7 @@ class Ran:
 
 
 @dataclass(frozen=True, eq=False)
-class Bent:
+class BentPath:
     """An action's straight path and the best one found.
 
     Attributes:
@@ -75,8 +75,8 @@ class Bent:
     """
 
     path: GripPath | None
-    before: Ran | None
-    after: Ran | None
+    before: PathResult | None
+    after: PathResult | None
     steps: int
     growth: float
 
@@ -91,19 +91,21 @@ class WayPoints:
         self._worlds = Worlds(task, LANES, robot=robot, lanes=LANES, precision=precision)
         self._gradients = gradients_for(task, robot, precision)
 
-    def bend(self, jobs: Sequence[tuple[WorldState, Action]], config: WayPointConfig) -> list[Bent]:
+    def bend(
+        self, jobs: Sequence[tuple[WorldState, Action]], config: WayPointConfig
+    ) -> list[BentPath]:
         """The best path found for each action from its state, in the order given.
 
         Depends on state and action alone.
         """
-        bent: list[Bent] = []
+        bent: list[BentPath] = []
         for first in range(0, len(jobs), LANES):
             bent += self._bend_lanes(jobs[first : first + LANES], config)
         return bent
 
     def run(
         self, jobs: dict[int, tuple[WorldState, Action]], paths: dict[int, GripPath]
-    ) -> dict[int, Ran]:
+    ) -> dict[int, PathResult]:
         """Run a path of each slot instead of its action's, as an action is run.
 
         Slots are left out where the tip takes nothing, the arm cannot follow, or the state cannot
@@ -115,7 +117,7 @@ class WayPoints:
         if not moving:
             return {}
         runs = carry_and_release(worlds, {slot: paths[slot] for slot in moving})
-        ran: dict[int, Ran] = {}
+        ran: dict[int, PathResult] = {}
         for slot in moving:
             episode = worlds.episodes[slot]
             episode.problems += runs[slot].watch.problems(slot, worlds.solver.config.limits)
@@ -128,12 +130,12 @@ class WayPoints:
             end = worlds.episodes[slot].snapshot
             before = jobs[slot][0].episode
             loss, _, _ = loss_and_gradients(worlds.task, before, end.particle_q, end.body_q)
-            ran[slot] = Ran(loss, float(worlds.score(slot)), worlds.hash(slot))
+            ran[slot] = PathResult(loss, float(worlds.score(slot)), worlds.hash(slot))
         return ran
 
     def _bend_lanes(
         self, jobs: Sequence[tuple[WorldState, Action]], config: WayPointConfig
-    ) -> list[Bent]:
+    ) -> list[BentPath]:
         led = dict(enumerate(jobs))
         carries = self._lead(led)
         straight = {slot: carried(led[slot][1])[1] for slot, carried in carries.items()}
@@ -144,7 +146,9 @@ class WayPoints:
         }
         led = {slot: led[slot] for slot in bends}
         before = self.run(led, {slot: straight[slot] for slot in led})
-        best: dict[int, tuple[Ran, GripPath | None]] = {s: (ran, None) for s, ran in before.items()}
+        best: dict[int, tuple[PathResult, GripPath | None]] = {
+            s: (ran, None) for s, ran in before.items()
+        }
         slots = sorted(best)
         values = np.array([bends[slot].start for slot in slots]).reshape(len(slots), -1)
         descent = Descent(values.shape, np.full(values.shape[1], config.rate))
@@ -173,9 +177,9 @@ class WayPoints:
                     best[slot] = ran, tries[slot]
                     best_values[slots.index(slot)] = values[slots.index(slot)]
         return [
-            Bent(best[s][1], before[s], best[s][0], used[s], growth[s])
+            BentPath(best[s][1], before[s], best[s][0], used[s], growth[s])
             if s in best
-            else Bent(None, None, None, 0, 0.0)
+            else BentPath(None, None, None, 0, 0.0)
             for s in range(len(jobs))
         ]
 
