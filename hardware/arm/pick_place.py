@@ -18,11 +18,11 @@ from enum import StrEnum
 
 import numpy as np
 
-from warp_deform.errors import InputError
+from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.tasks.strand_grasp import wrap_half_turn
 
 from .arguments import check_number
-from .robot import MotionError
+from .robot import MotionError, SafetyViolation, UnreachablePose
 from .safe_robot import SafeRobot
 from .table_plane import TablePlane
 
@@ -33,6 +33,7 @@ __all__ = [
     "PickPlaceResult",
     "execute",
     "hand_down",
+    "refusal",
     "waypoints",
 ]
 
@@ -170,6 +171,31 @@ def waypoints(
     }
 
 
+def refusal(
+    robot: SafeRobot, action: PickPlaceAction, config: PickPlaceConfig
+) -> WarpDeformError | None:
+    """Return why an action would be refused, None where it would not; moves nothing.
+
+    Raises:
+        RobotError: the robot accepts no motion at all now
+    """
+    try:
+        robot.check_lines(_lines(waypoints(action, robot.limits.table, config), config))
+    except (SafetyViolation, UnreachablePose, InputError) as error:
+        return error
+    return None
+
+
+def _lines(
+    poses: dict[str, np.ndarray], config: PickPlaceConfig
+) -> list[tuple[np.ndarray, float, float | None]]:
+    """Return target, speed and stop force of the straight lines through an action's poses."""
+    down = (config.descent_speed, config.stop_force_N)
+    # The hover pose is usually below where the arm is, so it is approached at descent speed.
+    speeds = {"hover": down, "grasp": down, "place": down}
+    return [(T, *speeds.get(name, (config.speed, None))) for name, T in poses.items()]
+
+
 def execute(
     robot: SafeRobot, action: PickPlaceAction, config: PickPlaceConfig | None = None
 ) -> PickPlaceResult:
@@ -199,12 +225,7 @@ class _Execution:
 
     def run(self) -> PickPlaceResult:
         robot, config = self._robot, self._config
-        down = (config.descent_speed, config.stop_force_N)
-        # The hover pose is usually below where the arm is, so it is approached at descent speed.
-        speeds = {"hover": down, "grasp": down, "place": down}
-        robot.check_lines(
-            [(T, *speeds.get(name, (config.speed, None))) for name, T in self._poses.items()]
-        )
+        robot.check_lines(_lines(self._poses, config))
         self._go("hover", contact=True)
         robot.open_gripper(config.open_width_m)
         if not self._descend("grasp"):

@@ -38,9 +38,10 @@ from ..arm.pick_place import (
     PickPlaceOutcome,
     PickPlaceResult,
     execute,
+    refusal,
     waypoints,
 )
-from ..arm.robot import ConnectionLost, MotionError, RobotError, SafetyViolation, UnreachablePose
+from ..arm.robot import ConnectionLost, MotionError, RobotError
 from ..arm.safe_robot import SafeRobot
 from ..calibration.calibration import Calibration
 from ..cameras.camera import Camera, CameraError, Frame
@@ -51,7 +52,7 @@ from ..vision.segmentation import SegmentationConfig, SegmentationError, segment
 from ..vision.top_down_view import TopDownView
 from .operators import Answer, Operator, Proposal, Unattended, until_cleared
 
-__all__ = ["Chooser", "EpisodeConfig", "EpisodeResult", "Observation", "refusal", "run_episode"]
+__all__ = ["Chooser", "EpisodeConfig", "EpisodeResult", "Observation", "run_episode"]
 
 # A joint farther than this from home is sent there once more before a picture is taken [rad]: an
 # arrival may miss by 2 degrees, which a camera on the hand sees as a shift of up to 2 cm.
@@ -146,30 +147,6 @@ class EpisodeResult:
     outcomes: tuple[PickPlaceOutcome, ...]
     score: EpisodeScore | None
     error: WarpDeformError | None
-
-
-def refusal(
-    robot: SafeRobot, action: PickPlaceAction, config: PickPlaceConfig
-) -> WarpDeformError | None:
-    """Return why an action would be refused, None where it would not; moves nothing.
-
-    Raises:
-        RobotError: the robot accepts no motion at all now
-    """
-    down = {"hover", "grasp", "place"}
-    try:
-        poses = waypoints(action, robot.limits.table, config)
-        robot.check_lines(
-            [
-                (T, config.descent_speed, config.stop_force_N)
-                if name in down
-                else (T, config.speed, None)
-                for name, T in poses.items()
-            ]
-        )
-    except (SafetyViolation, UnreachablePose, InputError) as error:
-        return error
-    return None
 
 
 def run_episode(

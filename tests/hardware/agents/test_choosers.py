@@ -24,9 +24,9 @@ from hardware.agents.choosers import RandomChooser, ScriptedChooser, still_chain
 from hardware.agents.finger_room import has_finger_room
 from hardware.agents.human import HumanChooser
 from hardware.agents.planner import PlannerChooser, PlannerConfig, SeenChain, chord_error
-from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig
+from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig, refusal
 from hardware.arm.safe_robot import SafeRobot
-from hardware.episodes.episode import EpisodeConfig, Observation, refusal, run_episode
+from hardware.episodes.episode import EpisodeConfig, Observation, run_episode
 from hardware.recordings.recording import Recording
 from hardware.recordings.replay import replay_recording
 from hardware.twin.camera import SimCamera
