@@ -30,9 +30,8 @@ def sources(name: str) -> list[Path]:
 FILES = sorted({path for name in SHOWN for path in sources(name)})
 WHOLE = sorted(
     path
-    for package in ("learning", "warp_deform")
+    for package in ("hardware", "learning", "warp_deform")
     for path in (ROOT / package).rglob("*.py")
-    if not {"xpbd", "solver"} & set(path.relative_to(ROOT).parts)
 )
 """Files whose private names have the dialect, too."""
 

@@ -2,9 +2,9 @@
 
 Source: Seita et al., ICRA 2021 and their reference code, whose arithmetic this follows to the bit:
 a cell is a point's position rounded down, the highest point of a camera fills its cell, heights are
-merged by their maximum and colours by the mean over the cameras that saw something. Of equally high
-points the last one of the picture wins here. In the original one of them wins, and which one depends
-on the processor.
+merged by their maximum and colours by the mean over the cameras that saw something. Of equally
+high points the last one of the picture wins here. In the original one of them wins, and which one
+depends on the processor.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def _splat(camera: Camera, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
         np.floor((points[:, axis] - low[axis]) / PIXEL_SIZE).astype(np.int64) for axis in (0, 1)
     )
     cells = rows * SHAPE[1] + columns
-    # the last assignment to a cell stays: ascending order leaves the highest point, and a stable one
-    # the same point on every processor
+    # the last assignment to a cell stays: ascending order leaves the highest point, and a stable
+    # one the same point on every processor
     order = np.argsort(points[:, 2], kind="stable")
     winner = np.full(SHAPE[0] * SHAPE[1], -1)
     winner[cells[order]] = order

@@ -60,10 +60,11 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
     ) -> None:
         """Pack `model`.
 
-        lanes: worlds a thread; None takes 8 for many worlds on the CPU and 1 otherwise.
-        precision: "float32" or "float64".
-        pairs_per_particle: room in the contact list; a guard fires when it does not suffice.
-        bundles: folder that gets a reproducing file whenever a guard fires.
+        Args:
+            lanes: worlds a thread; None takes 8 for many worlds on the CPU and 1 otherwise
+            precision: "float32" or "float64"
+            pairs_per_particle: room in the contact list; a guard fires when it does not suffice
+            bundles: folder that gets a reproducing file whenever a guard fires
         """
         SolverBase.__init__(self, model)
         FusedXPBD.__init__(
@@ -172,7 +173,8 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
     def _clamped_in_a_row(self, values: list[WatchValues], share: float) -> list[WatchValues]:
         """The values with the clamped substeps of the steps before, if all of them had some.
 
-        share: length of a substep as a share of the configured one, in which the guard counts
+        Args:
+            share: length of a substep as a share of the configured one, in which the guard counts
         """
         before = self._clamped or [0.0] * len(values)
         self._clamped = [

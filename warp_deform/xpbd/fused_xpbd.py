@@ -53,10 +53,11 @@ class FusedXPBD:
     ) -> None:
         """Pack `model`.
 
-        lanes: worlds a thread; None takes 8 for many worlds on the CPU and 1 otherwise.
-        precision: "float32" or "float64".
-        pairs_per_particle: room in the contact list; a guard fires when it does not suffice.
-        bundles: folder that gets a reproducing file whenever a guard fires.
+        Args:
+            lanes: worlds a thread; None takes 8 for many worlds on the CPU and 1 otherwise
+            precision: "float32" or "float64"
+            pairs_per_particle: room in the contact list; a guard fires when it does not suffice
+            bundles: folder that gets a reproducing file whenever a guard fires
         """
         self.model = model
         self.config = config or SolverConfig()
@@ -161,11 +162,12 @@ class FusedXPBD:
     ) -> list[WatchValues]:
         """Launch up to `max_steps` substeps; returns the guards' values by world.
 
-        dt: length of a substep [s], None: as configured. What is given per second, or in seconds,
-        is turned into shares and numbers of these substeps.
-
         Worlds stop early as `set_duration` says. Nothing is raised, see `check`; but when a guard
         fires and the solver has a folder for bundles, `bundle` is the file that reproduces it.
+
+        Args:
+            dt: length of a substep [s], None: as configured. What is given per second, or in
+                seconds, is turned into shares and numbers of these substeps.
         """
         data = self.data
         frames = -(-max_steps // record_every) if record_every else 0

@@ -35,8 +35,10 @@ AHEAD = 1.0e-4
 def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     """`begin_body`, `list_contact` for every pair of points, `solve_contacts`, `end_body`.
 
-    `noted`: for the backward sweep, impulses before every visit are written to `Contacts.log`, and
-    how many contacts share a load to `Contacts.code`; `solve_contacts` returns its passes.
+    Args:
+        noted: for the backward sweep, impulses before every visit are written to `Contacts.log`,
+            and how many contacts share a load to `Contacts.code`; `solve_contacts` returns its
+            passes
     """
     t = structures(scalar, lanes)
     S, R3, M33, Bodies, Contacts = t.S, t.R3, t.M33, t.Bodies, t.Contacts

@@ -26,7 +26,9 @@ POINTS = 12
 def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     """`list_boxes(c, sa, a, sb, b, ...)`: adds the contacts of shape sa of body a with shape sb of
     body b to the list, from number c on, and returns the next number.
-    `noted`: with the axis, edge and end in `Contacts.code`.
+
+    Args:
+        noted: with the axis, edge and end in `Contacts.code`
     """
     t = structures(scalar, lanes)
     S, R3, M33 = t.S, t.R3, t.M33

@@ -17,7 +17,9 @@ __all__ = ["box_table", "box_table_adjoint"]
 def box_table(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     """`list_table(c, b, local, first, last, ...)`: adds the corners of body b with shapes
     first..last that may touch the table to the contacts, from number c on; returns the next number.
-    `noted`: with the number of the corner in `Contacts.code`.
+
+    Args:
+        noted: with the number of the corner in `Contacts.code`
     """
     t = structures(scalar, lanes)
     S, R3 = t.S, t.R3

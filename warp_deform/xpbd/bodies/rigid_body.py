@@ -97,8 +97,9 @@ def rigid_body(scalar: Any, lanes: int) -> SimpleNamespace:
         """Velocities from the substep; returns the squared step of the centre of mass [m^2], with
         the turning counted at 2 cm from it.
 
-        drowsy: factor on the speeds of sleep; above 1 (late in a world of fabrics, where light
-        layers under a box give way for ever) a sleeper loses its velocity as well.
+        Args:
+            drowsy: factor on the speeds of sleep; above 1 (late in a world of fabrics, where light
+                layers under a box give way for ever) a sleeper loses its velocity as well
         """
         d = stepped_body(b, dt, damping_factor, gravity, bodies)
         # the inverse of `turned`, which turns by twice the arc tangent of half the vector's length

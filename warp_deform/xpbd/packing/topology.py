@@ -26,19 +26,36 @@ __all__ = ["WorldTopology", "read_worlds", "tethers"]
 class WorldTopology:
     """One world as the solver sees it; all indices are local to the world.
 
-    spring_ij (S, 2); spring_length (S,) [m]; spring_compliance (S,) [m/N]; spring_limit (S,) [m];
-    spring_floor (S,) [m]; spring_mode (S,)
-    spring_watched (S,): two-sided and not a soft one of a fabric; the stretch guard looks at these
-    spring_middle (S,): third particle of a bending spring, else -1
-    pair_ij (C, 2), pair_distance (C,) [m]: particles that may collide
-    particle_radius (P,) [m]
-    shape_body (K,); shape_center (K, 3) relative to the centre of mass; shape_rotation (K, 4) xyzw;
-    shape_half (K, 3) [m]; shape_friction (K,)
-    body_com (B, 3): centre of mass in the body's frame [m]
-    sheet_triangle (T, 3), sheet_friction (T,); where there are triangles, for every particle:
-    sheet_skin (P,) [m], sheet_rest (P, 3) [m], sheet_owner (P,), sheet_exclusion (P,) [m],
-    sheet_edge_gap (P,) [m]; sheet_edge (E, 2): edges that meet each other;
-    sheet_cell: least side of a cell of their contact list [m]
+    The fields of single particles of sheets are empty where a world has no triangles.
+
+    Attributes:
+        spring_ij: (S, 2), particles at the ends
+        spring_length: (S,) [m]
+        spring_compliance: (S,) [m/N]
+        spring_limit: (S,) [m]
+        spring_floor: (S,) [m]
+        spring_mode: (S,), see `SpringMode`
+        spring_watched: (S,), two-sided and not a soft one of a fabric; the stretch guard looks at
+            these
+        spring_middle: (S,), third particle of a bending spring, else -1
+        pair_ij: (C, 2), particles that may collide
+        pair_distance: (C,), where they touch [m]
+        particle_radius: (P,) [m]
+        shape_body: (K,), the body that a box belongs to
+        shape_center: (K, 3), relative to the body's centre of mass [m]
+        shape_rotation: (K, 4), xyzw
+        shape_half: (K, 3) [m]
+        shape_friction: (K,)
+        body_com: (B, 3), centre of mass in the body's frame [m]
+        sheet_triangle: (T, 3), particles at the corners
+        sheet_friction: (T,)
+        sheet_skin: (P,) [m]
+        sheet_rest: (P, 3), place in the rest shape [m]
+        sheet_owner: (P,), the object that a particle belongs to
+        sheet_exclusion: (P,), no contact closer than this in the rest shape [m]
+        sheet_edge: (E, 2), edges that meet each other
+        sheet_edge_gap: (P,), where they touch [m]
+        sheet_cell: least side of a cell of their contact list [m]
     """
 
     spring_ij: np.ndarray

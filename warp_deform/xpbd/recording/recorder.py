@@ -48,16 +48,17 @@ class Recorder:
     sweep, "full" keeps all tapes. Both give the same bits: the same substeps are taped from the
     same states. Segments end at the marks at which states are asked for.
 
-    memory: most bytes of checkpoints and tapes; a rollout that does not fit is refused.
-    sleep: False leaves dry friction and sleep of fabrics out: they hold what a derivative should
-    move.
-    dt: length of a substep [s]; None: the solver's.
-
     Branches (contact or not, side, clamp, stick, release, rest) are those of the forward pass, as
     functions of the state there: the derivative is that of the smooth piece the rollout ran on.
 
     Sweeping needs nothing of the solver's present state and leaves it as it is: worlds may be
     changed, and other rollouts run, between `forward` and `backward`.
+
+    Args:
+        memory: most bytes of checkpoints and tapes; a rollout that does not fit is refused
+        sleep: False leaves dry friction and sleep of fabrics out: they hold what a derivative
+            should move
+        dt: length of a substep [s]; None: the solver's
     """
 
     def __init__(
@@ -166,8 +167,9 @@ class Recorder:
     def forward(self, marks: Sequence[int]) -> list[WatchValues]:
         """Run the rollout that `prepare` has set up, to the last of the `marks`.
 
-        marks: ascending numbers of substeps; `states[mark]` is the state after so many: arrays
-        "particles.x", "particles.v" as in `SolverData` and poses and twists of bodies.
+        Args:
+            marks: ascending numbers of substeps; `states[mark]` is the state after so many: arrays
+                "particles.x", "particles.v" as in `SolverData` and poses and twists of bodies
 
         Raises:
             InputError: the tape needs more memory than allowed.
@@ -277,12 +279,15 @@ class Recorder:
     def backward(self, cotangents: Mapping[int, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
         """Derivatives of a loss by the start of the rollout and its parameters.
 
-        cotangents: by mark, derivatives of the loss by the arrays of `states` there
+        Args:
+            cotangents: by mark, derivatives of the loss by the arrays of `states` there
 
-        Returns views, valid until the next call: "x", "v" (by the state at the start), "mass" (by
-        inverse masses), per group "damping", "table_friction", "contact_friction", "stiffness";
-        per knot "position", "rotation", "time"; "fired" (groups, kinds, L): how often constraints
-        acted. Per body "body.x", "body.q" (by the four numbers), "body.v", "body.omega", "body.w".
+        Returns:
+            Views, valid until the next call: "x", "v" (by the state at the start), "mass" (by
+            inverse masses), per group "damping", "table_friction", "contact_friction", "stiffness";
+            per knot "position", "rotation", "time"; "fired" (groups, kinds, L): how often
+            constraints acted. Per body "body.x", "body.q" (by the four numbers), "body.v",
+            "body.omega", "body.w".
         """
         if not self._segments:
             raise InputError("there is nothing to sweep back: call forward first")
