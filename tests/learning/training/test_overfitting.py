@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,8 @@ from learning.training.schedules import Schedule
 from learning.training.train import train
 from warp_deform.episodes import Episode
 
-PICTURES = Schedule(steps=40, batch=1, lr=5e-4, warmup=5, snapshots=1)
-GOALS = replace(PICTURES, steps=25)
+PICTURES = Schedule(steps=80, batch=1, lr=2e-4, warmup=5, decay=True, snapshots=1)
+GOALS = Schedule(steps=25, batch=1, lr=5e-4, warmup=5, snapshots=1)
 STATES = Schedule(steps=1200, batch=1, lr=3e-3, warmup=50, decay=True, snapshots=1)
 AGENTS = {
     "transporter": ("cable-ring", PICTURES),
