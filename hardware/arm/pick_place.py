@@ -1,10 +1,9 @@
-"""The pick-and-place primitive on a robot: the hand points down, and every height is above the
-measured table.
+"""The pick-and-place primitive on a robot, with the hand pointing down.
 
 Hover, open, descend until contact, take hold, lift, carry, lower until contact, let go, retreat,
-home. Every waypoint is checked before anything moves, and once more when it is its turn. What the
-fingers hold is measured after the grasp and again after the lift: a cable that was missed or lost
-is an outcome, not an error.
+home. Every height is above the measured table. Every waypoint is checked before anything moves, and
+once more when it is its turn. What the fingers hold is measured after the grasp and again after the
+lift: a cable that was missed or lost is an outcome, not an error.
 
 Source: Seita et al., ICRA 2021, section on physical experiments, for the primitive, the openings
 and the force of the fingers; heights are for the vendor's fingers on a flat table.

@@ -1,7 +1,7 @@
 """The workspace in software: a bead chain on foam, under a hand with two fingers.
 
 A twin is a `World` of the emulator, so that the vendor's own client moves the simulated chain, and
-what `backends.sim` moves. It lives in the base frame; its ground is the foam's upper side.
+what `twin.robot.SimRobot` moves. It lives in the base frame; its ground is the foam's upper side.
 
     with EmulatorProcess(world=CableTwin) as emulator:
         emulator.call_world("toss", seed=3)

@@ -70,7 +70,7 @@ def image_batch(
     augment: bool = True,
     mirror: bool = False,
 ) -> Batch:
-    """Moments, moved by `rng`, as an agent over pictures sees them.
+    """Transitions, moved by `rng`, as an agent over pictures sees them.
 
     Args:
         transitions: number of a demonstration, and of an action in it, as of `Demonstrations.drawn`
@@ -118,7 +118,7 @@ def state_batch(
     rng: np.random.Generator,
     augment: bool = True,
 ) -> StateBatch:
-    """Moments, moved by `rng`, as a ground-truth baseline sees them; see `image_batch`.
+    """Transitions, moved by `rng`, as a ground-truth baseline sees them; see `image_batch`.
 
     Raises:
         InputError: a lift is no stage's.

@@ -110,7 +110,7 @@ class TransporterConfig:
                     f"{name}: 1 to {_MOST_CHOICES} are possible, got {getattr(self, name)}"
                 )
         if not (0 < self.gain < math.inf and 0 <= self.focus < math.inf):
-            raise InputError(f"gain {self.gain} and focus {self.focus}: must not be negative")
+            raise InputError(f"gain {self.gain} and focus {self.focus}: above 0, and 0 or more")
         if not math.isfinite(self.goal_bias):
             raise InputError(f"goal_bias: must be finite, got {self.goal_bias}")
         if not self.lifts or not all(0 < lift <= _MOST_LIFT for lift in self.lifts):

@@ -20,7 +20,7 @@ class Schedule:
     steps: int
     """Steps of the optimiser, which the original calls iterations."""
     batch: int
-    """Moments a step and process."""
+    """Transitions a step and process."""
     lr: float
     """Greatest step size of Adam."""
     warmup: int = 0

@@ -26,7 +26,7 @@ _FRAME = (360, 640)  # [pixels] rows, columns
 
 
 class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
-    """Rearrange a cable, ring or block by picking and placing.
+    """Rearrange cables, fabrics, bags or boxes by picking and placing, in the episodes of a task.
 
         env = gymnasium.make("WarpDeform/CableRing-v1")
         observation, info = env.reset(seed=0)

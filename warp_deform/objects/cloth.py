@@ -29,7 +29,10 @@ _CELL_SHARE = 0.6  # thickest that layers may be, as a share of the spacing
 
 @dataclass(frozen=True, kw_only=True)
 class ClothConfig:
-    """A sheet of rows x columns particles; the defaults are the paper's fabric."""
+    """A sheet of rows x columns particles, by default as large as the paper's fabric.
+
+    The fabric of the tasks is stiffer, and its edges touch: `tasks.cloth_physics.FABRIC`.
+    """
 
     rows: int = 10
     columns: int = 10

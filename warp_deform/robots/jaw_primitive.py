@@ -30,7 +30,7 @@ __all__ = ["JawActionConfig", "JawCommand", "hand_pose", "jaw_motion", "jaw_scri
 
 _FOREVER = 1e7
 _FRAMES = 40
-"""Way-points of a motion that is drawn, at most."""
+"""Waypoints of a motion that is drawn, at most."""
 
 
 @dataclass(frozen=True, kw_only=True)

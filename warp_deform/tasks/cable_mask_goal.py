@@ -1,9 +1,9 @@
-"""cable-mask-goal: the paper's physical task, in simulation. A parallel jaw brings a bead chain to
-where a goal mask shows it, and sees masks only.
+"""cable-mask-goal: bring a bead chain with a parallel jaw to where a goal mask shows it.
 
-A chain of 45 cm lies lightly tossed on 60 x 30 cm of foam. An episode succeeds as soon as the
-intersection over union of its mask with the goal's exceeds 0.25, within 10 actions. Not one of the
-benchmark's 13 tasks.
+This is the paper's physical task, in simulation, where all that is seen is masks. A chain of 45 cm
+lies lightly tossed on 60 x 30 cm of foam. An episode succeeds as soon as the intersection over
+union of its mask with the goal's exceeds 0.25, within 10 actions. Not one of the benchmark's 13
+tasks.
 
 Masks and physics differ between episodes, so that what is learned here holds on a robot: width,
 scale, tilt, shift, gaps and outline of the mask; friction of foam and chain, damping and stiffness.

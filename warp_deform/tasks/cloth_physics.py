@@ -30,8 +30,8 @@ of trembling on; and it creases less when it is dragged over the table. With mor
 contact list than `CLOTH_SOLVER` gives it is made anew less often, which costs a quarter less."""
 
 FABRIC = ClothConfig(edge_contact=0.2, bend_stiffness=1.0)
-"""The paper's fabric. It is as stiff as canvas, so that what crumples under a pull smooths again as
-in the original; its edges do not pass through each other."""
+"""The fabric of the tasks. It is as stiff as canvas, so that what crumples under a pull smooths
+again as in the original; its edges do not pass through each other."""
 
 FABRIC_SPEED = 0.40
 """Speed of the tip that holds a fabric [m/s]."""

@@ -85,7 +85,7 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """State of one world at rest between two actions.
+    """State of one world between two actions, as a rule at rest.
 
     `images` renders on first use.
 
@@ -123,7 +123,7 @@ class Snapshot:
 
 
 class Task(abc.ABC):
-    """One task of the benchmark; instances are stateless and reusable."""
+    """One task, of the benchmark or of your own; instances are stateless and reusable."""
 
     name: ClassVar[str]
     goal_conditioned: ClassVar[bool] = False

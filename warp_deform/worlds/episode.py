@@ -96,8 +96,8 @@ class StepReport:
     """What one action did.
 
     Attributes:
-        motions: the tip's way-points, of the approach and of the carry
-        joints: the arm's way-points, of both
+        motions: the tip's waypoints, of the approach and of the carry
+        joints: the arm's waypoints, of both
         frames: recorded states, when asked for, at times from the beginning of the action
     """
 

@@ -22,7 +22,7 @@ class SolverConfig:
     table_friction: float = 0.5
     """Coulomb coefficient of particles, and factor on that of boxes, against the table."""
     contact_friction: float = 0.3
-    """Coulomb coefficient between particles, and factor on that of boxes, in contact."""
+    """Coulomb coefficient between particles, and factor on that of boxes and of triangles."""
     stiffness: float = 1.0
     """Factor on the stiffness of all springs."""
     recovery: float = 0.1

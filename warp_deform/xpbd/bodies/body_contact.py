@@ -35,6 +35,9 @@ AHEAD = 1.0e-4
 def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     """`begin_body`, `list_contact` for every pair of points, `solve_contacts`, `end_body`.
 
+    `share_load` follows the listing of one pair of bodies. `relative` is how far the points of a
+    contact have been moved against each other, which the adjoint asks, too.
+
     Args:
         noted: for the backward sweep, impulses before every visit are written to `Contacts.log`,
             and how many contacts share a load to `Contacts.code`; `solve_contacts` returns its

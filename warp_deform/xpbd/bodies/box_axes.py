@@ -13,8 +13,9 @@ __all__ = ["box_axes"]
 
 @functools.cache
 def box_axes(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`center(shape, b, ...)` and `axes(shape, b, ...)` of a shape of body b; `column(axes, k)`;
-    `reach(axes, half, n)`; `candidate(aa, ab, k)`, the normals of the separating axis theorem.
+    """`center(shape, b, ...)` and `axes(shape, b, ...)` of a shape of body b; of axes m,
+    `column(m, k)` and `reach(m, half, n)`; `candidate(aa, ab, k)`, the normals of the separating
+    axis theorem.
     """
     t = structures(scalar, lanes)
     R3, M33 = t.R3, t.M33

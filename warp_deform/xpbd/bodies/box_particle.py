@@ -28,7 +28,7 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
 
     A particle that the table carries does not give way downwards: the box would sink through light
     fabric, as the table takes back only afterwards what a contact of very unequal masses gives to
-    the particle.
+    the particle: `stands` is 0 for those. `particle_gap` is the distance of a point from a box.
     """
     t = structures(scalar, lanes)
     S, R3 = t.S, t.R3

@@ -23,7 +23,8 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     derivative by friction.
 
     Branches: nearest point on a face, an edge or a corner, or the nearest face from inside; depth
-    limited by the overlap or by `recovery`; a particle that the table carries.
+    limited by the overlap or by `recovery`; a particle that the table carries. The other functions
+    are what the adjoint of boxes and triangles has in common with this one.
     """
     t = structures(scalar, lanes)
     S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33

@@ -25,7 +25,11 @@ SLEEP_TURN = 0.05
 
 @functools.cache
 def rigid_body(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`predict_body`, `apply_impulse`, `finish_body` and what they share."""
+    """`predict_body` begins a substep of a body, `apply_impulse` moves it, `finish_body` ends it.
+
+    Contacts also ask for its `response` to an impulse, and how far a point of it has `moved`.
+    `turned` and `stepped_body` are what the adjoint shares with these.
+    """
     t = structures(scalar, lanes)
     S, R3, Q, Bodies = t.S, t.R3, t.Q, t.Bodies
 

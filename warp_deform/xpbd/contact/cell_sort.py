@@ -27,8 +27,9 @@ def cell_sort(scalar: Any, lanes: int) -> SimpleNamespace:
     `links + head[heads + c]` to `links + head[heads + c + 1]` of `sorted`, and of `key` their
     numbers n, as -1 - n where `moved[links + n]` is 0.
 
-    `hits_in_ball(sorted, key, at, end, ball, below)`: which of the next RUN points, as bits, reach
-    the ball (both have their fourth number as radius) and have a key less than `below`.
+    `hits_in_ball(x, key, at, end, b, below)`: which of the next RUN points of x, which is `sorted`,
+    as bits, reach the ball b (both have their fourth number as radius) and have a key less than
+    `below`.
     `hits_in_box` likewise, in the box from l to h, with keys of at least `least`. `first_hit` is
     the lowest of the bits.
     """

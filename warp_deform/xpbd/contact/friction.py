@@ -23,7 +23,7 @@ def friction(scalar: Any, lanes: int) -> SimpleNamespace:
     angle would creep at 5 mm/s; with power 4 it creeps at 1 mm/s there, at 80 % at 0.5 mm/s.
 
     `coulomb_soft` is the form with power 2, a third cheaper, for contacts between particles, where
-    nothing has to hold on a slope.
+    nothing has to hold on a slope. `coulomb_scalar` is `coulomb` for one lane.
     """
     t = structures(scalar, lanes)
     S, V = t.S, t.V

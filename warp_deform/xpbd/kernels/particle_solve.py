@@ -12,7 +12,7 @@ from ..contact.edge_contact_adjoint import edge_contact_adjoint
 from ..contact.sphere_contact import sphere_contact, sphere_contact_adjoint
 from ..contact.triangle_contact import triangle_contact
 from ..contact.triangle_contact_adjoint import triangle_contact_adjoint
-from ..lanes.algebra import any_less, sub  # noqa: F401  (operators are acted_count by name)
+from ..lanes.algebra import any_less, sub  # noqa: F401  (operators are found by name)
 from ..lanes.group_state import group_state
 from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS
 from ..springs.bending import bending, bending_adjoint

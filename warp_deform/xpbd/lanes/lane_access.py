@@ -17,9 +17,9 @@ __all__ = ["lane_access"]
 
 @functools.cache
 def lane_access(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`get(x, i, lane)` and `put(x, i, lane, value)` for flat arrays of V3, `get_mass` of V;
-    `count_one` counts a constraint that acted in one lane of the backward sweep, `count_lanes` an
-    `amount` of them in the lanes that are `on`.
+    """`get(x, i, lane)` and `put(x, i, lane, v)` for flat arrays of V3, `get_mass` and `put_scalar`
+    of V; `count_one` counts a constraint that acted in one lane of the backward sweep,
+    `count_lanes` an `amount` of them in the lanes that are `on`.
     """
     t = structures(scalar, lanes)
     S, V, R3, L, Adjoint = t.S, t.V, t.R3, t.L, t.Adjoint

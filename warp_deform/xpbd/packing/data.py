@@ -196,7 +196,7 @@ class SolverData(PackedWorlds):
         self.reserve_frames(0)
 
     def reserve_knots(self, count: int) -> None:
-        """Make room for `count` way-points of all paths together."""
+        """Make room for `count` knots of all paths together."""
         t, number = self.types, self.number
         self.knot_room = count
         for name, dtype, shape in (
