@@ -35,11 +35,13 @@ _IMPORTED_SOLVED = "bag-items-1", "bag-items-2"
 
 
 class Transition(NamedTuple):
-    """One demonstrated action: what was seen, what was done, and what came of the episode.
+    """One demonstrated action: what was seen, what was done, and where the demonstration ended.
 
     Attributes:
-        color: (H, W, 3) uint8, before the action and at the episode's end
-        height: (H, W) float32 [m], likewise
+        color: before the action (H, W, 3) uint8
+        height: before the action (H, W) float32 [m]
+        goal_color: at the end of the demonstration, which counts as its goal (H, W, 3) uint8
+        goal_height: at the end of the demonstration (H, W) float32 [m]
         action: (7,) float64 pick x, y, yaw, place x, y, yaw, lift [m, rad]
     """
 

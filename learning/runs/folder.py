@@ -5,6 +5,7 @@ log.jsonl                    losses, a line every few steps
 snapshots/step_*.safetensors weights, and beside each a JSON file that says whose they are
 state.safetensors            all that training goes on from
 evaluations/*.json           results of snapshots, episode by episode
+goals/                       goals that were made for test episodes
 eval_info.json               the report of `warp-deform eval`
 
 Weights are safetensors: loading runs no code.

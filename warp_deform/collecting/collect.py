@@ -58,9 +58,12 @@ class CollectReport:
     """What was collected.
 
     Attributes:
-        attempts: seeds up to the one of the last kept success; mean_actions, mean_score,
-            sim_seconds [s] and physics_ok are of the kept episodes
+        attempts: seeds up to the one of the last kept success
+        mean_actions: of the kept episodes
+        mean_score: of the kept episodes
         seconds: what this run took [s]
+        sim_seconds: of the kept episodes together [s]
+        physics_ok: of the kept episodes, whether no guard fired
         state_hash: of the kept episodes' hashes in the order of their seeds
         enclosed: kept episodes whose bag enclosed its items, see `Task.enclosed`; None where there
             are none

@@ -60,7 +60,7 @@ class SearchConfig:
     rate: float = 0.015
     """Length of its first steps [m]; turns go ten times as far [rad]."""
     depth: int = 2
-    """Actions ahead."""
+    """Actions ahead, 1 or 2."""
     beam: int = 3
     """States after the first action that are searched on."""
     joint: bool = False

@@ -1,4 +1,4 @@
-"""Grip paths in, trajectories out: one launch runs whole actions of many worlds."""
+"""Grip paths in, trajectories out: one launch runs many worlds until they rest."""
 
 from __future__ import annotations
 
@@ -110,10 +110,12 @@ def rollout(
     A world's result does not depend on which other worlds run with it.
 
     Args:
+        paths: by world, what is held there and where it is led; nothing in the others
+        pushes: by world, accelerations from the start on
         least: a world runs at least so long after its path [s]
         most: and at most so long in all [s]
-        calm: speeds are clamped to `calm_speed` for so long from the start, `calm_after`: after a
-            release
+        calm: speeds are clamped to `calm_speed` for so long from the start [s]
+        calm_after: and for so long after a release [s]
         record: interval of recorded frames [s]; 0 records nothing
     """
     dt = solver.config.dt

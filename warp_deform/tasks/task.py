@@ -155,8 +155,7 @@ class Task(abc.ABC):
     place_yaws: ClassVar[int] = 1
     """Place yaws to choose among, evenly spread; 1 where the yaw does not matter."""
     version: ClassVar[int] = 1
-    """Of its Gymnasium id: rises with any change of physics, observation or reward. Those of tasks
-    from elsewhere are 1."""
+    """Of its Gymnasium id: rises with any change of physics, observation or reward."""
     looks_aloft: ClassVar[bool] = False
     """Whether its rules ask where things were while what was held hung highest, see `Aloft`."""
 
