@@ -24,6 +24,9 @@ class SpringMode(IntEnum):
     AT_LEAST = 1  # only when shorter than the rest length (fold limits)
     AT_MOST = 2  # only when longer than the rest length (tension-only diagonals)
     BEND = 3  # on a third particle: its distance from the middle of the two is the rest length
+    # solved together with the springs that follow and go on where this one ends
+    CHAIN = 4  # as EQUAL
+    BEAM = 5  # as BEND, with rest length 0
 
 
 def attribute(name: str) -> str:
@@ -40,7 +43,7 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
     spring_mode               spring     a `SpringMode`
     spring_limit              spring     strain limit: largest length / rest length; 0 = none
     spring_floor              spring     smallest length / rest length; 0 = none
-    spring_middle             spring     BEND: the particle between the two
+    spring_middle             spring     BEND, BEAM: the particle between the two
     particle_object           particle   which object of its world a particle belongs to
     particle_rest             particle   position in the object's undeformed shape [m]
     particle_exclusion        particle   no self-contact closer than this in the rest shape [m]

@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..support.checked import NOT_NEGATIVE, POSITIVE, Interval, check_fields
 from .attributes import SpringMode, attribute, next_object, register_attributes
 from .colors import BLUE, WHITE, YELLOW, Color
+from .direct import check_solve, too_heavy, too_stiff
 
 if TYPE_CHECKING:
     import newton
@@ -51,6 +52,10 @@ class CableConfig:
     bend_stiffness: float = 0.0
     """Stiffness of the springs that pull a bead to the middle of its neighbours [N/m], so that the
     cable bends like a beam with E I = bend_stiffness * spacing^3 / 4; the paper's bend freely."""
+    solve: str | None = None
+    """How links and bending are solved: "direct", all of a chain at once, "gauss-seidel", one after
+    the other once a substep, which is cheaper, or None: direct where the cable is long or stiff
+    (`solved_directly`)."""
     exclusion: float = 2.5
     """Beads closer along the chain than this many spacings do not collide."""
     color: Color = BLUE
@@ -69,11 +74,19 @@ class CableConfig:
                 "fold_limit": Interval(low=0.0, high=2.0, below_high=True),
             },
         )
+        check_solve("CableConfig.solve", self.solve)
 
     @property
     def length(self) -> float:
         """Length of the straight cable as the paper counts it, beads times spacing [m]."""
         return self.beads * self.spacing
+
+    @property
+    def solved_directly(self) -> bool:
+        """Whether links are solved together, and bending springs of an open cable."""
+        if self.solve is not None:
+            return self.solve == "direct"
+        return too_heavy(self.beads, self.spacing) or too_stiff(self.bend_stiffness, self.mass)
 
     def colors(self) -> tuple[Color, ...]:
         """Colour of every bead; only an open cable marks its ends."""
@@ -164,15 +177,20 @@ def add_cable(builder: newton.ModelBuilder, config: CableConfig, positions: np.n
             },
         )
     offset = float(np.linalg.norm(rest[1] - (rest[0] + rest[2]) / 2))
+    link, bend = SpringMode.EQUAL, SpringMode.BEND
+    if config.solved_directly:
+        # a closed cable keeps round by an offset, which only single springs have
+        link, bend = SpringMode.CHAIN, SpringMode.BEND if config.closed else SpringMode.BEAM
     for step, length, stiffness, mode in (
-        (1, config.spacing, config.link_stiffness, SpringMode.EQUAL),
+        (1, config.spacing, config.link_stiffness, link),
         (2, config.fold_limit * config.spacing, config.fold_stiffness, SpringMode.AT_LEAST),
-        (2, offset, config.bend_stiffness, SpringMode.BEND),
+        (2, offset, config.bend_stiffness, bend),
     ):
         if stiffness == 0 or (length == 0 and mode == SpringMode.AT_LEAST):
             continue
         starts = range(config.beads if config.closed else config.beads - step)
-        for i in _from_both_ends(starts):
+        together = mode in (SpringMode.CHAIN, SpringMode.BEAM)
+        for i in starts if together else _from_both_ends(starts):
             j = (i + step) % config.beads
             builder.add_spring(
                 first_particle + i,
@@ -185,7 +203,7 @@ def add_cable(builder: newton.ModelBuilder, config: CableConfig, positions: np.n
                     attribute("spring_middle"): first_particle + (i + 1) % config.beads,
                 },
             )
-            builder.spring_rest_length[-1] = length
+            builder.spring_rest_length[-1] = 0.0 if mode == SpringMode.BEAM else length
     return Cable(
         config,
         range(first_particle, builder.particle_count),

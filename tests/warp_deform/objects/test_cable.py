@@ -15,7 +15,9 @@ MASS, BEADS = 0.002, 5
 
 def _droop(bend_stiffness: float) -> float:
     """How far the free end of a cable clamped by its first two beads hangs down [m]."""
-    config = CableConfig(beads=BEADS, mass=MASS, bend_stiffness=bend_stiffness)
+    config = CableConfig(
+        beads=BEADS, mass=MASS, bend_stiffness=bend_stiffness, solve="gauss-seidel"
+    )
     start = cable_line(config, (0.4, 0.0), (0.5, 0.0)) + np.array([0, 0, 0.5])
     builder = newton.ModelBuilder()
     SolverFusedXPBD.register_custom_attributes(builder)

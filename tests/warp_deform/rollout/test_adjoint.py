@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from fixtures.adjoint_check import DT, PARAMETERS, Check, lift, set_state, state
 from fixtures.cloth_scenes import two_sheets_and_a_cable
 from fixtures.solver_scenes import LOOSE, add_particles, box_solver, finalize, ideal, new_builder
 
 from warp_deform.errors import InputError
 from warp_deform.objects import BoxConfig, CableConfig, add_box, add_cable, cable_line
 from warp_deform.objects.push import Push
-from warp_deform.rollout import DifferentiableRollout, Gradients, GripPath, rollout, substep_vjp
+from warp_deform.rollout import DifferentiableRollout, GripPath, rollout, substep_vjp
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 
-DT = 1 / 1200
 SHORT = CableConfig(beads=10)
-PARAMETERS = ("damping", "table_friction", "contact_friction", "stiffness")
 ROLLING = replace(FABRIC_SOLVER, limits=LOOSE, sleep_speed=0.0, max_speed=1e3)
 """A sheet that never sleeps: sleep is a jump, which finite differences would straddle."""
 
@@ -40,122 +38,6 @@ def heap(seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     z = 0.02 + 0.006 * np.arange(SHORT.beads)
     return np.column_stack([rng.normal(0, 4e-3, (SHORT.beads, 2)), z])
-
-
-def set_state(solver: SolverFusedXPBD, x: np.ndarray, v: np.ndarray, world: int = 0) -> None:
-    solver.data.lane("particles.x", world)[:] = x
-    solver.data.lane("particles.v", world)[:] = v
-
-
-def state(solver: SolverFusedXPBD, world: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    return solver.particle_q(world), solver.particle_qd(world)
-
-
-class Check:
-    """A rollout of world 0 from its present state, and its loss along random cotangents."""
-
-    def __init__(
-        self, solver: SolverFusedXPBD, steps: int = 1, path: GripPath | None = None, seed: int = 0
-    ) -> None:
-        self.solver, self.steps, self.path = solver, steps, path
-        self.x, self.v = state(solver)
-        self.w = solver.data.lane("particles.w0", 0).copy()
-        self.rng = np.random.default_rng(seed)
-        self.gx = self.rng.normal(size=self.x.shape)
-        self.gv = self.rng.normal(size=self.x.shape) * 1e-3
-        self.values = {
-            name: solver.data.per_world(f"group.{name}", 0).copy() for name in PARAMETERS
-        }
-
-    def run(self, path: GripPath | None = None, **start: np.ndarray) -> Gradients:
-        at = {"positions": self.x, "velocities": self.v, "inverse_masses": self.w, **self.values}
-        at |= start
-        run = DifferentiableRollout(self.solver)
-        parameters = {
-            n: at[n].reshape(1, -1) if n == "inverse_masses" else at[n]
-            for n in at
-            if n not in ("positions", "velocities")
-        }
-        path = path or self.path
-        run.forward(
-            [0],
-            [self.steps * DT],
-            paths={} if path is None else {0: path},
-            parameters=parameters,
-            positions=at["positions"][None],
-            velocities=at["velocities"][None],
-        )
-        x, v = state(self.solver)
-        # the change only: less is lost to rounding
-        self.loss = float((self.gx * (x - self.x)).sum() + (self.gv * (v - self.v)).sum())
-        return run.backward(self.gx[None, None], self.gv[None, None])
-
-    def error(
-        self, name: str, size: float, along: np.ndarray, by: Callable[..., Gradients] | None = None
-    ) -> tuple[float, float]:
-        """Difference of the two directional derivatives, and their size."""
-        gradients = self.run()
-        value = {
-            "way_points": lambda: gradients.way_points[0],
-            "knot_times": lambda: gradients.knot_times[0],
-        }.get(name, lambda: getattr(gradients, name)[0])()
-        ours = float((value * along).sum())
-        moved = by or (lambda d: self.run(**{name: self._base(name) + d}))
-        moved(size * along)
-        above = self.loss
-        moved(-size * along)
-        return abs((above - self.loss) / (2 * size) - ours), abs(ours)
-
-    def _base(self, name: str) -> np.ndarray:
-        named = {"positions": self.x, "velocities": self.v, "inverse_masses": self.w}
-        return named[name] if name in named else self.values[name]
-
-    def assert_right(self, *, rounding: float = 1.0, draws: int = 3) -> dict[str, int]:
-        """All derivatives agree; returns how often constraints acted.
-
-        Steps are as small as float64 allows, for contacts are a micrometre deep: the error that
-        rounding leaves is allowed for, times `rounding`.
-        """
-        steps = {
-            "positions": 1e-9, "velocities": 1e-7, "inverse_masses": 1e-4 * self.w.max(),
-            "damping": 1e-3, "table_friction": 1e-5, "contact_friction": 1e-5, "stiffness": 1e-4,
-        }  # fmt: skip
-        floor = rounding * 2e-15
-        for name, size in steps.items():
-            base = self._base(name)
-            for _ in range(draws):
-                along = self.rng.normal(size=base.shape) * (base > 0 if "mass" in name else 1)
-                wrong, right = self.error(name, size, along)
-                assert wrong < 1e-6 * right + floor / size, (name, wrong, right)
-        if self.path is not None:
-            self._assert_path(floor)
-        return self.run().counts()
-
-    def _assert_path(self, floor: float) -> None:
-        path = self.path
-        assert path is not None
-        along = self.rng.normal(size=path.positions.shape)
-        wrong, right = self.error(
-            "way_points",
-            1e-8,
-            along,
-            lambda d: self.run(replace(path, positions=path.positions + d)),
-        )
-        assert wrong < 1e-6 * right + floor / 1e-8
-        along = np.arange(len(path.times)) > 0
-        wrong, right = self.error(
-            "knot_times",
-            1e-8,
-            along.astype(float),
-            lambda d: self.run(replace(path, times=path.times + d)),
-        )
-        assert wrong < 1e-6 * right + floor / 1e-8
-
-
-def lift(x: np.ndarray, particle: int = 0, far: float = 1.0) -> GripPath:
-    """A path of 5.2 ms from where the particle is."""
-    knots = x[particle] + far * np.array([[0, 0, 0], [1e-3, 5e-4, 2e-3], [2e-3, 0, 1e-3]])
-    return GripPath(np.array([0, 0.002, 0.0052]), knots, particle=particle)
 
 
 @pytest.fixture(scope="module")

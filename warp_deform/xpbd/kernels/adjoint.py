@@ -49,8 +49,8 @@ def adjoint_kernel(
     sheets_ = sweep_sheets(scalar, lanes, with_edges)
     sweep_viscosity, sweep_tethers = sheets_.sweep_viscosity, sheets_.sweep_tethers
     sweep_fabrics = sheets_.sweep_fabrics
-    Settings, Topology, Springs, Pairs = t.Settings, t.Topology, t.Springs, t.Pairs
-    Shapes = t.Shapes
+    Settings, Topology, Pairs, Shapes = t.Settings, t.Topology, t.Pairs, t.Shapes
+    Springs, Lines = t.Springs, t.Lines
     Group, Particles, Bodies, Contacts, Grips = t.Group, t.Particles, t.Bodies, t.Contacts, t.Grips
     Sheets, Tape, Adjoint, BodyAdjoint, By = t.Sheets, t.Tape, t.Adjoint, t.BodyAdjoint, t.By
 
@@ -67,6 +67,7 @@ def adjoint_kernel(
         contacts: Contacts,
         grips: Grips,
         sheets: Sheets,
+        lines: Lines,
         tape: Tape,
         adj: Adjoint,
         ba: BodyAdjoint,
@@ -127,7 +128,7 @@ def adjoint_kernel(
             by, tops = sweep_contacts(at, pace, now, by, tops, pairs, tape, adj)
             if wp.static(with_sheets):
                 tops = sweep_tethers(at, now, tops, particles, tape, adj)
-            by, tops = sweep_springs(at, pace, now, by, tops, springs, tape, adj)
+            by, tops = sweep_springs(at, pace, now, by, tops, springs, lines, tape, adj)
             # grips
             tops = sweep_grips(at, pace, tops, grips, tape, adj, ba)
             # predict

@@ -61,7 +61,7 @@ def forward_kernel(
     Settings, Topology, Group, Particles = t.Settings, t.Topology, t.Group, t.Particles
     Springs, Pairs, Shapes, Near = t.Springs, t.Pairs, t.Shapes, t.Near
     Bodies, Contacts, Grips, Watch = t.Bodies, t.Contacts, t.Grips, t.Watch
-    Sheets, Cells, Tape, Run = t.Sheets, t.Cells, t.Tape, t.Run
+    Sheets, Cells, Lines, Tape, Run = t.Sheets, t.Cells, t.Lines, t.Tape, t.Run
 
     @wp.kernel(module="unique", enable_backward=False, module_options=kernel_options(scalar, lanes))
     def forward(
@@ -79,6 +79,7 @@ def forward_kernel(
         watch: Watch,
         sheets: Sheets,
         cells: Cells,
+        lines: Lines,
         tape: Tape,
     ):
         g = wp.tid()
@@ -142,7 +143,19 @@ def forward_kernel(
                     break
             # solve
             tops = solve_particles(
-                at, pace, run, tops, particles, springs, pairs, near, grips, sheets, cells, tape
+                at,
+                pace,
+                run,
+                tops,
+                particles,
+                springs,
+                lines,
+                pairs,
+                near,
+                grips,
+                sheets,
+                cells,
+                tape,
             )
             if wp.static(with_bodies):
                 tops = solve_bodies(

@@ -15,7 +15,9 @@ from ..contact.triangle_contact_adjoint import triangle_contact_adjoint
 from ..lanes.algebra import any_less, sub  # noqa: F401  (operators are found by name)
 from ..lanes.group_state import group_state
 from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS
+from ..springs.beam import beam, beam_adjoint
 from ..springs.bending import bending, bending_adjoint
+from ..springs.chain import chain, chain_adjoint
 from ..springs.distance import distance, distance_adjoint
 from ..springs.tether import tether, tether_adjoint
 
@@ -35,6 +37,10 @@ def particle_solve(
     record_distance = distance_adjoint(scalar, lanes, with_sheets).record_distance
     project_bend = bending(scalar, lanes).project_bend
     record_bend = bending_adjoint(scalar, lanes).record_bend
+    project_chain = chain(scalar, lanes).project_chain
+    record_chain = chain_adjoint(scalar, lanes).record_chain
+    project_beam = beam(scalar, lanes).project_beam
+    record_beam = beam_adjoint(scalar, lanes).record_beam
     project_contact = sphere_contact(scalar, lanes).project_contact
     record_contact = sphere_contact_adjoint(scalar, lanes).record_contact
     project_tether = tether(scalar, lanes).project_tether
@@ -44,7 +50,7 @@ def particle_solve(
     project_edges = edge_contact(scalar, lanes).project_edges
     record_edges = edge_contact_adjoint(scalar, lanes).record_edges
     Span, Pace, Run = t.Span, t.Pace, t.Run
-    Particles, Springs, Pairs, Near = t.Particles, t.Springs, t.Pairs, t.Near
+    Particles, Springs, Lines, Pairs, Near = t.Particles, t.Springs, t.Lines, t.Pairs, t.Near
     Grips, Sheets, Cells, Tape = t.Grips, t.Sheets, t.Cells, t.Tape
 
     @wp.func
@@ -55,6 +61,7 @@ def particle_solve(
         tops: wp.vec4i,
         particles: Particles,
         springs: Springs,
+        lines: Lines,
         pairs: Pairs,
         near: Near,
         grips: Grips,
@@ -78,7 +85,23 @@ def particle_solve(
         # always in the same order: sweeping backwards in every other substep makes tight heaps
         # crawl for ever, and shells jitter
         for s in range(at.s0, at.s1):
-            if wp.static(taped):
+            if springs.mode[s] >= wp.static(int(SpringMode.CHAIN)):
+                count = springs.run[s]
+                if count > 0:
+                    if springs.mode[s] == wp.static(int(SpringMode.CHAIN)):
+                        if wp.static(taped):
+                            record_chain(
+                                s, count, p0, tx, inverse_dt2, particles, springs, lines, tape
+                            )
+                            tx += count
+                        else:
+                            project_chain(s, count, p0, inverse_dt2, particles, springs, lines)
+                    elif wp.static(taped):
+                        record_beam(s, count, p0, tx, inverse_dt2, particles, springs, lines, tape)
+                        tx += count
+                    else:
+                        project_beam(s, count, p0, inverse_dt2, particles, springs, lines)
+            elif wp.static(taped):
                 if springs.mode[s] == wp.static(int(SpringMode.BEND)):
                     record_bend(s, p0, tx, inverse_dt2, particles, springs, tape)
                     tx += 1

@@ -18,7 +18,9 @@ from ..lanes.algebra import add, any_less, div, less, mul, select, sub  # noqa: 
 from ..lanes.lane_access import lane_access
 from ..lanes.sweep_state import sweep_state
 from ..lanes.tape import GRIP_WORDS, Kind, tape
+from ..springs.beam import beam_adjoint
 from ..springs.bending import bending_adjoint
+from ..springs.chain import chain_adjoint
 from ..springs.distance import distance_adjoint
 from .grip_adjoint import grip_adjoint
 
@@ -31,10 +33,13 @@ def sweeps(scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool) -> Sim
     t = sweep_state(scalar, lanes)
     S, V, L = t.S, t.V, t.L
     Span, Pace, By, Substep, Always = t.Span, t.Pace, t.By, t.Substep, t.Always
-    Settings, Topology, Springs, Pairs = t.Settings, t.Topology, t.Springs, t.Pairs
+    Settings, Topology, Pairs = t.Settings, t.Topology, t.Pairs
+    Springs, Lines = t.Springs, t.Lines
     Grips, Tape, Adjoint, BodyAdjoint = t.Grips, t.Tape, t.Adjoint, t.BodyAdjoint
     sweep_distance = distance_adjoint(scalar, lanes, with_sheets).sweep_distance
     sweep_bend = bending_adjoint(scalar, lanes).sweep_bend
+    sweep_chain = chain_adjoint(scalar, lanes).sweep_chain
+    sweep_beam = beam_adjoint(scalar, lanes).sweep_beam
     sweep_contact = sphere_contact_adjoint(scalar, lanes).sweep_contact
     table_ = table_contact_adjoint(scalar, lanes, with_sheets)
     sweep_finish, sweep_predict = table_.sweep_finish, table_.sweep_predict
@@ -52,9 +57,12 @@ def sweeps(scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool) -> Sim
         stretches = int(0)
         damped = int(0)
         for s in range(at.s0, at.s1):
-            if springs.mode[s] == wp.static(int(SpringMode.BEND)):
+            mode = springs.mode[s]
+            if mode == wp.static(int(SpringMode.BEND)) or mode == wp.static(int(SpringMode.BEAM)):
                 bends += 1
-            elif springs.mode[s] == wp.static(int(SpringMode.EQUAL)):
+            elif mode == wp.static(int(SpringMode.EQUAL)):
+                stretches += 1
+            elif mode == wp.static(int(SpringMode.CHAIN)):
                 stretches += 1
             if springs.limit[s] > S(0.0):
                 damped += 1
@@ -202,6 +210,7 @@ def sweeps(scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool) -> Sim
         by: By,
         tops: wp.vec4i,
         springs: Springs,
+        lines: Lines,
         tape: Tape,
         adj: Adjoint,
     ):
@@ -213,7 +222,29 @@ def sweeps(scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool) -> Sim
         for r in range(at.s1 - at.s0):
             s = at.s1 - 1 - r
             mode = springs.mode[s]
-            if mode == wp.static(int(SpringMode.BEND)):
+            if mode >= wp.static(int(SpringMode.CHAIN)):
+                # all at once when the first one's turn comes
+                count = springs.run[s]
+                tx -= count
+                if count > 0 and mode == wp.static(int(SpringMode.CHAIN)):
+                    by_inverse_dt2 = by_inverse_dt2 + sweep_chain(
+                        s,
+                        count,
+                        at.p0,
+                        tx,
+                        pace.inverse_dt2,
+                        springs,
+                        lines,
+                        now.counts,
+                        now.on,
+                        tape,
+                        adj,
+                    )
+                elif count > 0:
+                    by_inverse_dt2 = by_inverse_dt2 + sweep_beam(
+                        s, count, at.p0, tx, pace.inverse_dt2, springs, lines, tape, adj
+                    )
+            elif mode == wp.static(int(SpringMode.BEND)):
                 tx -= 1
                 by_inverse_dt2 = by_inverse_dt2 + sweep_bend(
                     s, at.p0, tape.x[tx], pace.inverse_dt2, springs, adj

@@ -69,6 +69,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         mode: wp.array(dtype=int)
         watched: wp.array(dtype=int)  # 1: the stretch guard looks at it
         middle: wp.array(dtype=int)  # of a bending spring: the particle between the two
+        run: wp.array(dtype=int)  # of a direct solve: springs from here on; 0: amid them
 
     @wp.struct
     class Pairs:
@@ -120,6 +121,23 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         w: wp.array(dtype=V)  # inverse mass [1/kg], 0 while gripped
         w0: wp.array(dtype=V)  # inverse mass when free
         tether: wp.array(dtype=V)  # farthest from what is held [m], see `tether`
+
+    @wp.struct
+    class Lines:
+        """Scratch of direct solves (`chain`, `beam`), by the particle where a spring begins, or
+        that it bends.
+        """
+
+        along: wp.array(dtype=V3)  # direction of a spring; multiplier of a bent one
+        bend: wp.array(dtype=V3)  # right side, then solution
+        length: wp.array(dtype=V)  # [m]
+        target: wp.array(dtype=V)  # length to be reached [m]
+        elastic: wp.array(dtype=V)  # 1: with the spring's compliance, 0: rigid
+        inverse: wp.array(dtype=V)  # of a pivot, which is a sum of inverse masses
+        ratio: wp.array(dtype=V)  # what couples a spring to the next one, over the pivot
+        ratio2: wp.array(dtype=V)  # and to the one after that
+        multiplier: wp.array(dtype=V)
+        turned: wp.array(dtype=V)  # derivative by the right side
 
     @wp.struct
     class Near:
@@ -352,6 +370,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         Shapes=Shapes,
         Group=Group,
         Particles=Particles,
+        Lines=Lines,
         Near=Near,
         Bodies=Bodies,
         Grips=Grips,

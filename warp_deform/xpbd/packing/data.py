@@ -8,6 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from ...objects.attributes import SpringMode
 from ...objects.push import MOST_PUSHES
 from ...support.quaternion import quat_rotate
 from ..bodies.box_box import POINTS
@@ -19,7 +20,8 @@ from .topology import tethers
 __all__ = ["KERNEL_ARGUMENTS", "WATCHED", "SolverData"]
 
 KERNEL_ARGUMENTS = ("topology", "springs", "pairs", "shapes", "group", "particles", "near",
-                    "bodies", "contacts", "grips", "watch", "sheets", "cells", "tape")  # fmt: skip
+                    "bodies", "contacts", "grips", "watch", "sheets", "cells", "lines",
+                    "tape")  # fmt: skip
 """The kernel's structs, after the settings, in the order of its arguments."""
 
 WATCHED = ("steps", "nonfinite", "stretch", "depth", "box_depth", "box_overlap", "clamped",
@@ -84,6 +86,7 @@ class SolverData(PackedWorlds):
             ("springs.mode", joined("spring_mode")),
             ("springs.watched", joined("spring_watched")),
             ("springs.middle", joined("spring_middle")),
+            ("springs.run", joined("spring_run")),
         ):
             self.add_constant(name, np.asarray(values), wp.int32, np.int32)
         self.add_constant("topology.radius", joined("particle_radius"), t.S, number)
@@ -146,6 +149,13 @@ class SolverData(PackedWorlds):
             self.add_array(f"particles.{name}", count, self.types.V3, (3, L), self.number)
         for name in ("w", "w0", "tether"):
             self.add_array(f"particles.{name}", count, self.types.V, (L,), self.number)
+        direct = np.isin(self.views["springs.mode"], (SpringMode.CHAIN, SpringMode.BEAM)).any()
+        room = count if direct else 0
+        for name in ("along", "bend"):
+            self.add_array(f"lines.{name}", room, self.types.V3, (3, L), self.number)
+        for name in ("length", "target", "elastic", "inverse", "ratio", "ratio2", "multiplier",
+                     "turned"):  # fmt: skip
+            self.add_array(f"lines.{name}", room, self.types.V, (L,), self.number)
         if self.has_particles:
             inverse = self.model.particle_inv_mass.numpy()
             for w in range(self.world_count):

@@ -19,7 +19,9 @@ from ...objects.attributes import NAMESPACE, SpringMode
 from ..springs.tether import NO_TETHER
 from .sheets import Sheets
 
-__all__ = ["WorldTopology", "read_worlds", "tethers"]
+__all__ = ["WorldTopology", "read_worlds", "runs", "tethers"]
+
+_BENDING = (int(SpringMode.BEND), int(SpringMode.BEAM))
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +40,7 @@ class WorldTopology:
         spring_watched: (S,), two-sided and not a soft one of a fabric; the stretch guard looks at
             these
         spring_middle: (S,), third particle of a bending spring, else -1
+        spring_run: (S,), springs that are solved together from this one on; 0: amid them
         pair_ij: (C, 2), particles that may collide
         pair_distance: (C,), where they touch [m]
         particle_radius: (P,) [m]
@@ -66,6 +69,7 @@ class WorldTopology:
     spring_mode: np.ndarray
     spring_watched: np.ndarray
     spring_middle: np.ndarray
+    spring_run: np.ndarray
     pair_ij: np.ndarray
     pair_distance: np.ndarray
     particle_radius: np.ndarray
@@ -116,6 +120,30 @@ def tethers(topology: WorldTopology, held: int) -> np.ndarray:
         longest[joined] = reach[joined]
     longest.flags.writeable = False  # callers share it
     return longest
+
+
+def runs(ij: np.ndarray, middle: np.ndarray, mode: np.ndarray) -> np.ndarray:
+    """Numbers (S,) of springs that are solved together, at the first of them; 0 at the others.
+
+    A CHAIN spring goes on where the one before ended, a BEAM spring bends the next particle. A run
+    ends before a particle that it has met, so the spring that closes a ring is solved by itself.
+    """
+    out = np.ones(len(ij), int)
+    first, met = 0, set[int]()
+    for s, (i, j) in enumerate(ij.tolist()):
+        goes_on = s > first and mode[s] == mode[s - 1] and j not in met
+        if mode[s] == int(SpringMode.CHAIN):
+            goes_on = goes_on and i == ij[s - 1, 1]
+        elif mode[s] == int(SpringMode.BEAM):
+            goes_on = goes_on and (i, middle[s]) == (middle[s - 1], ij[s - 1, 1])
+        else:
+            goes_on = False
+        if goes_on:
+            out[first], out[s] = out[first] + 1, 0
+        else:
+            first, met = s, {i, int(middle[s])}
+        met.add(j)
+    return out
 
 
 def _slices(worlds: np.ndarray, count: int, what: str) -> list[np.ndarray]:
@@ -200,7 +228,10 @@ def _refuse_unsupported(model: newton.Model) -> None:
     if model.body_count and (model.body_flags.numpy() & int(newton.BodyFlags.KINEMATIC)).any():
         raise InputError("SolverFusedXPBD has no kinematic bodies: hold the body with a grip path")
     if model.spring_count:
-        bent = getattr(model, NAMESPACE).spring_mode.numpy() == int(SpringMode.BEND)
+        mode = getattr(model, NAMESPACE).spring_mode.numpy()
+        bent = np.isin(mode, _BENDING)
+        if model.spring_rest_length.numpy()[mode == int(SpringMode.BEAM)].any():
+            raise InputError("a BEAM spring needs rest length 0: only BEND springs have another")
         for what, values in (
             ("rest length", model.spring_rest_length.numpy()[~bent]),
             ("stiffness", model.spring_stiffness.numpy()),
@@ -225,8 +256,8 @@ class _Springs:
             # a fabric's edges have a strain limit; its bending pairs may lengthen as it flattens
             corners = model.tri_indices.numpy() if model.tri_count else np.zeros(0, int)
             edge = (self.limit > 0) | ~np.isin(self.ij, corners).any(axis=1)
-            self.watched = edge & (self.mode == int(SpringMode.EQUAL))
-            self.middle = np.where(self.mode == int(SpringMode.BEND), middle, -1)
+            self.watched = edge & np.isin(self.mode, (SpringMode.EQUAL, SpringMode.CHAIN))
+            self.middle = np.where(np.isin(self.mode, _BENDING), middle, -1)
 
     def of(self, ids: np.ndarray, local: np.ndarray) -> dict[str, np.ndarray]:
         if not self.count:
@@ -240,9 +271,10 @@ class _Springs:
                 "spring_mode": empty.astype(int),
                 "spring_watched": empty.astype(int),
                 "spring_middle": empty.astype(int),
+                "spring_run": empty.astype(int),
             }
         mine = np.isin(self.ij[:, 0], ids)
-        bent = mine & (self.mode == int(SpringMode.BEND))
+        bent = mine & np.isin(self.mode, _BENDING)
         if not np.isin(self.middle[bent], ids).all():
             raise InputError("a BEND spring needs spring_middle, a particle of its own world")
         return {
@@ -254,6 +286,7 @@ class _Springs:
             "spring_mode": self.mode[mine],
             "spring_watched": self.watched[mine],
             "spring_middle": local[self.middle[mine]],
+            "spring_run": runs(self.ij[mine], self.middle[mine], self.mode[mine]),
         }
 
 

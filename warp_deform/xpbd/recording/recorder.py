@@ -25,7 +25,7 @@ __all__ = ["Recorder"]
 
 _NEAR = 4 * 2**20  # bytes of a tape that is replayed, where memory allows
 _SWEPT = ("topology", "springs", "pairs", "shapes", "group", "particles", "bodies", "contacts",
-          "grips", "sheets")  # fmt: skip
+          "grips", "sheets", "lines")  # fmt: skip
 _BODY = ("x", "q", "v", "omega")
 _READ = ("particles.x", "particles.v", *(f"bodies.{n}" for n in _BODY))
 _ADJOINT_OF = {"particles.x": "x", "particles.v": "v"} | {f"bodies.{n}": f"body.{n}" for n in _BODY}
