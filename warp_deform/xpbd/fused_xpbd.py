@@ -100,8 +100,9 @@ class FusedXPBD:
     def set_world(self, world: int, **parameters: float) -> None:
         """Set damping [1/s], table_friction, contact_friction or stiffness of one world."""
         for name, value in parameters.items():
-            if name not in ("damping", "table_friction", "contact_friction", "stiffness"):
-                raise InputError(f"a world has no parameter {name!r}")
+            known = ("damping", "table_friction", "contact_friction", "stiffness")
+            if name not in known:
+                raise InputError(f"a world has no parameter {name!r}; it has {', '.join(known)}")
             check_number(value, name, POSITIVE if name == "stiffness" else NOT_NEGATIVE)
             self.data.per_world(f"group.{name}", world)[:] = value
 

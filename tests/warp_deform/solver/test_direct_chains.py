@@ -163,3 +163,12 @@ def test_a_beam_has_no_offset() -> None:
     builder.custom_attributes[attribute("spring_middle")].values = {0: 1}
     with pytest.raises(InputError, match="a BEAM spring needs rest length 0"):
         finalize(builder)
+
+
+@pytest.mark.parametrize("mode", [-1, len(SpringMode)])
+def test_a_mode_that_there_is_not_is_refused(mode: int) -> None:
+    builder = new_builder()
+    add_particles(builder, [[0, 0, 1], [0.1, 0, 1]], links=[(0, 1, 0.1)])
+    builder.custom_attributes[attribute("spring_mode")].values = {0: mode}
+    with pytest.raises(InputError, match=f"there is no spring_mode {mode}; there are: 0 EQUAL"):
+        finalize(builder)

@@ -230,6 +230,10 @@ def _refuse_unsupported(model: newton.Model) -> None:
     if model.spring_count:
         mode = getattr(model, NAMESPACE).spring_mode.numpy()
         bent = np.isin(mode, _BENDING)
+        unknown = mode[~np.isin(mode, list(SpringMode))]
+        if len(unknown):
+            modes = ", ".join(f"{each.value} {each.name}" for each in SpringMode)
+            raise InputError(f"there is no spring_mode {unknown[0]}; there are: {modes}")
         if model.spring_rest_length.numpy()[mode == int(SpringMode.BEAM)].any():
             raise InputError("a BEAM spring needs rest length 0: only BEND springs have another")
         for what, values in (
