@@ -235,6 +235,41 @@ def test_a_box_on_a_box(turn: tuple[float, float, float]) -> None:
     assert counts["body_body"] > 0 and counts["body_table"] > 0
 
 
+@pytest.mark.parametrize("masses", [(0.05, 0.05, 0.05), (0.05, 0.05, 2.0)])
+def test_a_stack_that_is_pressed_and_turned(masses: tuple[float, ...]) -> None:
+    """The visits from the table up and back down are the start of the passes over all contacts."""
+    boxes = [replace(CUBE, mass=mass) for mass in masses]
+    spots = [(0.0, 0.0, 0.0199), (0.004, 0.003, 0.0597), (-0.003, 0.002, 0.0995)]
+    solver = box_solver(*zip(boxes, spots, strict=True), config=SOLID)
+    for body, turn in enumerate([(0.002, 0.001, 0.3), (-0.001, 0.002, 0.9), (0.001, 0.001, 0.1)]):
+        tilted(solver, turn, spots[body][2], body)
+    set_twist(
+        solver, (0.02, 0, 0, 0, 0, 0.1), (-0.1, 0.05, -0.2, 0, 0, -0.4), (0, 0.1, -0.1, 0, 0, 0)
+    )
+    counts = Check(solver, 2).assert_right(rounding=30.0)
+    assert counts["body_body"] >= 8 and counts["body_table"] > 0
+
+
+def test_a_box_that_is_pushed_from_the_side() -> None:
+    solver = box_solver((CUBE, (0, 0, 0.0199)), (CUBE, (0.0398, 0.006, 0.0199)), config=SOLID)
+    tilted(solver, (0.001, 0.002, 0.1), 0.0199)
+    tilted(solver, (0.002, -0.001, 0.15), 0.0199, body=1)
+    set_twist(solver, (0.4, 0, 0, 0, 0, 0.3), (-0.1, 0.1, 0, 0, 0, -0.2))
+    counts = Check(solver, 2).assert_right(rounding=30.0)
+    assert counts["body_body"] > 0 and counts["body_table"] > 0
+
+
+def test_a_free_box_under_a_held_one() -> None:
+    """What holds from above carries nothing: it is no support."""
+    solver = box_solver((CUBE, (0, 0, 0.0199)), (CUBE, (0.003, 0.002, 0.0597)), config=SOLID)
+    tilted(solver, (0.001, 0.002, 0.2), 0.0199)
+    path = GripPath(
+        np.array([0, 0.01]), np.array([[0.003, 0.002, 0.0597], [0.003, 0.002, 0.0592]]), body=1
+    )
+    counts = Check(solver, 2, path).assert_right(rounding=30.0)
+    assert counts["body_body"] > 0 and counts["grip"] == 2
+
+
 def test_edges_of_boxes_across_each_other() -> None:
     solver = box_solver((CUBE, (0, 0, 0.03)), (CUBE, (0.0, 0.0, 0.086)), config=SOLID)
     tilted(solver, (np.pi / 4, 0, 0), 0.03)

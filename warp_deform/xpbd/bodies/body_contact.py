@@ -16,32 +16,32 @@ import warp as wp
 from ..lanes.structures import structures
 from .rigid_body import rigid_body
 
-__all__ = ["AHEAD", "GIVEN_BACK", "PASSES", "VISIT", "body_contact"]
+__all__ = ["AHEAD", "ALONE", "BOTH", "GIVEN_BACK", "REACTION", "SHARED", "VISIT", "body_contact"]
 
-PASSES = 6
-"""Passes over the contacts at most."""
-EXACT = 1.0e-7
-"""When no impulse of a pass moved its contact by more than this [m], the passes end."""
 GIVEN_BACK = 0.2
 """Share of an overlap that a substep undoes: all at once, it would become speed and rock the
 box."""
-VISIT = 5
+STEEP = 0.5
+"""Least vertical share of the normal with which one body rests on another."""
+VISIT = 6
 """Scalars of `Contacts.log` for a visit."""
+BOTH, ALONE, SHARED, REACTION = 0, 1, 2, 3
+"""Kinds of visits: of both bodies, of the upper one alone, its shares, what the lower one takes."""
 AHEAD = 1.0e-4
 """Points this far apart are listed: the solution itself may bring them together [m]."""
 
 
 @functools.cache
 def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
-    """`begin_body`, `list_contact` for every pair of points, `solve_contacts`, `end_body`.
+    """What happens to one contact: `list_contact`, then visits of the kinds that `body_sweeps` asks
+    for, between `begin_body` and `end_body` of every body.
 
-    `share_load` follows the listing of one pair of bodies. `relative` is how far the points of a
-    contact have been moved against each other, which the adjoint asks, too.
+    `relative` is how far the points of a contact have been moved against each other, which the
+    adjoint asks, too.
 
     Args:
-        noted: for the backward sweep, impulses before every visit are written to `Contacts.log`,
-            and how many contacts share a load to `Contacts.code`; `solve_contacts` returns its
-            passes
+        noted: for the backward sweep, every visit is written to `Contacts.visit` and the impulses
+            before it to `Contacts.log`
     """
     t = structures(scalar, lanes)
     S, R3, M33, Bodies, Contacts = t.S, t.R3, t.M33, t.Bodies, t.Contacts
@@ -64,17 +64,34 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
         bodies.q[b] = turned(bodies.q[b], bodies.dr[b])
 
     @wp.func
-    def weight(b: int, r: R3, n: R3, bodies: Bodies):
-        """Inverse mass that an impulse along the unit vector n at offset r meets [1/kg]."""
-        rn = wp.cross(r, n)
-        return bodies.w[b] + wp.dot(rn, bodies.spread[b] * rn)
+    def carries(c: int, contacts: Contacts):
+        """Whether the upper body of contact c rests on the lower one, rather than leans on it."""
+        n = contacts.normal[c]
+        w = contacts.upper[c]
+        return n[2] > S(STEEP) and w[0] > S(0.0)
 
     @wp.func
-    def pair_weight(c: int, n: R3, bodies: Bodies, contacts: Contacts):
-        w = weight(contacts.b[c], contacts.rb[c], n, bodies)
-        if contacts.a[c] >= 0:
-            w += weight(contacts.a[c], contacts.ra[c], n, bodies)
-        return w
+    def note(at: int, c: int, how: int, old: R3, contacts: Contacts):
+        contacts.visit[at] = wp.vec2i(c, how)
+        for k in range(3):
+            contacts.log[at * wp.static(VISIT) + k] = old[k]
+
+    @wp.func
+    def note_friction(at: int, fu: S, fv: S, contacts: Contacts):
+        contacts.log[at * wp.static(VISIT) + 3] = fu
+        contacts.log[at * wp.static(VISIT) + 4] = fv
+
+    @wp.func
+    def weights(b: int, r: R3, n: R3, u: R3, v: R3, bodies: Bodies):
+        """Inverse masses that impulses along n, u and v at offset r meet [1/kg]."""
+        rn = wp.cross(r, n)
+        ru = wp.cross(r, u)
+        rv = wp.cross(r, v)
+        spread = bodies.spread[b]
+        w = bodies.w[b]
+        return R3(
+            w + wp.dot(rn, spread * rn), w + wp.dot(ru, spread * ru), w + wp.dot(rv, spread * rv)
+        )
 
     @wp.func
     def list_contact(
@@ -91,31 +108,37 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
     ):
         """Contact c: point pb of body b stays ahead of point pa of body a (-1: the table) along n.
 
-        Of an overlap that the substep began with, a share is given back, at most `max_recovery`.
+        A body that rests on another one is listed as `Contacts.b`. Of an overlap that the substep
+        began with, a share is given back, at most `max_recovery`.
         """
-        contacts.a[c] = a
-        contacts.b[c] = b
-        rb = pb - bodies.x[b]
+        turned_over = a >= 0 and n[2] < -S(STEEP)
+        lower = wp.where(turned_over, b, a)
+        upper = wp.where(turned_over, a, b)
+        low = wp.where(turned_over, pb, pa)
+        high = wp.where(turned_over, pa, pb)
+        up = wp.where(turned_over, -n, n)
+        contacts.a[c] = lower
+        contacts.b[c] = upper
+        rb = high - bodies.x[upper]
         contacts.rb[c] = rb
-        slip = moved(b, bodies, wp.quat_rotate_inv(bodies.q[b], rb))
-        if a >= 0:
-            ra = pa - bodies.x[a]
+        slip = moved(upper, bodies, wp.quat_rotate_inv(bodies.q[upper], rb))
+        u = wp.normalize(wp.cross(up, R3(S(1.0), S(0.0), S(0.0))))
+        if wp.abs(up[0]) > S(0.7):
+            u = wp.normalize(wp.cross(up, R3(S(0.0), S(1.0), S(0.0))))
+        v = wp.cross(up, u)
+        w = weights(upper, rb, up, u, v, bodies)
+        contacts.upper[c] = w
+        if lower >= 0:
+            ra = low - bodies.x[lower]
             contacts.ra[c] = ra
-            slip -= moved(a, bodies, wp.quat_rotate_inv(bodies.q[a], ra))
-        u = wp.normalize(wp.cross(n, R3(S(1.0), S(0.0), S(0.0))))
-        if wp.abs(n[0]) > S(0.7):
-            u = wp.normalize(wp.cross(n, R3(S(0.0), S(1.0), S(0.0))))
-        v = wp.cross(n, u)
-        gap = wp.dot(pb - pa, n)
-        before = gap - wp.dot(slip, n)
-        contacts.normal[c] = n
+            slip -= moved(lower, bodies, wp.quat_rotate_inv(bodies.q[lower], ra))
+            w += weights(lower, ra, up, u, v, bodies)
+        contacts.weights[c] = w
+        gap = wp.dot(high - low, up)
+        before = gap - wp.dot(slip, up)
+        contacts.normal[c] = up
         contacts.u[c] = u
         contacts.v[c] = v
-        contacts.weights[c] = R3(
-            pair_weight(c, n, bodies, contacts),
-            pair_weight(c, u, bodies, contacts),
-            pair_weight(c, v, bodies, contacts),
-        )
         overlap = wp.max(-before, S(0.0))
         remaining = wp.max(overlap - max_recovery, overlap * S(1.0 - GIVEN_BACK))
         contacts.steps[c] = R3(gap + remaining, wp.dot(slip, u), wp.dot(slip, v))
@@ -133,114 +156,127 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
         return d
 
     @wp.func
-    def apply(c: int, impulse: R3, bodies: Bodies, contacts: Contacts):
+    def push_upper(c: int, impulse: R3, bodies: Bodies, contacts: Contacts):
         b = contacts.b[c]
         bodies.dx[b] = bodies.dx[b] + impulse * bodies.w[b]
         bodies.dr[b] = bodies.dr[b] + bodies.spread[b] * wp.cross(contacts.rb[c], impulse)
+
+    @wp.func
+    def push_lower(c: int, impulse: R3, bodies: Bodies, contacts: Contacts):
         a = contacts.a[c]
         if a >= 0:
             bodies.dx[a] = bodies.dx[a] - impulse * bodies.w[a]
             bodies.dr[a] = bodies.dr[a] - bodies.spread[a] * wp.cross(contacts.ra[c], impulse)
 
     @wp.func
-    def share_load(start: int, end: int, bodies: Bodies, contacts: Contacts):
-        """First guess for the contacts start .. end of one pair of bodies: each carries its share
-        without turning anything, as under a box that rests or slides.
-        """
-        loaded = S(0.0)
-        for c in range(start, end):
-            s = contacts.steps[c]
-            if s[0] < S(0.0):
-                loaded += S(1.0)
-        for c in range(start, end):
-            total = bodies.w[contacts.b[c]]
-            if contacts.a[c] >= 0:
-                total += bodies.w[contacts.a[c]]
-            part = S(1.0) / (total * wp.max(loaded, S(1.0)))
-            s = contacts.steps[c]
-            normal = wp.max(-s[0], S(0.0)) * part
-            fu = -s[1] * part
-            fv = -s[2] * part
-            f = wp.sqrt(fu * fu + fv * fv)
-            share = wp.min(contacts.mu[c] * normal / wp.max(f, S(1.0e-30)), S(1.0))
-            if wp.static(noted):
-                code = contacts.code[c]
-                code[3] = wp.max(int(loaded), 1)
-                contacts.code[c] = code
-            contacts.impulse[c] = R3(normal, fu * share, fv * share)
-            across = contacts.u[c] * (fu * share) + contacts.v[c] * (fv * share)
-            apply(c, contacts.normal[c] * normal + across, bodies, contacts)
+    def visit(c: int, at: int, alone: bool, bodies: Bodies, contacts: Contacts):
+        """One contact once; returns the largest step that it made [m].
 
-    @wp.func
-    def solve_contact(c: int, at: int, bodies: Bodies, contacts: Contacts):
-        """One contact once; returns the largest step that it made [m]."""
+        Args:
+            alone: whether the lower body stays where it is
+        """
         n = contacts.normal[c]
         u = contacts.u[c]
         v = contacts.v[c]
         w = contacts.weights[c]
+        if alone:
+            w = contacts.upper[c]
         s = contacts.steps[c]
         old = contacts.impulse[c]
-        if wp.static(noted):
-            for k in range(3):
-                contacts.log[at + k] = old[k]
         normal = wp.max(old[0] - (s[0] + wp.dot(relative(c, bodies, contacts), n)) / w[0], S(0.0))
         largest = wp.abs(normal - old[0]) * w[0]
+        if wp.static(noted):
+            note(at, c, wp.where(alone, wp.static(ALONE), wp.static(BOTH)), old, contacts)
         if normal > S(0.0) or old[0] > S(0.0):
-            apply(c, n * (normal - old[0]), bodies, contacts)
+            step = n * (normal - old[0])
+            push_upper(c, step, bodies, contacts)
+            if not alone:
+                push_lower(c, step, bodies, contacts)
             # friction takes back the step across the normal as far as its budget goes
             d = relative(c, bodies, contacts)
             fu = old[1] - (s[1] + wp.dot(d, u)) / w[1]
             fv = old[2] - (s[2] + wp.dot(d, v)) / w[2]
             if wp.static(noted):
-                contacts.log[at + 3] = fu
-                contacts.log[at + 4] = fv
+                note_friction(at, fu, fv, contacts)
             budget = contacts.mu[c] * normal
             f = wp.sqrt(fu * fu + fv * fv)
             if f > budget:
                 fu = fu * (budget / f)
                 fv = fv * (budget / f)
-            apply(c, u * (fu - old[1]) + v * (fv - old[2]), bodies, contacts)
+            step = u * (fu - old[1]) + v * (fv - old[2])
+            push_upper(c, step, bodies, contacts)
+            if not alone:
+                push_lower(c, step, bodies, contacts)
             contacts.impulse[c] = R3(normal, fu, fv)
             across = wp.max(wp.abs(fu - old[1]) * w[1], wp.abs(fv - old[2]) * w[2])
             largest = wp.max(largest, across)
         return largest
 
     @wp.func
-    def solve_contacts(start: int, end: int, bodies: Bodies, contacts: Contacts):
-        """Solve contacts start .. end, forwards and backwards in turn."""
-        p = int(0)
-        done = int(0)
-        at = start * wp.static(PASSES * VISIT)
-        while p < wp.static(PASSES):
-            largest = S(0.0)
-            for k in range(end - start):
-                c = start + k
-                if p % 2 == 1:
-                    c = end - 1 - k
-                largest = wp.max(largest, solve_contact(c, at, bodies, contacts))
+    def share_load(first: int, last: int, at: int, bodies: Bodies, contacts: Contacts):
+        """Contacts first .. last of `Contacts.order`, which hold one body: each takes its share of
+        what is left to hold, without turning anything, as under a box that rests or slides.
+        """
+        b = contacts.b[contacts.order[first]]
+        loaded = S(0.0)
+        for k in range(first, last):
+            c = contacts.order[k]
+            if carries(c, contacts):
+                s = contacts.steps[c]
+                old = contacts.impulse[c]
+                left = s[0] + wp.dot(relative(c, bodies, contacts), contacts.normal[c])
+                if left < S(0.0) or old[0] > S(0.0):
+                    loaded += S(1.0)
+        part = S(1.0) / (bodies.w[b] * wp.max(loaded, S(1.0)))
+        dx = bodies.dx[b]
+        dr = bodies.dr[b]
+        for k in range(first, last):
+            c = contacts.order[k]
+            if carries(c, contacts):
+                n = contacts.normal[c]
+                u = contacts.u[c]
+                v = contacts.v[c]
+                s = contacts.steps[c]
+                old = contacts.impulse[c]
+                d = relative(c, bodies, contacts)
+                normal = wp.max(old[0] - (s[0] + wp.dot(d, n)) * part, S(0.0))
+                fu = old[1] - (s[1] + wp.dot(d, u)) * part
+                fv = old[2] - (s[2] + wp.dot(d, v)) * part
                 if wp.static(noted):
-                    at += wp.static(VISIT)
-            p += 1
-            done = p
-            if largest < S(EXACT):
-                p = wp.static(PASSES)
-        for c in range(start, end):
-            impulse = contacts.impulse[c]
-            if impulse[0] > S(0.0):
-                a = contacts.a[c]
-                b = contacts.b[c]
-                bodies.support[b] = bodies.support[b] + 1
-                if a >= 0:
-                    bodies.support[a] = bodies.support[a] + 1
-                    bodies.touching[a] = bodies.touching[a] + 1
-                    bodies.touching[b] = bodies.touching[b] + 1
-        return done
+                    note(at, c, wp.static(SHARED), old, contacts)
+                    note_friction(at, fu, fv, contacts)
+                    contacts.log[at * wp.static(VISIT) + 5] = wp.max(loaded, S(1.0))
+                    at += 1
+                budget = contacts.mu[c] * normal
+                f = wp.sqrt(fu * fu + fv * fv)
+                if f > budget:
+                    fu = fu * (budget / f)
+                    fv = fv * (budget / f)
+                new = R3(normal, fu, fv)
+                contacts.impulse[c] = new
+                step = n * (new[0] - old[0]) + u * (new[1] - old[1]) + v * (new[2] - old[2])
+                dx += step * bodies.w[b]
+                dr += bodies.spread[b] * wp.cross(contacts.rb[c], step)
+        bodies.dx[b] = dx
+        bodies.dr[b] = dr
+        return at
+
+    @wp.func
+    def react(c: int, at: int, bodies: Bodies, contacts: Contacts):
+        """The lower body of contact c takes the load that the upper one has met."""
+        f = contacts.impulse[c]
+        if wp.static(noted):
+            note(at, c, wp.static(REACTION), f, contacts)
+        push = contacts.normal[c] * f[0] + contacts.u[c] * f[1] + contacts.v[c] * f[2]
+        push_lower(c, push, bodies, contacts)
 
     return SimpleNamespace(
         begin_body=begin_body,
         list_contact=list_contact,
-        share_load=share_load,
         relative=relative,
-        solve_contacts=solve_contacts,
+        visit=visit,
+        share_load=share_load,
+        react=react,
+        carries=carries,
         end_body=end_body,
     )

@@ -18,6 +18,15 @@ from .box_axes import box_axes
 
 __all__ = ["POINTS", "box_box"]
 
+FLUSH = 2.0e-5
+"""Edges that miss a face by less are on it [m]: of equal boxes they coincide, and rounding decides
+on which side they are."""
+INSIDE = 1.0e-5
+"""Corners of a face that are inside the other one by more are contacts, too [m]."""
+EVEN = 2.0e-6
+"""What separates the overlaps along two axes at least, for the later one to be chosen [m]."""
+CROSSED = 2.0e-5
+"""The same if the later one is that of two edges."""
 POINTS = 12
 """Most contacts of two boxes: 8 ends of edges and 4 corners."""
 
@@ -34,7 +43,7 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     S, R3, M33 = t.S, t.R3, t.M33
     Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
     contact, box = body_contact(scalar, lanes, noted), box_axes(scalar, lanes)
-    list_contact, share_load = contact.list_contact, contact.share_load
+    list_contact = contact.list_contact
     center, axes, column, reach, candidate = (
         box.center,
         box.axes,
@@ -46,7 +55,9 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     @wp.func
     def list_face(
         c: int,
+        sa: int,
         a: int,
+        sb: int,
         b: int,
         axis: int,
         n: R3,
@@ -101,20 +112,22 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
             pv = wp.dot(p - ca, v)
             du = wp.dot(d, u)
             dv = wp.dot(d, v)
+            wu = hu + S(FLUSH)
+            wv = hv + S(FLUSH)
             if wp.abs(du) > S(1.0e-9):
-                lo = wp.max(lo, wp.min((-hu - pu) / du, (hu - pu) / du))
-                hi = wp.min(hi, wp.max((-hu - pu) / du, (hu - pu) / du))
-            elif wp.abs(pu) > hu:
+                lo = wp.max(lo, wp.min((-wu - pu) / du, (wu - pu) / du))
+                hi = wp.min(hi, wp.max((-wu - pu) / du, (wu - pu) / du))
+            elif wp.abs(pu) > wu:
                 hi = S(-1.0)
             if wp.abs(dv) > S(1.0e-9):
-                lo = wp.max(lo, wp.min((-hv - pv) / dv, (hv - pv) / dv))
-                hi = wp.min(hi, wp.max((-hv - pv) / dv, (hv - pv) / dv))
-            elif wp.abs(pv) > hv:
+                lo = wp.max(lo, wp.min((-wv - pv) / dv, (wv - pv) / dv))
+                hi = wp.min(hi, wp.max((-wv - pv) / dv, (wv - pv) / dv))
+            elif wp.abs(pv) > wv:
                 hi = S(-1.0)
-            if lo <= hi:
+            if lo <= hi + S(1.0e-6):
                 for end in range(2):
                     # the far end of an edge that is not cut off is the near end of the next one
-                    if end == 0 or hi < S(1.0):
+                    if end == 0 or (hi < S(1.0) and lo < hi):
                         at = p + d * wp.where(end == 0, lo, hi)
                         gap = wp.dot(at, n) - face
                         if gap < S(AHEAD):
@@ -122,19 +135,18 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
                                 c, a, b, at - n * gap, at, n, mu, max_recovery, bodies, contacts
                             )
                             if wp.static(noted):
-                                contacts.code[c] = wp.vec4i(axis, k, edge * 4 + end, 0)
+                                contacts.code[c] = wp.vec4i(sa, sb, edge * 4 + end, axis * 4 + k)
                             c += 1
             # corner of a's face inside b's side
             q = ca + n * ha[axis] + u * (hu * s0) + v * (hv * s1)
-            if (
-                wp.abs(wp.dot(q - cb, bu)) < hb[(k + 1) % 3]
-                and wp.abs(wp.dot(q - cb, bv)) < hb[(k + 2) % 3]
-            ):
+            if wp.abs(wp.dot(q - cb, bu)) < hb[(k + 1) % 3] - S(INSIDE) and wp.abs(
+                wp.dot(q - cb, bv)
+            ) < hb[(k + 2) % 3] - S(INSIDE):
                 gap = wp.dot(side - q, m) / wp.dot(m, n)
                 if gap < S(AHEAD):
                     list_contact(c, a, b, q, q + n * gap, n, mu, max_recovery, bodies, contacts)
                     if wp.static(noted):
-                        contacts.code[c] = wp.vec4i(axis, k, edge * 4 + 2, 0)
+                        contacts.code[c] = wp.vec4i(sa, sb, edge * 4 + 2, axis * 4 + k)
                     c += 1
         return c
 
@@ -151,7 +163,6 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
         bodies: Bodies,
         contacts: Contacts,
     ):
-        start = int(c)
         ha = shapes.half[sa]
         hb = shapes.half[sb]
         ca = center(sa, a, shapes, bodies)
@@ -165,23 +176,31 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
             normal = R3()
             for k in range(15):
                 n = candidate(aa, ab, k)
-                # edge axes must win clearly: near-parallel edges would otherwise flicker
+                # a later axis must win clearly: else rounding decides between the faces of two
+                # boxes, or between a face and edges that are nearly parallel to it
                 bias = wp.where(k < 6, S(1.0), S(1.05))
+                handicap = S(0.0)
+                if k >= 6:
+                    handicap = S(CROSSED)
+                elif k >= 3:
+                    handicap = S(EVEN)
                 l = wp.length(n)
                 if l > S(1.0e-3) and least > S(0.0):
                     n = n / l
                     overlap = reach(aa, ha, n) + reach(ab, hb, n) - wp.abs(wp.dot(d, n)) + S(AHEAD)
                     if overlap <= S(0.0):
                         least = S(-1.0)
-                    elif overlap * bias < least:
-                        least = overlap * bias
+                    elif overlap * bias + handicap < least:
+                        least = overlap * bias + handicap
                         kind = k
                         normal = n * wp.where(wp.dot(d, n) < S(0.0), S(-1.0), S(1.0))
             if least > S(0.0) and kind >= 0:
                 if kind < 3:
                     c = list_face(
                         c,
+                        sa,
                         a,
+                        sb,
                         b,
                         kind,
                         normal,
@@ -199,7 +218,9 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
                 elif kind < 6:
                     c = list_face(
                         c,
+                        sb,
                         b,
+                        sa,
                         a,
                         kind - 3,
                         -normal,
@@ -235,17 +256,8 @@ def box_box(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
                     pb += v * sv
                     list_contact(c, a, b, pa, pb, normal, mu, max_recovery, bodies, contacts)
                     if wp.static(noted):
-                        contacts.code[c] = wp.vec4i(ea, eb, 16, 0)
+                        contacts.code[c] = wp.vec4i(sa, sb, 16, ea * 4 + eb)
                     c += 1
-        if wp.static(noted):
-            # the axis and the faces stay; shapes in the order of the contact's bodies
-            for k in range(start, c):
-                code = contacts.code[k]
-                if contacts.a[k] == a:
-                    contacts.code[k] = wp.vec4i(sa, sb, code[2] * 16 + code[0] * 4 + code[1], 0)
-                else:
-                    contacts.code[k] = wp.vec4i(sb, sa, code[2] * 16 + code[0] * 4 + code[1], 0)
-        share_load(start, c, bodies, contacts)
         return c
 
     return SimpleNamespace(list_boxes=list_boxes)

@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from ..lanes.structures import structures
+from .box_box import FLUSH
 
 __all__ = ["box_box_adjoint"]
 
@@ -107,14 +108,16 @@ def box_box_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
                 dv = wp.dot(d, v)
                 lo_u = S(0.0)
                 hi_u = S(1.0)
+                wu = hu + S(FLUSH)
+                wv = hv + S(FLUSH)
                 if wp.abs(du) > S(1.0e-9):
-                    lo_u = wp.max(S(0.0), wp.min((-hu - pu) / du, (hu - pu) / du))
-                    hi_u = wp.min(S(1.0), wp.max((-hu - pu) / du, (hu - pu) / du))
+                    lo_u = wp.max(S(0.0), wp.min((-wu - pu) / du, (wu - pu) / du))
+                    hi_u = wp.min(S(1.0), wp.max((-wu - pu) / du, (wu - pu) / du))
                 lo = lo_u
                 hi = hi_u
                 if wp.abs(dv) > S(1.0e-9):
-                    lo = wp.max(lo_u, wp.min((-hv - pv) / dv, (hv - pv) / dv))
-                    hi = wp.min(hi_u, wp.max((-hv - pv) / dv, (hv - pv) / dv))
+                    lo = wp.max(lo_u, wp.min((-wv - pv) / dv, (wv - pv) / dv))
+                    hi = wp.min(hi_u, wp.max((-wv - pv) / dv, (wv - pv) / dv))
                 pb = p + d * wp.where(end == 0, lo, hi)
                 pa = pb - n * (wp.dot(pb, n) - wp.dot(ca, n) - ha[axis])
         return pa, pb, n
@@ -140,9 +143,9 @@ def box_box_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         by_a, by_b, _how, _axis, _k, _ga, _gb, _gn = wp.grad(points_loss)(
             box_of(a, code[0], shapes, bodies),
             box_of(b, code[1], shapes, bodies),
-            code[2] // 16,
-            (code[2] // 4) % 4,
-            code[2] % 4,
+            code[2],
+            code[3] // 4,
+            code[3] % 4,
             ga,
             gb,
             gn,

@@ -25,7 +25,7 @@ def box_table(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     S, R3 = t.S, t.R3
     Shapes, Bodies, Contacts = t.Shapes, t.Bodies, t.Contacts
     contact = body_contact(scalar, lanes, noted)
-    list_contact, share_load = contact.list_contact, contact.share_load
+    list_contact = contact.list_contact
 
     @wp.func
     def corner(shape: int, c: int, shapes: Shapes):
@@ -48,7 +48,6 @@ def box_table(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
         bodies: Bodies,
         contacts: Contacts,
     ):
-        start = int(c)
         up = R3(S(0.0), S(0.0), S(1.0))
         for shape in range(first, last):
             if shapes.body[shape] == local:
@@ -63,7 +62,6 @@ def box_table(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
                         if wp.static(noted):
                             contacts.code[c] = wp.vec4i(-1, shape, k, 0)
                         c += 1
-        share_load(start, c, bodies, contacts)
         return c
 
     return SimpleNamespace(list_table=list_table, corner=corner)

@@ -6,9 +6,10 @@ from typing import Any
 
 import warp as wp
 
-from ..bodies.body_contact import PASSES, VISIT, body_contact
 from ..bodies.body_contact_adjoint import body_contact_adjoint
 from ..bodies.body_pairs import body_pairs
+from ..bodies.body_sweeps import VISITS, body_sweeps
+from ..bodies.body_sweeps_adjoint import body_sweeps_adjoint
 from ..bodies.box_box_adjoint import box_box_adjoint
 from ..bodies.box_particle_adjoint import box_particle_adjoint
 from ..bodies.box_table import box_table_adjoint
@@ -35,18 +36,14 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     list_pairs = body_pairs(scalar, lanes, True).list_pairs
     sweep_boxes = box_box_adjoint(scalar, lanes).sweep_boxes
     sweep_table = box_table_adjoint(scalar, lanes).sweep_table
-    solve_contacts = body_contact(scalar, lanes, True).solve_contacts
+    solve_contacts = body_sweeps(scalar, lanes, True).solve_contacts
     contact_ = body_contact_adjoint(scalar, lanes)
-    sweep_end_body, sweep_visits, sweep_listed, sweep_spread, clear_contacts = (
+    sweep_end_body, sweep_listed, sweep_spread, clear_contacts = (
         getattr(contact_, name)
-        for name in (
-            "sweep_end_body",
-            "sweep_visits",
-            "sweep_listed",
-            "sweep_spread",
-            "clear_contacts",
-        )
+        for name in ("sweep_end_body", "sweep_listed", "sweep_spread", "clear_contacts")
     )
+    visits_ = body_sweeps_adjoint(scalar, lanes)
+    sweep_visits, count_contacts = visits_.sweep_visits, visits_.count_contacts
     sweep_box_particle = box_particle_adjoint(scalar, lanes).sweep_box_particle
     sweep_box_triangle = box_triangle_adjoint(scalar, lanes).sweep_box_triangle
     poses = rigid_body_adjoint(scalar, lanes)
@@ -90,12 +87,13 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
             bodies.q[b0 + b] = quaternion(before + b * wp.static(POSE) + 3, tape)
         start = group.contact_start[g]
         end = list_pairs(g, lane, at.k, max_recovery, top, shapes, group, bodies, contacts)
-        passes = solve_contacts(start, end, bodies, contacts)
+        visits = solve_contacts(start, end, bodies, contacts)
         clear_contacts(start, end, ba)
         for b in range(b0, b0 + count):
             sweep_end_body(b, bodies.q[b], bodies, ba)
-        log = start * wp.static(PASSES * VISIT)
-        sweep_visits(start, end, passes, log, lane, counts, bodies, contacts, ba, adj)
+        count_contacts(start, end, lane, counts, contacts, adj)
+        log = start * wp.static(VISITS)
+        sweep_visits(log, log + visits, bodies, contacts, ba)
         by_table = one - one
         by_contact = S(0.0)
         for r in range(end - start):
@@ -107,7 +105,10 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
             if a >= 0:
                 pa = bodies.x[a] + contacts.ra[i]
                 ga, gb, gn = sweep_listed(i, pa, pb, max_recovery, bodies, contacts, ba)
-                sweep_boxes(a, b, code, ga, gb, gn, shapes, bodies, ba)
+                if b0 + shapes.body[code[0]] == a:
+                    sweep_boxes(a, b, code, ga, gb, gn, shapes, bodies, ba)
+                else:
+                    sweep_boxes(b, a, code, gb, ga, -gn, shapes, bodies, ba)
                 rub = wp.min(shapes.friction[code[0]], shapes.friction[code[1]])
                 by_contact += ba.mu[i] * rub
             else:

@@ -235,19 +235,24 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         """Scratch per group, for one lane at a time: where bodies touch things and the table."""
 
         a: wp.array(dtype=int)  # body row, -1: the table
-        b: wp.array(dtype=int)
+        b: wp.array(dtype=int)  # the upper one, if it rests on the other
         ra: wp.array(dtype=R3)  # arms from the centres of mass [m]
         rb: wp.array(dtype=R3)
         normal: wp.array(dtype=R3)  # from a to b
         u: wp.array(dtype=R3)  # across it
         v: wp.array(dtype=R3)
         weights: wp.array(dtype=R3)  # inverse masses along normal, u and v [1/kg]
+        upper: wp.array(dtype=R3)  # those of body b alone [1/kg]
         steps: wp.array(dtype=R3)  # gap, with the overlap that may remain, and slip along u, v [m]
         impulse: wp.array(dtype=R3)  # along normal, u and v [kg m]
         mu: wp.array(dtype=S)
+        order: wp.array(dtype=int)  # contacts by the height of what they hold
         # only in the backward sweep
-        code: wp.array(dtype=wp.vec4i)  # shapes of a and b, which feature, how many share the load
-        log: wp.array(dtype=S)  # of every visit: impulse before, friction before its limit
+        code: wp.array(
+            dtype=wp.vec4i
+        )  # shapes whose face and side touch, which feature, which axes
+        visit: wp.array(dtype=wp.vec2i)  # of every visit: contact, kind
+        log: wp.array(dtype=S)  # of every visit: impulse before, friction before its limit, sharing
 
     @wp.struct
     class Grips:
@@ -356,6 +361,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         across_u: wp.array(dtype=R3)
         across_v: wp.array(dtype=R3)
         weights: wp.array(dtype=R3)
+        upper: wp.array(dtype=R3)
         steps: wp.array(dtype=R3)
         impulse: wp.array(dtype=R3)
         mu: wp.array(dtype=S)

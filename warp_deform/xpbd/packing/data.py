@@ -137,9 +137,9 @@ class SolverData(PackedWorlds):
         self.add_array("near.pair", total, wp.int32, (), np.int32)
         self.add_array("near.mask", total, t.V, (L,), number)
         total = int(contact_start[-1])
-        for name in ("a", "b"):
+        for name in ("a", "b", "order"):
             self.add_array(f"contacts.{name}", total, wp.int32, (), np.int32)
-        for name in ("ra", "rb", "normal", "u", "v", "weights", "steps", "impulse"):
+        for name in ("ra", "rb", "normal", "u", "v", "weights", "upper", "steps", "impulse"):
             self.add_array(f"contacts.{name}", total, t.R3, (3,), number)
         self.add_array("contacts.mu", total, t.S, (), number)
 

@@ -11,7 +11,8 @@ import warp as wp
 
 from ...errors import InputError
 from ...xpbd.fused_xpbd import FusedXPBD
-from ..bodies.body_contact import PASSES, VISIT
+from ..bodies.body_contact import VISIT
+from ..bodies.body_sweeps import VISITS
 from ..guards import WatchValues
 from ..kernels.adjoint import adjoint_kernel
 from ..kernels.forward import forward_kernel
@@ -88,7 +89,8 @@ class Recorder:
         contacts = len(data.arrays["contacts.mu"].view)
         self._notes = {
             "code": wp.zeros(contacts, dtype=wp.vec4i, device=data.device),
-            "log": wp.zeros(contacts * PASSES * VISIT, dtype=data.scalar, device=data.device),
+            "visit": wp.zeros(contacts * VISITS, dtype=wp.vec2i, device=data.device),
+            "log": wp.zeros(contacts * VISITS * VISIT, dtype=data.scalar, device=data.device),
         }
         self._room = TapeRoom(data, self._control)
         self._tape: Stacks | None = None
@@ -157,7 +159,17 @@ class Recorder:
             arrays[f"body.{name}"] = self._mirrored(bodies, t.Q, (4,))
         arrays["body.w"] = self._mirrored(bodies, t.S, ())
         arrays["body.spread"] = self._mirrored(bodies, t.M33, (3, 3))
-        for name in ("ra", "rb", "normal", "across_u", "across_v", "weights", "steps", "impulse"):
+        for name in (
+            "ra",
+            "rb",
+            "normal",
+            "across_u",
+            "across_v",
+            "weights",
+            "upper",
+            "steps",
+            "impulse",
+        ):
             arrays[f"body.{name}"] = self._mirrored(contacts, t.R3, (3,))
         arrays["body.mu"] = self._mirrored(contacts, t.S, ())
         return arrays
