@@ -74,7 +74,8 @@ class CableConfig:
                 "fold_limit": Interval(low=0.0, high=2.0, below_high=True),
             },
         )
-        check_solve("CableConfig.solve", self.solve)
+        if self.solve is not None:
+            check_solve("CableConfig.solve", self.solve)
 
     @property
     def length(self) -> float:

@@ -16,6 +16,7 @@ from ..errors import InputError
 from ..support.checked import BELOW_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Interval, check_fields
 from .attributes import SpringMode
 from .colors import YELLOW, Color
+from .direct import check_solve
 from .sheet import Spring, add_sheet
 
 if TYPE_CHECKING:
@@ -55,6 +56,10 @@ class ClothConfig:
     """Hard limits of rows, columns and a mesh's edges, as shares of the rest length."""
     shortest_diagonal: float = 0.5
     """Hard limit of the diagonals; without it triangles collapse in folds."""
+    solve: str = "gauss-seidel"
+    """How rows and columns of a sheet are solved: "gauss-seidel", spring after spring once a
+    substep, or "direct", each of them as a whole, so that its stiffness does not depend on its
+    resolution. A mesh has no rows, and is solved spring after spring."""
     exclusion: float = 1.2
     """No self-contact closer than this in the flat sheet, in spacings."""
     edge_contact: float = 0.0
@@ -80,6 +85,7 @@ class ClothConfig:
             | {"longest": Interval(low=1.0, above_low=True), "edge_contact": SHARE}
             | ({} if self.thickness is None else {"thickness": POSITIVE}),
         )
+        check_solve("ClothConfig.solve", self.solve)
 
     @property
     def spacing(self) -> float:
@@ -173,14 +179,18 @@ def add_cloth(builder: newton.ModelBuilder, config: ClothConfig, positions: np.n
     a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
     c, d = number[1:, :-1].ravel(), number[1:, 1:].ravel()
     faces = np.stack([[a, b, d], [a, d, c]], axis=1).transpose(2, 1, 0).reshape(-1, 3)
+    direct = config.solve == "direct"
+    # of a column solved as a whole, each spring begins where the one before ended
+    columns = _ends(number.T, 0, 1) if direct else _ends(number, 1, 0)
     ranges = add_sheet(
         builder,
         cloth_sheet(config, (0.0, 0.0), height=0.0),
         faces,
         (
             Spring(
-                np.concatenate([_ends(number, 0, 1), _ends(number, 1, 0)]),
+                np.concatenate([_ends(number, 0, 1), columns]),
                 config.structural_stiffness,
+                SpringMode.CHAIN if direct else SpringMode.EQUAL,
                 shortest=config.shortest,
                 longest=config.longest,
             ),

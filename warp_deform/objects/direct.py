@@ -17,10 +17,14 @@ _STRAIN = 0.02
 _SHARE = 0.1
 
 
-def check_solve(name: str, value: str | None) -> None:
-    """Raises `InputError` unless the option `name` is one of `SOLVES` or None."""
-    if value is not None and value not in SOLVES:
-        raise InputError(f"{name} must be one of {', '.join(SOLVES)} or None, got {value!r}")
+def check_solve(name: str, value: str) -> None:
+    """Check that the option `name` is one of `SOLVES`.
+
+    Raises:
+        InputError: it is not.
+    """
+    if value not in SOLVES:
+        raise InputError(f"{name} must be one of {', '.join(SOLVES)}, got {value!r}")
 
 
 def too_heavy(count: int, spacing: float) -> bool:

@@ -1,13 +1,17 @@
 """The adjoint of chains and beams that are solved directly, against finite differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fixtures.adjoint_check import Check, lift, set_state
+from fixtures.cloth_scenes import SMALL, cloth_solver
 from fixtures.solver_scenes import LOOSE, new_builder
 
 from warp_deform.objects import CableConfig, add_cable, cable_line, cable_ring
 from warp_deform.rollout import DifferentiableRollout, rollout
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
+from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 
 BEADS = 10
 
@@ -69,3 +73,17 @@ def test_bits_depend_neither_on_storage_nor_on_lanes() -> None:
     for other in found[1:]:
         for name in ("positions", "velocities", "inverse_masses", "stiffness"):
             assert np.array_equal(getattr(first, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize("stiffness", [10.0, 2e3])
+def test_a_sheet_beyond_its_limits(stiffness: float) -> None:
+    cloth = replace(SMALL, solve="direct", structural_stiffness=stiffness)
+    config = replace(FABRIC_SOLVER, limits=LOOSE, sleep_speed=0.0, max_speed=1e3)
+    solver, _ = cloth_solver(cloth, height=0.05, config=config, lanes=1, precision="float64")
+    rng = np.random.default_rng(2)
+    x = solver.particle_q(0)
+    set_state(solver, x + rng.normal(0, 5e-3, x.shape), rng.normal(0, 0.05, x.shape))
+    acted = Check(solver).assert_right(rounding=30.0, draws=2)
+    assert acted["stretch"] >= 60
+    # soft springs alone would leave some of them too long or too short
+    assert acted.get("strain_limit", 0) > 20 or stiffness > 1e3

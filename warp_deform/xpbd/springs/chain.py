@@ -30,8 +30,8 @@ def chain(scalar: Any, lanes: int) -> SimpleNamespace:
     springs from `k` on. `measure` takes in the offset of one of them, `solve_chain` leaves their
     multipliers in `lines`.
 
-    What the solution would leave beyond its strain limit, or below its floor, is brought just there
-    instead, as a rigid rod: these springs are found by a first solution, and all is solved anew.
+    What is beyond its strain limit, or below its floor, and would stay so, is brought just there
+    instead, as a rigid rod: a first solution finds these springs, and all is solved anew.
     """
     t = structures(scalar, lanes)
     S, V, V3 = t.S, t.V, t.V3
@@ -91,18 +91,20 @@ def chain(scalar: Any, lanes: int) -> SimpleNamespace:
         bounded = bool(False)
         for s in range(k, k + count):
             i = p0 + springs.ij[s][0]
-            # the length that the solution leaves
+            # what is within its bounds now may leave them for a substep: bounding it already would
+            # push, and neighbours would push each other to and fro
+            length = lines.length[i]
             left = lines.target[i] + inverse_dt2 * springs.compliance[s] * lines.multiplier[i]
             limit = springs.limit[s]
-            if limit > S(0.0) and any_less(V(limit) - left, S(0.0)):
+            if limit > S(0.0) and any_less(V(limit) - length, S(0.0)):
                 bounded = True
-                beyond = less(V(limit), left)
+                beyond = less(V(limit), wp.min(left, length))
                 lines.target[i] = select(beyond, V(limit), lines.target[i])
                 lines.elastic[i] = select(beyond, zero, lines.elastic[i])
             floor = springs.floor[s]
-            if any_less(left - V(floor), S(0.0)):
+            if any_less(length - V(floor), S(0.0)):
                 bounded = True
-                below = less(left, V(floor))
+                below = less(wp.max(left, length), V(floor))
                 lines.target[i] = select(below, V(floor), lines.target[i])
                 lines.elastic[i] = select(below, zero, lines.elastic[i])
         return bounded
