@@ -18,6 +18,7 @@ from warp_deform.gradcheck.differences import DEEPEST, RUNGS, WORLDS, Sample, _d
 from warp_deform.gradcheck.draws import Draw, draw_states
 from warp_deform.gradcheck.limits import RATIO, central, kink
 from warp_deform.rollout import DifferentiableRollout, Gradients, rollout
+from warp_deform.tasks.cable_shape import CableShape
 from warp_deform.worlds import Worlds
 from warp_deform.xpbd.lanes.tape import Kind
 
@@ -50,6 +51,16 @@ def test_substeps_of_real_episodes_agree(task: str) -> None:
     assert of_all["stiffness"].n == of_all["all"].states >= 4
     least = {"body_table", "grip"} if task == "block-notarget" else {"stretch", "grip", "table"}
     assert least <= {row.constraint for row in rows}
+
+
+def test_cables_solved_directly_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    stiff = replace(CableShape.cable, bend_stiffness=200.0, solve="direct")
+    monkeypatch.setattr(CableShape, "cable", stiff)
+    rows, _ = check(LINE, FEW)
+    assert {"bend", "stretch", "grip", "table"} <= {row.constraint for row in rows}
+    for row in rows:
+        assert row.relative_error is None or row.relative_error < 1e-6, row
+    assert overall(rows)["all"].within == 1.0
 
 
 def test_a_wrong_derivative_shows(monkeypatch: pytest.MonkeyPatch) -> None:
