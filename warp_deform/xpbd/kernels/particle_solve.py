@@ -12,7 +12,7 @@ from ..contact.edge_contact_adjoint import edge_contact_adjoint
 from ..contact.sphere_contact import sphere_contact, sphere_contact_adjoint
 from ..contact.triangle_contact import triangle_contact
 from ..contact.triangle_contact_adjoint import triangle_contact_adjoint
-from ..lanes.algebra import any_less, sub  # noqa: F401  (operators are found by name)
+from ..lanes.algebra import any_less, mul, sub  # noqa: F401  (operators are found by name)
 from ..lanes.group_state import group_state
 from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS
 from ..springs.beam import beam, beam_adjoint
@@ -72,7 +72,8 @@ def particle_solve(
         zero = V(S(0.0))
         p0 = at.p0
         world0 = at.world0
-        inverse_dt2 = pace.inverse_dt2
+        # each pass has its share of the stiffness
+        inverse_dt2 = pace.inverse_dt2 * S(at.passes)
         contact_mu = pace.contact_mu
         max_recovery = pace.max_recovery
         holding = run.holding
@@ -84,41 +85,46 @@ def particle_solve(
         mark = int(tk)
         # always in the same order: sweeping backwards in every other substep makes tight heaps
         # crawl for ever, and shells jitter
-        for s in range(at.s0, at.s1):
-            if springs.mode[s] >= wp.static(int(SpringMode.CHAIN)):
-                count = springs.run[s]
-                if count > 0:
-                    if springs.mode[s] == wp.static(int(SpringMode.CHAIN)):
-                        if wp.static(taped):
-                            record_chain(
+        for _ in range(at.passes):
+            if wp.static(taped):
+                mark = int(tk)
+            for s in range(at.s0, at.s1):
+                if springs.mode[s] >= wp.static(int(SpringMode.CHAIN)):
+                    count = springs.run[s]
+                    if count > 0:
+                        if springs.mode[s] == wp.static(int(SpringMode.CHAIN)):
+                            if wp.static(taped):
+                                record_chain(
+                                    s, count, p0, tx, inverse_dt2, particles, springs, lines, tape
+                                )
+                                tx += count
+                            else:
+                                project_chain(s, count, p0, inverse_dt2, particles, springs, lines)
+                        elif wp.static(taped):
+                            record_beam(
                                 s, count, p0, tx, inverse_dt2, particles, springs, lines, tape
                             )
                             tx += count
                         else:
-                            project_chain(s, count, p0, inverse_dt2, particles, springs, lines)
-                    elif wp.static(taped):
-                        record_beam(s, count, p0, tx, inverse_dt2, particles, springs, lines, tape)
-                        tx += count
-                    else:
-                        project_beam(s, count, p0, inverse_dt2, particles, springs, lines)
-            elif wp.static(taped):
-                if springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                    record_bend(s, p0, tx, inverse_dt2, particles, springs, tape)
-                    tx += 1
-                else:
-                    acted = record_distance(s, p0, tx, inverse_dt2, particles, springs, tape)
-                    if acted:
+                            project_beam(s, count, p0, inverse_dt2, particles, springs, lines)
+                elif wp.static(taped):
+                    if springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                        record_bend(s, p0, tx, inverse_dt2, particles, springs, tape)
                         tx += 1
-                        if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
-                            tape.k[tk] = s
-                            tk += 1
-            elif springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                project_bend(s, p0, inverse_dt2, particles, springs)
-            else:
-                project_distance(s, p0, inverse_dt2, particles, springs)
-        if wp.static(taped):
-            tape.k[tk] = tk - mark
-            tk += 1
+                    else:
+                        acted = record_distance(s, p0, tx, inverse_dt2, particles, springs, tape)
+                        if acted:
+                            tx += 1
+                            if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
+                                tape.k[tk] = s
+                                tk += 1
+                elif springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                    project_bend(s, p0, inverse_dt2, particles, springs)
+                else:
+                    project_distance(s, p0, inverse_dt2, particles, springs)
+            if wp.static(taped):
+                tape.k[tk] = tk - mark
+                tk += 1
         if wp.static(with_sheets):
             if any_less(zero - holding, S(0.0)):
                 held = particles.x[p0]

@@ -71,8 +71,8 @@ def sweeps(scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool) -> Sim
             slot = at.world0 * wp.static(MOST_PUSHES) + p
             if grips.push[slot] >= 0:
                 longest = wp.max(longest, grips.push_steps[slot])
-        always.bends = bends
-        always.stretches = stretches
+        always.bends = bends * at.passes
+        always.stretches = stretches * at.passes
         always.damped = damped
         always.longest_push = longest
         return always
@@ -217,51 +217,54 @@ def sweeps(scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool) -> Sim
         tx = int(tops[0])
         tk = int(tops[2])
         by_inverse_dt2 = by.inverse_dt2
-        tk -= 1
-        left = tape.k[tk]
-        for r in range(at.s1 - at.s0):
-            s = at.s1 - 1 - r
-            mode = springs.mode[s]
-            if mode >= wp.static(int(SpringMode.CHAIN)):
-                # all at once when the first one's turn comes
-                count = springs.run[s]
-                tx -= count
-                if count > 0 and mode == wp.static(int(SpringMode.CHAIN)):
-                    by_inverse_dt2 = by_inverse_dt2 + sweep_chain(
-                        s,
-                        count,
-                        at.p0,
-                        tx,
-                        pace.inverse_dt2,
-                        springs,
-                        lines,
-                        now.counts,
-                        now.on,
-                        tape,
-                        adj,
-                    )
-                elif count > 0:
-                    by_inverse_dt2 = by_inverse_dt2 + sweep_beam(
-                        s, count, at.p0, tx, pace.inverse_dt2, springs, lines, tape, adj
-                    )
-            elif mode == wp.static(int(SpringMode.BEND)):
-                tx -= 1
-                by_inverse_dt2 = by_inverse_dt2 + sweep_bend(
-                    s, at.p0, tape.x[tx], pace.inverse_dt2, springs, adj
-                )
-            else:
-                acted = mode == wp.static(int(SpringMode.EQUAL))
-                if not acted and left > 0:
-                    if tape.k[tk - 1] == s:
-                        acted = True
-                        tk -= 1
-                        left -= 1
-                if acted:
+        share = S(at.passes)
+        inverse_dt2 = pace.inverse_dt2 * share
+        for _ in range(at.passes):
+            tk -= 1
+            left = tape.k[tk]
+            for r in range(at.s1 - at.s0):
+                s = at.s1 - 1 - r
+                mode = springs.mode[s]
+                if mode >= wp.static(int(SpringMode.CHAIN)):
+                    # all at once when the first one's turn comes
+                    count = springs.run[s]
+                    tx -= count
+                    if count > 0 and mode == wp.static(int(SpringMode.CHAIN)):
+                        by_inverse_dt2 = by_inverse_dt2 + share * sweep_chain(
+                            s,
+                            count,
+                            at.p0,
+                            tx,
+                            inverse_dt2,
+                            springs,
+                            lines,
+                            now.counts,
+                            now.on,
+                            tape,
+                            adj,
+                        )
+                    elif count > 0:
+                        by_inverse_dt2 = by_inverse_dt2 + share * sweep_beam(
+                            s, count, at.p0, tx, inverse_dt2, springs, lines, tape, adj
+                        )
+                elif mode == wp.static(int(SpringMode.BEND)):
                     tx -= 1
-                    fetch_ahead(tape.x, tx - now.ahead, wp.static(BYTES))
-                    by_inverse_dt2 = by_inverse_dt2 + sweep_distance(
-                        s, at.p0, tape.x[tx], pace.inverse_dt2, springs, now.counts, now.on, adj
+                    by_inverse_dt2 = by_inverse_dt2 + share * sweep_bend(
+                        s, at.p0, tape.x[tx], inverse_dt2, springs, adj
                     )
+                else:
+                    acted = mode == wp.static(int(SpringMode.EQUAL))
+                    if not acted and left > 0:
+                        if tape.k[tk - 1] == s:
+                            acted = True
+                            tk -= 1
+                            left -= 1
+                    if acted:
+                        tx -= 1
+                        fetch_ahead(tape.x, tx - now.ahead, wp.static(BYTES))
+                        by_inverse_dt2 = by_inverse_dt2 + share * sweep_distance(
+                            s, at.p0, tape.x[tx], inverse_dt2, springs, now.counts, now.on, adj
+                        )
         by.inverse_dt2 = by_inverse_dt2
         return by, wp.vec4i(tx, tops[1], tk, tops[3])
 

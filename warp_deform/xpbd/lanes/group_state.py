@@ -39,6 +39,7 @@ def group_state(scalar: Any, lanes: int) -> SimpleNamespace:
         radii: int  # first of the particles' radii
         s0: int  # first spring
         s1: int  # behind the last one
+        passes: int  # over them, in a substep
         b0: int  # first body of lane 0
         bodies: int  # of one world
         shape0: int  # first box of lane 0
@@ -93,6 +94,7 @@ def group_state(scalar: Any, lanes: int) -> SimpleNamespace:
         at.radii = top.particle_start[k]
         at.s0 = top.spring_start[k]
         at.s1 = top.spring_start[k + 1]
+        at.passes = top.passes[k]
         at.b0 = group.body_start[g]
         at.bodies = top.body_count[k]
         at.shape0 = group.shape_start[g]

@@ -54,6 +54,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         radius: wp.array(dtype=S)  # of particles [m]
         body_count: wp.array(dtype=int)
         spring_start: wp.array(dtype=int)
+        passes: wp.array(dtype=int)  # over the springs, in a substep
         pair_start: wp.array(dtype=int)
         shape_count: wp.array(dtype=int)
 

@@ -107,13 +107,13 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def has_room(at: Span, run: Run, listed: int, tops: wp.vec4i, tape: Tape):
-        springs = at.s1 - at.s0
+        springs = (at.s1 - at.s0) * at.passes
         particles = at.particles
         near = run.near_count
         bodies = at.bodies * wp.static(L)
         solid = at.shapes * (at.particles + at.triangles) * wp.static(L)
         end = tape.end[at.g]
-        words = springs + particles + near + wp.static(TRIANGLE_WORDS) * listed
+        words = springs + at.passes + particles + near + wp.static(TRIANGLE_WORDS) * listed
         words += wp.static(2 * L * (GRIP_WORDS + 4) + 8) + wp.static(BODY_WORDS) * (bodies + solid)
         return (
             tops[0] + 2 * springs + 4 * particles + 2 * near <= end[0]

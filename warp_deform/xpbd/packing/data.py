@@ -81,6 +81,7 @@ class SolverData(PackedWorlds):
             ("topology.particle_start", starts("particle_radius")),
             ("topology.body_count", [k.body_count for k in tops]),
             ("topology.spring_start", starts("spring_ij")),
+            ("topology.passes", [k.passes for k in tops]),
             ("topology.pair_start", starts("pair_ij")),
             ("topology.shape_count", [len(k.shape_body) for k in tops]),
             ("springs.mode", joined("spring_mode")),

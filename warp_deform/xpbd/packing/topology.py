@@ -21,6 +21,7 @@ from .sheets import Sheets
 
 __all__ = ["WorldTopology", "read_worlds", "runs", "tethers"]
 
+_RUN_OF_A_PASS = 10
 _BENDING = (int(SpringMode.BEND), int(SpringMode.BEAM))
 
 
@@ -92,6 +93,22 @@ class WorldTopology:
     @property
     def particle_count(self) -> int:
         return len(self.particle_radius)
+
+    @property
+    def passes(self) -> int:
+        """How often its springs are solved in a substep.
+
+        Runs that cross do not know of each other: once for every 10 springs of the longest of them.
+        """
+        first = np.flatnonzero(self.spring_run > 1)
+        count = self.spring_run[first]
+        spans = [self.spring_ij[a : a + n] for a, n in zip(first, count, strict=True)]
+        met = np.bincount(
+            np.concatenate([np.unique(s) for s in spans] or [np.zeros(0, int)]),
+            minlength=self.particle_count,
+        )
+        crossing = [n for s, n in zip(spans, count, strict=True) if (met[s] > 1).any()]
+        return -(-max(crossing, default=1) // _RUN_OF_A_PASS)
 
     @property
     def body_count(self) -> int:

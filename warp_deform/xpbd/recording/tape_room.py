@@ -129,8 +129,8 @@ class TapeRoom:
         data, rows = self._data, []
         for k in data.group_topology:
             top = data.topologies[k]
-            springs, particles = len(top.spring_ij), top.particle_count
-            words = springs + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
+            springs, particles = len(top.spring_ij) * top.passes, top.particle_count
+            words = springs + top.passes + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
             bodies = top.body_count * data.lanes
             words += BODY_WORDS * bodies
             rows.append((2 * springs + 4 * particles, particles + 8, words, BODY_SCALARS * bodies))
