@@ -140,6 +140,11 @@ class Calibration:
         Raises:
             InputError: missing, damaged, of another version, or with values that cannot be
         """
+        if not path.exists():
+            raise InputError(
+                f"calibration {path} is missing: make it with `franka calibrate`, or rehearse without "
+                "one, with --robot sim --camera sim"
+            )
         record = read_json(path, what="calibration", schema=SCHEMA)
         what = f"calibration {path}"
         try:

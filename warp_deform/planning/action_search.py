@@ -73,6 +73,8 @@ class SearchConfig:
             raise InputError(f"no method {self.method!r}; choose from {', '.join(METHODS)}")
         if min(self.budget, self.candidates, self.elites, self.depth, self.beam) < 1:
             raise InputError("budget, candidates, elites, depth and beam must be 1 or more")
+        if self.depth > 2:
+            raise InputError(f"depth must be 1 or 2 actions ahead, got {self.depth}")
 
 
 def search(

@@ -171,7 +171,7 @@ def test_a_file_that_is_no_calibration(tmp_path: Path, data: bytes) -> None:
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"calibration .*setup\.json"):
         Calibration.load(path)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is missing: make it with `franka calibrate`"):
         Calibration.load(tmp_path / "none.json")
 
 

@@ -129,6 +129,8 @@ def test_a_search_that_cannot_be_is_refused():
         SearchConfig(method="luck")
     with pytest.raises(InputError, match="must be 1 or more"):
         SearchConfig(budget=0)
+    with pytest.raises(InputError, match="depth must be 1 or 2"):
+        SearchConfig(depth=3)
 
 
 def test_given_actions_are_tried_first_and_drawn_ones_say_so(started):
