@@ -20,7 +20,17 @@ from .packing.data import KERNEL_ARGUMENTS, SolverData, alias_lanes
 
 __all__ = ["replay_bundle", "write_bundle"]
 
-_HEADER = {"digest", "lanes", "precision", "bodies", "sheets", "edges", "groups", "settings"}
+_HEADER = {
+    "digest",
+    "lanes",
+    "precision",
+    "bodies",
+    "sheets",
+    "edges",
+    "lines",
+    "groups",
+    "settings",
+}
 _SETTINGS = ("dt", "max_steps", "recovery", "max_speed", "calm_speed", "margin",
              "rest_speed", "rest_steps", "viscous", "dry", "sleep", "sleep_ramp", "check_every",
              "record_every", "particle_stride", "body_stride")  # fmt: skip
@@ -37,6 +47,7 @@ def write_bundle(
         "bodies": bool(data.has_bodies),
         "sheets": bool(data.has_sheets),
         "edges": bool(data.has_edges),
+        "lines": bool(data.has_lines),
         "groups": data.group_count,
         "settings": {name: getattr(settings, name) for name in _SETTINGS},
     }
@@ -102,7 +113,12 @@ def replay_bundle(path: str | Path) -> dict[str, np.ndarray]:
         structs.append(struct)
     alias_lanes(structs, scalar)
     kernel = forward_kernel(
-        scalar, header["lanes"], header["bodies"], header["sheets"], header["edges"]
+        scalar,
+        header["lanes"],
+        header["bodies"],
+        header["sheets"],
+        header["edges"],
+        header["lines"],
     )
     wp.launch(kernel, dim=header["groups"], inputs=[settings, *structs], device="cpu")
     return {

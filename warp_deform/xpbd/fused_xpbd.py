@@ -77,6 +77,7 @@ class FusedXPBD:
             bool(self.data.has_bodies),
             self.data.has_sheets,
             self.data.has_edges,
+            self.data.has_lines,
         )
         self._launch: Any = None
         self._launch_settings: Any = None

@@ -28,6 +28,7 @@ def adjoint_kernel(
     with_bodies: bool,
     with_sheets: bool = False,
     with_edges: bool = False,
+    with_lines: bool = False,
 ) -> Any:
     """The kernel for a precision and a width, with the variants of `forward_kernel`.
 
@@ -36,7 +37,7 @@ def adjoint_kernel(
     inverse masses of the state likewise. With `leave`, the prediction of the first substep is left
     to the sweep of the tape before (`pending`), which finds the velocity without a tape.
     """
-    t = sweeps(scalar, lanes, with_bodies, with_sheets)
+    t = sweeps(scalar, lanes, with_bodies, with_sheets, with_lines)
     S, V, span_of, pace_of = t.S, t.V, t.span_of, t.pace_of
     held_again = grip_adjoint(scalar, lanes, with_bodies).held_again
     solids = sweep_solids(scalar, lanes, with_sheets)

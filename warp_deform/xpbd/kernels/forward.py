@@ -33,13 +33,14 @@ def forward_kernel(
     with_bodies: bool,
     with_sheets: bool = False,
     with_edges: bool = False,
+    with_lines: bool = False,
     taped: bool = False,
 ) -> Any:
     """The kernel for a precision and a width; launch it with one thread per group.
 
     `with_bodies` False leaves the code of rigid bodies out, which halves the compile time;
-    `with_sheets` False that of triangles, `with_edges` False that of their edges. `taped` leaves a
-    tape for the backward sweep (see `tape`) and can continue a launch, to the same bits.
+    `with_sheets` False that of triangles, `with_edges` False that of their edges, and
+    `with_lines` False that of direct solves. `taped` leaves a tape for the backward sweep (see `tape`) and can continue a launch, to the same bits.
     """
     t = group_state(scalar, lanes)
     S, V = t.S, t.V
@@ -51,7 +52,8 @@ def forward_kernel(
     lead_grips = leads(scalar, lanes, with_bodies, with_sheets, taped).lead_grips
     lists_ = contact_lists(scalar, lanes, with_sheets, with_edges)
     list_contacts, count_listed = lists_.list_contacts, lists_.count_listed
-    solve_particles = particle_solve(scalar, lanes, with_sheets, with_edges, taped).solve_particles
+    particles_ = particle_solve(scalar, lanes, with_sheets, with_edges, with_lines, taped)
+    solve_particles = particles_.solve_particles
     solve_bodies = body_solve(scalar, lanes, with_sheets, taped).solve_bodies
     finishes_ = finishes(scalar, lanes, with_bodies, with_sheets, taped)
     finish_all, count_substep = finishes_.finish_all, finishes_.count_substep

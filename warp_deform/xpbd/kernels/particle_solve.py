@@ -26,7 +26,7 @@ __all__ = ["particle_solve"]
 
 @functools.cache
 def particle_solve(
-    scalar: Any, lanes: int, with_sheets: bool, with_edges: bool, taped: bool
+    scalar: Any, lanes: int, with_sheets: bool, with_edges: bool, with_lines: bool, taped: bool
 ) -> SimpleNamespace:
     """`solve_particles(g, ...)`: the constraints of a group once; `taped`, each leaves what its
     adjoint needs on the tape from `tops` on. Returns the tops after that.
@@ -54,6 +54,60 @@ def particle_solve(
     Grips, Sheets, Cells, Tape = t.Grips, t.Sheets, t.Cells, t.Tape
 
     @wp.func
+    def solve_springs(
+        at: Span,
+        tx: int,
+        tk: int,
+        inverse_dt2: V,
+        particles: Particles,
+        springs: Springs,
+        lines: Lines,
+        tape: Tape,
+    ):
+        """One pass over the springs; returns the tops of the stacks of V3 and of whole numbers."""
+        p0 = at.p0
+        mark = int(tk)
+        for s in range(at.s0, at.s1):
+            direct = bool(False)
+            if wp.static(with_lines):
+                direct = springs.mode[s] >= wp.static(int(SpringMode.CHAIN))
+                count = springs.run[s]
+                if direct and count > 0:
+                    if springs.mode[s] == wp.static(int(SpringMode.CHAIN)):
+                        if wp.static(taped):
+                            record_chain(
+                                s, count, p0, tx, inverse_dt2, particles, springs, lines, tape
+                            )
+                            tx += count
+                        else:
+                            project_chain(s, count, p0, inverse_dt2, particles, springs, lines)
+                    elif wp.static(taped):
+                        record_beam(s, count, p0, tx, inverse_dt2, particles, springs, lines, tape)
+                        tx += count
+                    else:
+                        project_beam(s, count, p0, inverse_dt2, particles, springs, lines)
+            if not direct:
+                if wp.static(taped):
+                    if springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                        record_bend(s, p0, tx, inverse_dt2, particles, springs, tape)
+                        tx += 1
+                    else:
+                        acted = record_distance(s, p0, tx, inverse_dt2, particles, springs, tape)
+                        if acted:
+                            tx += 1
+                            if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
+                                tape.k[tk] = s
+                                tk += 1
+                elif springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                    project_bend(s, p0, inverse_dt2, particles, springs)
+                else:
+                    project_distance(s, p0, inverse_dt2, particles, springs)
+        if wp.static(taped):
+            tape.k[tk] = tk - mark
+            tk += 1
+        return wp.vec2i(tx, tk)
+
+    @wp.func
     def solve_particles(
         at: Span,
         pace: Pace,
@@ -72,8 +126,10 @@ def particle_solve(
         zero = V(S(0.0))
         p0 = at.p0
         world0 = at.world0
-        # each pass has its share of the stiffness
-        inverse_dt2 = pace.inverse_dt2 * S(at.passes)
+        inverse_dt2 = pace.inverse_dt2
+        if wp.static(with_lines):
+            # each pass has its share of the stiffness
+            inverse_dt2 = pace.inverse_dt2 * S(at.passes)
         contact_mu = pace.contact_mu
         max_recovery = pace.max_recovery
         holding = run.holding
@@ -85,46 +141,15 @@ def particle_solve(
         mark = int(tk)
         # always in the same order: sweeping backwards in every other substep makes tight heaps
         # crawl for ever, and shells jitter
-        for _ in range(at.passes):
-            if wp.static(taped):
-                mark = int(tk)
-            for s in range(at.s0, at.s1):
-                if springs.mode[s] >= wp.static(int(SpringMode.CHAIN)):
-                    count = springs.run[s]
-                    if count > 0:
-                        if springs.mode[s] == wp.static(int(SpringMode.CHAIN)):
-                            if wp.static(taped):
-                                record_chain(
-                                    s, count, p0, tx, inverse_dt2, particles, springs, lines, tape
-                                )
-                                tx += count
-                            else:
-                                project_chain(s, count, p0, inverse_dt2, particles, springs, lines)
-                        elif wp.static(taped):
-                            record_beam(
-                                s, count, p0, tx, inverse_dt2, particles, springs, lines, tape
-                            )
-                            tx += count
-                        else:
-                            project_beam(s, count, p0, inverse_dt2, particles, springs, lines)
-                elif wp.static(taped):
-                    if springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                        record_bend(s, p0, tx, inverse_dt2, particles, springs, tape)
-                        tx += 1
-                    else:
-                        acted = record_distance(s, p0, tx, inverse_dt2, particles, springs, tape)
-                        if acted:
-                            tx += 1
-                            if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
-                                tape.k[tk] = s
-                                tk += 1
-                elif springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                    project_bend(s, p0, inverse_dt2, particles, springs)
-                else:
-                    project_distance(s, p0, inverse_dt2, particles, springs)
-            if wp.static(taped):
-                tape.k[tk] = tk - mark
-                tk += 1
+        if wp.static(with_lines):
+            for _ in range(at.passes):
+                solved = solve_springs(at, tx, tk, inverse_dt2, particles, springs, lines, tape)
+                tx = solved[0]
+                tk = solved[1]
+        else:
+            solved = solve_springs(at, tx, tk, inverse_dt2, particles, springs, lines, tape)
+            tx = solved[0]
+            tk = solved[1]
         if wp.static(with_sheets):
             if any_less(zero - holding, S(0.0)):
                 held = particles.x[p0]

@@ -28,7 +28,9 @@ __all__ = ["sweeps"]
 
 
 @functools.cache
-def sweeps(scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool) -> SimpleNamespace:
+def sweeps(
+    scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool, with_lines: bool
+) -> SimpleNamespace:
     """The phases for a precision and a width, with the variants of `forward_kernel`."""
     t = sweep_state(scalar, lanes)
     S, V, L = t.S, t.V, t.L
@@ -217,42 +219,49 @@ def sweeps(scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool) -> Sim
         tx = int(tops[0])
         tk = int(tops[2])
         by_inverse_dt2 = by.inverse_dt2
-        share = S(at.passes)
+        share = S(1.0)
+        passes = int(1)
+        if wp.static(with_lines):
+            share = S(at.passes)
+            passes = at.passes
         inverse_dt2 = pace.inverse_dt2 * share
-        for _ in range(at.passes):
+        for _ in range(passes):
             tk -= 1
             left = tape.k[tk]
             for r in range(at.s1 - at.s0):
                 s = at.s1 - 1 - r
                 mode = springs.mode[s]
-                if mode >= wp.static(int(SpringMode.CHAIN)):
-                    # all at once when the first one's turn comes
-                    count = springs.run[s]
-                    tx -= count
-                    if count > 0 and mode == wp.static(int(SpringMode.CHAIN)):
-                        by_inverse_dt2 = by_inverse_dt2 + share * sweep_chain(
-                            s,
-                            count,
-                            at.p0,
-                            tx,
-                            inverse_dt2,
-                            springs,
-                            lines,
-                            now.counts,
-                            now.on,
-                            tape,
-                            adj,
-                        )
-                    elif count > 0:
-                        by_inverse_dt2 = by_inverse_dt2 + share * sweep_beam(
-                            s, count, at.p0, tx, inverse_dt2, springs, lines, tape, adj
-                        )
-                elif mode == wp.static(int(SpringMode.BEND)):
+                direct = bool(False)
+                if wp.static(with_lines):
+                    direct = mode >= wp.static(int(SpringMode.CHAIN))
+                    if direct:
+                        # all at once when the first one's turn comes
+                        count = springs.run[s]
+                        tx -= count
+                        if count > 0 and mode == wp.static(int(SpringMode.CHAIN)):
+                            by_inverse_dt2 = by_inverse_dt2 + share * sweep_chain(
+                                s,
+                                count,
+                                at.p0,
+                                tx,
+                                inverse_dt2,
+                                springs,
+                                lines,
+                                now.counts,
+                                now.on,
+                                tape,
+                                adj,
+                            )
+                        elif count > 0:
+                            by_inverse_dt2 = by_inverse_dt2 + share * sweep_beam(
+                                s, count, at.p0, tx, inverse_dt2, springs, lines, tape, adj
+                            )
+                if not direct and mode == wp.static(int(SpringMode.BEND)):
                     tx -= 1
                     by_inverse_dt2 = by_inverse_dt2 + share * sweep_bend(
                         s, at.p0, tape.x[tx], inverse_dt2, springs, adj
                     )
-                else:
+                elif not direct:
                     acted = mode == wp.static(int(SpringMode.EQUAL))
                     if not acted and left > 0:
                         if tape.k[tk - 1] == s:

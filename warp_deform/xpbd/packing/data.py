@@ -8,7 +8,6 @@ import newton
 import numpy as np
 import warp as wp
 
-from ...objects.attributes import SpringMode
 from ...objects.push import MOST_PUSHES
 from ...support.quaternion import quat_rotate
 from ..bodies.box_box import POINTS
@@ -150,8 +149,7 @@ class SolverData(PackedWorlds):
             self.add_array(f"particles.{name}", count, self.types.V3, (3, L), self.number)
         for name in ("w", "w0", "tether"):
             self.add_array(f"particles.{name}", count, self.types.V, (L,), self.number)
-        direct = np.isin(self.views["springs.mode"], (SpringMode.CHAIN, SpringMode.BEAM)).any()
-        room = count if direct else 0
+        room = count if self.has_lines else 0
         for name in ("along", "bend"):
             self.add_array(f"lines.{name}", room, self.types.V3, (3, L), self.number)
         for name in ("length", "target", "elastic", "inverse", "ratio", "ratio2", "multiplier",

@@ -8,6 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from ...objects.attributes import SpringMode
 from ..lanes.structures import structures
 from .mirrored import Mirrored
 from .topology import WorldTopology, read_worlds
@@ -69,6 +70,9 @@ class PackedWorlds:
         self.has_sheets = any(
             len(top.sheet_triangle) > 0 or bool((top.spring_floor > 0).any())
             for top in self.topologies
+        )
+        self.has_lines = any(
+            bool((top.spring_mode >= SpringMode.CHAIN).any()) for top in self.topologies
         )
         self.has_edges = any(len(top.sheet_edge) > 0 for top in self.topologies)
 

@@ -77,6 +77,7 @@ class Recorder:
         self.dt = dt or solver.config.dt
         data = solver.data
         variant = (data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets, data.has_edges)
+        variant += (data.has_lines,)
         self._kernels = forward_kernel(*variant, taped=True), adjoint_kernel(*variant)
         self._settings = self._new_settings()
         self._segments: list[_Segment] = []
