@@ -20,17 +20,8 @@ from .packing.data import KERNEL_ARGUMENTS, SolverData, alias_lanes
 
 __all__ = ["replay_bundle", "write_bundle"]
 
-_HEADER = {
-    "digest",
-    "lanes",
-    "precision",
-    "bodies",
-    "sheets",
-    "edges",
-    "lines",
-    "groups",
-    "settings",
-}
+_VARIANT = ("bodies", "sheets", "edges", "lines")
+_HEADER = {"digest", "lanes", "precision", "groups", "settings", *_VARIANT}
 _SETTINGS = ("dt", "max_steps", "recovery", "max_speed", "calm_speed", "margin",
              "rest_speed", "rest_steps", "viscous", "dry", "sleep", "sleep_ramp", "check_every",
              "record_every", "particle_stride", "body_stride")  # fmt: skip
@@ -112,14 +103,7 @@ def replay_bundle(path: str | Path) -> dict[str, np.ndarray]:
                 setattr(struct, field, array)
         structs.append(struct)
     alias_lanes(structs, scalar)
-    kernel = forward_kernel(
-        scalar,
-        header["lanes"],
-        header["bodies"],
-        header["sheets"],
-        header["edges"],
-        header["lines"],
-    )
+    kernel = forward_kernel(scalar, header["lanes"], *(header[name] for name in _VARIANT))
     wp.launch(kernel, dim=header["groups"], inputs=[settings, *structs], device="cpu")
     return {
         key: array.numpy().view(dtype).reshape(shape).copy() for key, array, shape, dtype in held

@@ -39,8 +39,9 @@ def forward_kernel(
     """The kernel for a precision and a width; launch it with one thread per group.
 
     `with_bodies` False leaves the code of rigid bodies out, which halves the compile time;
-    `with_sheets` False that of triangles, `with_edges` False that of their edges, and
-    `with_lines` False that of direct solves. `taped` leaves a tape for the backward sweep (see `tape`) and can continue a launch, to the same bits.
+    `with_sheets` False that of triangles, `with_edges` False that of their edges, `with_lines`
+    False that of direct solves. `taped` leaves a tape for the backward sweep (see `tape`) and can
+    continue a launch, to the same bits.
     """
     t = group_state(scalar, lanes)
     S, V = t.S, t.V
