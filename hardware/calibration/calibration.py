@@ -142,8 +142,8 @@ class Calibration:
         """
         if not path.exists():
             raise InputError(
-                f"calibration {path} is missing: make it with `franka calibrate`, or rehearse without "
-                "one, with --robot sim --camera sim"
+                f"calibration {path} is missing: make it with `franka calibrate`, or rehearse "
+                "without one, with --robot sim --camera sim"
             )
         record = read_json(path, what="calibration", schema=SCHEMA)
         what = f"calibration {path}"
