@@ -22,8 +22,9 @@ __all__ = ["replay_bundle", "write_bundle"]
 
 _HEADER = {"digest", "lanes", "precision", "bodies", "sheets", "edges", "groups", "settings"}
 _SETTINGS = ("dt", "max_steps", "recovery", "max_speed", "calm_speed", "margin",
-             "rest_speed", "rest_steps", "viscous", "dry", "sleep", "sleep_ramp", "check_every",
-             "record_every", "particle_stride", "body_stride")  # fmt: skip
+             "rest_speed", "rest_steps", "viscous", "damp_every", "sleep", "sleep_after", "wake",
+             "sleep_ramp", "check_every", "record_every", "particle_stride",
+             "body_stride")  # fmt: skip
 
 
 def write_bundle(
