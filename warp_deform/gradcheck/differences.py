@@ -47,6 +47,8 @@ SMOOTH_RUNGS, DEEPEST = 3, 9
 rounding is below the bound, to so many rungs at most."""
 ARM = 0.05
 """A turn moves a point so far from the centre by as much as a unit of position does [m]."""
+AIR = 1.0
+"""What has no air is checked in this much [1/s]."""
 EPSILON = 2.2e-16
 """Relative rounding of float64; positions are below 1 m."""
 KINK = 1e-6
@@ -149,6 +151,7 @@ def compare(
     """
     for world in range(WORLDS):
         worlds.restore(world, draw.state)
+    usual = float(worlds.solver.data.per_world("group.damping", 0)[0])
     base, loss = _base(worlds, draw.path), _Loss.draw(worlds, rng)
     names = [
         name
@@ -163,6 +166,8 @@ def compare(
         samples += _compare_some(
             run, worlds, draw, substeps, base, loss, names[part], along[part], bound
         )
+    for w in range(WORLDS):
+        worlds.solver.set_world(w, damping=usual)
     return samples
 
 
@@ -343,6 +348,7 @@ def _base(worlds: Worlds, path: GripPath | None) -> dict[str, np.ndarray]:
             values["knot_rotations"] = np.asarray(path.rotations, dtype=float)
     for name in WORLD_PARAMETERS:
         values[name] = data.per_world(f"group.{name}", 0).astype(float).reshape(())
+    values["damping"] = np.maximum(values["damping"], AIR)
     return values
 
 

@@ -16,6 +16,7 @@ from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
 from ..xpbd.lanes.tape import Kind
 from ..xpbd.recording.recorder import Recorder
+from ..xpbd.springs.viscosity import DAMP_EVERY
 from .rollouts import GripPath, prepare
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
@@ -70,15 +71,17 @@ class Gradients:
 class DifferentiableRollout:
     """Rollouts of worlds of one topology, and derivatives back through them.
 
-    What is simulated is what `rollout` simulates, bit for bit. Contact on or off, its side, clamps,
+    What is simulated is what `rollout` simulates, bit for bit, from fabrics that are awake where
+    `forward` is given their state. Contact on or off, its side, clamps,
     release and the like are those of the rollout, so a derivative is that of the smooth piece that
     it ran on; a derivative over many contacts may be as large as the rollout is chaotic.
 
     Args:
         storage: see `Recorder`
         memory: see `Recorder`
-        sleep: see `Recorder`; False lets fabrics creep, not sleep
+        sleep: see `Recorder`
         dt: length of a substep [s]; None: the solver's
+        damp_every: see `FusedXPBD.run`
     """
 
     def __init__(
@@ -89,9 +92,12 @@ class DifferentiableRollout:
         memory: int = 2**30,
         sleep: bool = True,
         dt: float | None = None,
+        damp_every: int = DAMP_EVERY,
     ) -> None:
         self.solver = solver
-        self.recorder = Recorder(solver, storage=storage, memory=memory, sleep=sleep, dt=dt)
+        self.recorder = Recorder(
+            solver, storage=storage, memory=memory, sleep=sleep, dt=dt, damp_every=damp_every
+        )
         self.watch: list[WatchValues] = []
         self._worlds: list[int] = []
         self.times = np.zeros(0)
@@ -150,6 +156,7 @@ class DifferentiableRollout:
         for name, start in (("particles.x", positions), ("particles.v", velocities)):
             for k, w in enumerate(self._worlds) if start is not None else ():
                 data.lane(name, w)[:] = np.asarray(start)[k]
+                data.wake(w)
         if body_poses is not None or body_velocities is not None:
             for k, w in enumerate(self._worlds):
                 poses, twists = data.body_poses(w)

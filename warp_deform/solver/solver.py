@@ -16,7 +16,7 @@ from ..xpbd.config import SolverConfig
 from ..xpbd.fused_xpbd import FOREVER, FusedXPBD
 from ..xpbd.guards import WatchValues
 from .newton_tape import TapedStep, recording, refuse_lost_derivatives, unrecorded
-from .stepping import grip_from_control, substeps
+from .stepping import damp_every, grip_from_control, substeps
 
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 
@@ -166,7 +166,7 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
         else:
             self.set_duration(FOREVER, FOREVER)
             self.activate()
-            values = self.run(steps, dt=substep)
+            values = self.run(steps, dt=substep, damp_every=damp_every(steps))
         self.write_state(state_out)
         return values
 
@@ -183,13 +183,20 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
         return [replace(v, clamped=round(c)) for c, v in zip(self._clamped, values, strict=True)]
 
     def read_state(self, state: newton.State) -> None:
-        """Take positions and velocities of all worlds from a Newton state."""
+        """Take positions and velocities of all worlds from a Newton state.
+
+        Where these are not what the solver gave last, no fabric sleeps.
+        """
         data = self.data
         if data.has_particles:
             positions, velocities = state.particle_q.numpy(), state.particle_qd.numpy()
             for w in range(data.world_count):
-                data.lane("particles.x", w)[:] = positions[data.particle_ids[w]]
-                data.lane("particles.v", w)[:] = velocities[data.particle_ids[w]]
+                x, v = data.lane("particles.x", w), data.lane("particles.v", w)
+                now = positions[data.particle_ids[w]], velocities[data.particle_ids[w]]
+                known = np.array_equal((x.astype(np.float32), v.astype(np.float32)), now)
+                x[:], v[:] = now
+                if not known:
+                    data.wake(w)
         if data.has_bodies:
             poses, twists = state.body_q.numpy(), state.body_qd.numpy()
             for w in range(data.world_count):

@@ -10,19 +10,18 @@ from .task import Stage
 __all__ = ["BAG_PRIMITIVE", "BAG_SOLVER", "CARRY", "INSERT", "OPEN"]
 
 BAG_SOLVER = SolverConfig(
-    damping=1.0,
     table_friction=0.8,
     contact_friction=0.4,
     recovery=0.1,
     margin=0.006,
-    viscosity=30.0,
-    dry_friction=2.0,
+    viscosity=15.0,
     sleep_speed=0.006,
     sleep_ramp=20.0,
     limits=GuardLimits(stretch=2.0),
 )
-"""Viscosity and dry friction inside the shell bring a crumpled bag to rest within a second. A short
-edge near the pole may stretch by more than half for a moment while the bag is dragged over it."""
+"""Viscosity inside the shell and sleep on the table bring a crumpled bag to rest in a second. A
+short edge near the pole may stretch by more than half for a moment while the bag is dragged over
+it."""
 
 OPEN = Stage(lift=0.05, speed=0.25)
 """Low, so that a pulled bead opens the bag instead of lifting it."""

@@ -6,7 +6,7 @@ union of its mask with the goal's exceeds 0.25, within 10 actions. Not one of th
 tasks.
 
 Masks and physics differ between episodes, so that what is learned here holds on a robot: width,
-scale, tilt, shift, gaps and outline of the mask; friction of foam and chain, damping and stiffness.
+scale, tilt, shift, gaps and outline of the mask; friction of foam and chain, and stiffness.
 The score compares true masks.
 
 Source: Seita et al., ICRA 2021, section on physical experiments. The paper's demonstrations and
@@ -89,7 +89,6 @@ class CableMaskGoal(Task):
         physics = {
             "table_friction": float(self.solver.table_friction * rng.uniform(0.7, 1.4)),
             "contact_friction": float(self.solver.contact_friction * rng.uniform(0.5, 1.5)),
-            "damping": float(self.solver.damping * rng.uniform(0.5, 2.0)),
             "stiffness": float(np.exp(rng.uniform(np.log(0.5), np.log(3.0)))),
         }
         look = MaskLook.draw(rng)

@@ -31,7 +31,6 @@ BEAD_CHAIN = CableConfig(
 
 CHAIN_SOLVER = SolverConfig(
     dt=1 / 2000,  # a link of a chain dragged by its end then stretches by 10 % for a moment
-    damping=2.0,
     table_friction=0.8,
     contact_friction=0.2,
     margin=0.003,

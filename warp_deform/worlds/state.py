@@ -23,6 +23,8 @@ class WorldState:
     Attributes:
         particle_q: positions of the particles (P, 3) [m]
         particle_qd: their velocities (P, 3) [m/s]
+        still: how long the particles of fabrics have been near their anchors (P,) [s]
+        anchor: these (P, 3) [m]; see `xpbd.springs.sleep`
         body_x: centres of mass (B, 3) [m]
         body_quat: turns of the bodies (B, 4) quat_xyzw
         body_v: their velocities (B, 3) [m/s]
@@ -32,6 +34,8 @@ class WorldState:
 
     particle_q: np.ndarray
     particle_qd: np.ndarray
+    still: np.ndarray
+    anchor: np.ndarray
     body_x: np.ndarray
     body_quat: np.ndarray
     body_v: np.ndarray
@@ -45,6 +49,8 @@ class WorldState:
         return WorldState(
             particle_q=data.lane("particles.x", world).copy(),
             particle_qd=data.lane("particles.v", world).copy(),
+            still=data.lane("particles.still", world).copy(),
+            anchor=data.lane("particles.anchor", world).copy(),
             body_x=x,
             body_quat=quat,
             body_v=v,
@@ -58,10 +64,10 @@ class WorldState:
         Raises:
             InputError: the world has other numbers of particles or bodies, or another precision.
         """
-        particles = [data.lane("particles.x", world), data.lane("particles.v", world)]
+        particles = [data.lane(f"particles.{n}", world) for n in ("x", "v", "still", "anchor")]
         places = [*particles, *_bodies(data, world)]
         bodies = [self.body_x, self.body_quat, self.body_v, self.body_omega]
-        saved = [self.particle_q, self.particle_qd, *bodies]
+        saved = [self.particle_q, self.particle_qd, self.still, self.anchor, *bodies]
         for place, values in zip(places, saved, strict=True):
             if (place.shape, place.dtype) != (values.shape, values.dtype):
                 raise InputError(

@@ -167,6 +167,7 @@ class Worlds:
             if len(layout.particle_q):
                 data.lane("particles.x", slot)[:] = layout.particle_q
                 data.lane("particles.v", slot)[:] = 0.0
+                data.wake(slot)
             objects = objects_in(layout, self.objects)
             if len(layout.body_q):
                 data.set_bodies(slot, layout.body_q)
@@ -333,8 +334,9 @@ class Worlds:
         self._check_slot(slot)
         if state.episode.posture.shape != self.robot.home_q.shape:
             raise InputError("the state was saved with another robot")
+        # before the state, for it wakes what sleeps
+        self._set_physics(slot, state.episode.layout)
         episode = self.episodes[slot] = state.put(self.solver.data, slot)
-        self._set_physics(slot, episode.layout)
         self._shape_boxes(slot, episode.layout, episode.objects)
         self.look(slot)
 

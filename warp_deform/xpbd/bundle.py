@@ -23,8 +23,9 @@ __all__ = ["replay_bundle", "write_bundle"]
 _VARIANT = ("bodies", "sheets", "edges", "lines")
 _HEADER = {"digest", "lanes", "precision", "groups", "settings", *_VARIANT}
 _SETTINGS = ("dt", "max_steps", "recovery", "max_speed", "calm_speed", "margin",
-             "rest_speed", "rest_steps", "viscous", "dry", "sleep", "sleep_ramp", "check_every",
-             "record_every", "particle_stride", "body_stride")  # fmt: skip
+             "rest_speed", "rest_steps", "viscous", "damp_every", "sleep", "sleep_after", "wake",
+             "sleep_ramp", "check_every", "record_every", "particle_stride",
+             "body_stride")  # fmt: skip
 
 
 def write_bundle(

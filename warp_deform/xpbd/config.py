@@ -17,8 +17,8 @@ class SolverConfig:
 
     dt: float = 1 / 60 / 20
     """Substep [s]."""
-    damping: float = 1.0
-    """Air damping [1/s]."""
+    damping: float = 0.0
+    """Drag of the air, against the world [1/s]; 0: what is free falls as in a vacuum."""
     table_friction: float = 0.5
     """Coulomb coefficient of particles, and factor on that of boxes, against the table."""
     contact_friction: float = 0.3
@@ -39,22 +39,27 @@ class SolverConfig:
     rest_seconds: float = 0.05
     """At rest for so long ends a world's rollout [s]."""
     viscosity: float = 0.0
-    """Rate at which the ends of a strain-limited spring take on one velocity [1/s]."""
-    dry_friction: float = 0.0
-    """Deceleration of a particle by friction inside a fabric, in worlds with triangles [m/s^2]."""
+    """Rate at which neighbours in a fabric take on one velocity, but for its turning [1/s]."""
     sleep_speed: float = 0.0
-    """Particles of a world with triangles stay where they are when slower than this [m/s]."""
+    """Particles of fabrics with a lower mean speed fall asleep where something carries them [m/s];
+    0: none does."""
+    sleep_seconds: float = 0.25
+    """Time over which that is the mean [s]."""
+    wake_speed: float = 0.12
+    """A sleeper that a substep would move faster than this wakes [m/s]."""
     sleep_ramp: float = 10.0
-    """Factor by which the sleep speed grows from 1 s to 2 s after a release."""
+    """Factor by which the sleep speed of boxes in worlds with triangles grows from 1 s to 2 s after
+    a release."""
     limits: GuardLimits = field(default_factory=GuardLimits)
 
     def __post_init__(self) -> None:
         check_fields(
             self,
-            dict.fromkeys(("dt", "calm_speed", "margin", "rest_speed", "stiffness"), POSITIVE)
+            dict.fromkeys(("dt", "calm_speed", "margin", "rest_speed", "stiffness", "sleep_seconds",
+                           "wake_speed"), POSITIVE)
             | dict.fromkeys(
                 ("damping", "table_friction", "contact_friction", "recovery", "rest_seconds",
-                 "viscosity", "dry_friction", "sleep_speed", "sleep_ramp"), NOT_NEGATIVE,
+                 "viscosity", "sleep_speed", "sleep_ramp"), NOT_NEGATIVE,
             )
             | {"max_speed": Interval(low=0.0, above_low=True, infinite=True)},
         )  # fmt: skip

@@ -21,6 +21,7 @@ from .config import SolverConfig
 from .guards import PhysicsError, Problem, WatchValues
 from .kernels.forward import forward_kernel
 from .packing.data import WATCHED, SolverData
+from .springs.viscosity import DAMP_EVERY
 
 __all__ = ["FOREVER", "FusedXPBD"]
 
@@ -99,13 +100,19 @@ class FusedXPBD:
     # -- parameters
 
     def set_world(self, world: int, **parameters: float) -> None:
-        """Set damping [1/s], table_friction, contact_friction or stiffness of one world."""
+        """Set damping [1/s], table_friction, contact_friction or stiffness of one world.
+
+        Where one changes, no fabric sleeps on.
+        """
         for name, value in parameters.items():
             known = ("damping", "table_friction", "contact_friction", "stiffness")
             if name not in known:
                 raise InputError(f"a world has no parameter {name!r}; it has {', '.join(known)}")
             check_number(value, name, POSITIVE if name == "stiffness" else NOT_NEGATIVE)
-            self.data.per_world(f"group.{name}", world)[:] = value
+            place = self.data.per_world(f"group.{name}", world)
+            if (place != place.dtype.type(value)).any():
+                self.data.wake(world)
+            place[:] = value
 
     def set_duration(
         self,
@@ -138,6 +145,7 @@ class FusedXPBD:
         gravity = self.model.gravity.numpy()
         for w in range(self.data.world_count):
             self.data.per_world("group.gravity", w)[:] = gravity[min(w, len(gravity) - 1)][:, None]
+            self.data.wake(w)
 
     # -- reading
 
@@ -160,7 +168,12 @@ class FusedXPBD:
     # -- running
 
     def run(
-        self, max_steps: int, *, record_every: int = 0, dt: float | None = None
+        self,
+        max_steps: int,
+        *,
+        record_every: int = 0,
+        dt: float | None = None,
+        damp_every: int = DAMP_EVERY,
     ) -> list[WatchValues]:
         """Launch up to `max_steps` substeps; returns the guards' values by world.
 
@@ -170,13 +183,15 @@ class FusedXPBD:
         Args:
             dt: length of a substep [s], None: as configured. What is given per second, or in
                 seconds, is turned into shares and numbers of these substeps.
+            damp_every: substeps between two visits of viscosity, from the first one on; launches
+                that follow on each other need a divisor of `max_steps`
         """
         data = self.data
         frames = -(-max_steps // record_every) if record_every else 0
         if frames > data.frame_room:
             data.reserve_frames(frames)
             self._launch = None
-        settings = self._settings(max_steps, record_every, dt or self.config.dt)
+        settings = self._settings(max_steps, record_every, dt or self.config.dt, damp_every)
         data.clear_watch()
         inputs = {}
         if self.bundles is not None:
@@ -194,15 +209,15 @@ class FusedXPBD:
         limits = self.config.limits
         return tuple(p for w, v in enumerate(values) if v.steps for p in v.problems(w, limits))
 
-    def _settings(self, max_steps: int, record_every: int, dt: float) -> Any:
+    def _settings(self, max_steps: int, record_every: int, dt: float, damp_every: int) -> Any:
         """The kernel's settings, not to be changed: launches alike, which is most, share them."""
-        key = self.config, max_steps, record_every, dt
+        key = self.config, max_steps, record_every, dt, damp_every
         if self._cached_settings is None or self._cached_settings[0] != key:
             self._cached_settings = key, self._new_settings(*key)
         return self._cached_settings[1]
 
     def _new_settings(
-        self, config: SolverConfig, max_steps: int, record_every: int, dt: float
+        self, config: SolverConfig, max_steps: int, record_every: int, dt: float, damp_every: int
     ) -> Any:
         data = self.data
         settings = data.types.Settings()
@@ -213,9 +228,11 @@ class FusedXPBD:
         settings.calm_speed = config.calm_speed
         settings.margin = config.margin
         settings.rest_speed = config.rest_speed
-        settings.viscous = -math.expm1(-config.viscosity * dt)
-        settings.dry = config.dry_friction * dt
+        settings.damp_every = damp_every
+        settings.viscous = -math.expm1(-config.viscosity * damp_every * dt)
         settings.sleep = config.sleep_speed
+        settings.sleep_after = config.sleep_seconds
+        settings.wake = config.wake_speed
         settings.sleep_ramp = config.sleep_ramp
         settings.rest_steps = max(1, round(config.rest_seconds / dt))
         settings.check_every = 20

@@ -24,6 +24,8 @@ from warp_deform.xpbd.lanes.tape import Kind
 
 LINE = "cable-line-notarget"
 FEW = GradcheckConfig(levels=("substep",), states=4)
+MORE = replace(FEW, states=40)
+"""Stiffness moves a sheet so little in a substep that single differences are wrong by 2e-6."""
 OF_WORLD = {"damping", "table_friction", "contact_friction", "stiffness"}
 OF_PATH = {"way_points", "knot_times", "knot_rotations"}
 OF_PARTICLES = {"positions", "velocities", "inverse_masses"}
@@ -41,7 +43,7 @@ def overall(rows: list[Row]) -> dict[str, Row]:
 
 @pytest.mark.parametrize("task", PARAMETERS)
 def test_substeps_of_real_episodes_agree(task: str) -> None:
-    rows, _ = check(task, FEW)
+    rows, _ = check(task, MORE if task == "fabric-flat" else FEW)
     of_all = overall(rows)
     assert set(of_all) == PARAMETERS[task] | {"all"}
     for row in rows:

@@ -196,7 +196,7 @@ def test_a_thrown_bag_comes_to_rest_on_the_table(thrown):
     for w, r in results.items():
         x = r.frames.particle_q
         assert r.at_rest and not r.watch.problems(w, BAG_SOLVER.limits)
-        assert np.linalg.norm(x[-1] - x[-11], axis=1).max() < 0.005 * 10 * DT
+        assert np.linalg.norm(x[-1] - x[-11], axis=1).max() < BAG_SOLVER.rest_speed * 10 * DT
         assert x[..., 2].min() >= BAG.shell_radius - 5e-4
         assert pierced(x[-1], bag.faces) <= 0.02 * 904
         area = hull_area(x[-1, list(bag.ring), :2]) / (np.pi * BAG.opening_radius**2)

@@ -26,7 +26,9 @@ from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 
 DT = 1 / 1200
 CUBE = BoxConfig(mass=0.05, friction=0.8)
-SOLID = SolverConfig(table_friction=0.6, contact_friction=0.7, max_speed=1e3, limits=LOOSE)
+SOLID = SolverConfig(
+    damping=1.0, table_friction=0.6, contact_friction=0.7, max_speed=1e3, limits=LOOSE
+)
 PARAMETERS = ("damping", "table_friction", "contact_friction")
 
 
@@ -309,7 +311,7 @@ def test_a_box_pushed_by_a_held_bead() -> None:
 
 
 def test_a_sheet_draped_on_a_box() -> None:
-    config = replace(FABRIC_SOLVER, limits=LOOSE, sleep_speed=0.0, max_speed=1e3)
+    config = replace(FABRIC_SOLVER, damping=4.0, limits=LOOSE, sleep_speed=0.0, max_speed=1e3)
     solver, _ = cloth_solver(
         SMALL, box=(0.5, 0.0, 0.0199), config=config, lanes=1, precision="float64"
     )

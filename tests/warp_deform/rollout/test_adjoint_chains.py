@@ -30,7 +30,9 @@ def solver_of(
     add_cable(one, cable, cable_ring(cable, (0.5, 0.0)) if closed else line)
     builder.replicate(one, worlds)
     model = builder.finalize(device="cpu")
-    return SolverFusedXPBD(model, SolverConfig(limits=LOOSE), lanes=lanes, precision=precision)
+    return SolverFusedXPBD(
+        model, SolverConfig(damping=1.0, limits=LOOSE), lanes=lanes, precision=precision
+    )
 
 
 def shake(solver: SolverFusedXPBD, seed: int, world: int = 0) -> None:

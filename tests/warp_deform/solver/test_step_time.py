@@ -75,8 +75,8 @@ def test_substeps_are_equal_and_no_longer_than_configured():
 
 
 def test_parameters_per_second_hold_at_an_adapted_substep():
-    """Air, viscosity and dry friction of a fabric that moves take as much in as long a time."""
-    config = SolverConfig(damping=2.0, viscosity=30.0, dry_friction=1.0, max_speed=100.0)
+    """Air and the viscosity of a fabric that moves take as much in as long a time."""
+    config = SolverConfig(damping=2.0, viscosity=30.0, max_speed=100.0)
     ends = {}
     for dt in (1 / 60, 1 / 60 / 32, 1 / 60 / 50):
         solver, _ = cloth_solver(SMALL, height=1.0, config=config, precision="float64")
@@ -89,8 +89,8 @@ def test_parameters_per_second_hold_at_an_adapted_substep():
             solver.step(state, after, None, None, dt)
             state, after = after, state
         ends[dt] = state.particle_qd.numpy()[:, 0]
-    # air leaves exp(-2 t) of the mean speed, dry friction takes 1 m/s^2 of it
-    expected = (1.05 + 0.5) * np.exp(-0.2) - 0.5
+    # air leaves exp(-2 t) of the mean speed
+    expected = 1.05 * np.exp(-0.2)
     for dt, speeds in ends.items():
         assert speeds.mean() == pytest.approx(expected, rel=5e-3), dt
         assert np.ptp(speeds) < 0.02
@@ -164,7 +164,7 @@ def test_a_push_that_would_do_nothing_or_harm_is_refused(push):
 
 
 def test_a_bundle_of_a_fabric_reproduces_the_very_bits(tmp_path):
-    """It needs viscosity, dry friction and sleep as well."""
+    """It needs viscosity and sleep as well."""
     solver, _ = cloth_solver(SMALL, height=0.02, config=CLOTH_SOLVER, bundles=tmp_path)
     solver.data.lane("particles.x", 0)[3, 0] += 0.1
     with pytest.raises(PhysicsError) as caught:

@@ -9,7 +9,6 @@ import warp as wp
 from ..lanes.algebra import add, any_less, div, dot, less, mul, root, select, sub  # noqa: F401
 from ..lanes.structures import structures
 from ..lanes.tape import Kind
-from ..springs.internal_friction import internal_friction_adjoint
 from .friction import friction, friction_adjoint
 
 __all__ = ["table_contact", "table_contact_adjoint"]
@@ -91,8 +90,8 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
     fabrics: its position, that at the start of the substep, and its old velocity).
 
     `sweep_finish` takes that back, and with it the prediction of the next substep (`again`), whose
-    velocity it finds; with fabrics, dry friction and sleep. Returns the derivatives by friction and
-    by the share of velocity that air damping keeps. `sweep_predict` takes back a prediction alone.
+    velocity it finds. Returns the derivatives by friction and by the share of velocity that air
+    damping keeps. `sweep_predict` takes back a prediction alone.
 
     Branches: above or on the table (its correction acts on z only, friction across), the speed
     clamp, and lanes that are frozen. Sticking is the smooth end of friction, no branch.
@@ -102,7 +101,6 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
     Particles, Tape, Adjoint = t.Particles, t.Tape, t.Adjoint
     finish, stepped = table_contact(scalar, lanes).finish, table_contact(scalar, lanes).stepped
     coulomb_gradients = friction_adjoint(scalar, lanes).coulomb_gradients
-    sweep_calm = internal_friction_adjoint(scalar, lanes).sweep_calm
 
     @wp.func
     def record_finish(
@@ -147,8 +145,6 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
         dt: S,
         damping_factor: V,
         fall: V3,
-        dry: S,
-        sleep: V,
         counts: int,
         adj: Adjoint,
     ):
@@ -196,13 +192,6 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
             g = g * on
             go = go + back
         adj.v[i] = frozen
-        if wp.static(with_sheets):
-            if dry > S(0.0) or any_less(zero - sleep, S(0.0)):
-                adj.x[i] = g
-                adj.xp[i] = go
-                gv = sweep_calm(i, e * (slower * inverse_dt), gv, dry, sleep, on, counts, adj)
-                g = adj.x[i]
-                go = adj.xp[i]
         gd = gv * inverse_dt
         gd = gd * slower - e * (bent * dot(gd, e))
         g = g + gd

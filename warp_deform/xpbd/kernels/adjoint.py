@@ -48,8 +48,8 @@ def adjoint_kernel(
     sweep_springs, sweep_grips = t.sweep_springs, t.sweep_grips
     sweep_pushes, sweep_predictions = t.sweep_pushes, t.sweep_predictions
     sheets_ = sweep_sheets(scalar, lanes, with_edges)
-    sweep_viscosity, sweep_tethers = sheets_.sweep_viscosity, sheets_.sweep_tethers
-    sweep_fabrics = sheets_.sweep_fabrics
+    sweep_sleep, sweep_viscosity = sheets_.sweep_sleep, sheets_.sweep_viscosity
+    sweep_tethers, sweep_fabrics = sheets_.sweep_tethers, sheets_.sweep_fabrics
     Settings, Topology, Pairs, Shapes = t.Settings, t.Topology, t.Pairs, t.Shapes
     Springs, Lines = t.Springs, t.Lines
     Group, Particles, Bodies, Contacts, Grips = t.Group, t.Particles, t.Bodies, t.Contacts, t.Grips
@@ -76,7 +76,7 @@ def adjoint_kernel(
         g = wp.tid()
         at = span_of(g, top, group, sheets)
         pace = pace_of(g, st, group)
-        always = look_ahead(at, springs, grips)
+        always = look_ahead(at, top, springs, grips)
         by = By()
         by.damping_factor = adj.damping[g]
         by.inverse_dt2 = adj.stiffness[g]
@@ -101,9 +101,10 @@ def adjoint_kernel(
             if wp.static(with_bodies):
                 tops, matters = sweep_finished_bodies(at, pace, now, tops, bodies, tape, ba, adj)
             if wp.static(with_sheets):
-                tops = sweep_viscosity(at, st, now, always, tops, springs, tape, adj)
+                tops = sweep_sleep(at, st, now, tops, tape, adj)
+                tops = sweep_viscosity(at, st, now, always, tops, top, springs, tape, adj)
             again = back > 0 or adj.pending[g] > 0
-            by, tops = sweep_finishes(at, pace, now, again, by, tops, st, top, tape, adj)
+            by, tops = sweep_finishes(at, pace, now, again, by, tops, top, tape, adj)
             now.finished = tops[0]
             # solve
             if wp.static(with_bodies):

@@ -1,4 +1,4 @@
-"""How a substep ends: the table, velocities, what brings fabrics to rest, and what is at rest."""
+"""How a substep ends: the table, velocities, viscosity and sleep of fabrics, what is at rest."""
 
 import functools
 from types import SimpleNamespace
@@ -9,10 +9,11 @@ import warp as wp
 from ..bodies.rigid_body import rigid_body
 from ..bodies.rigid_body_adjoint import rigid_body_adjoint
 from ..contact.table_contact import table_contact, table_contact_adjoint
-from ..lanes.algebra import add, less, mul, root, select, sub  # noqa: F401  (operators by name)
+from ..lanes.algebra import add, dot, less, mul, root, select, sub  # noqa: F401
 from ..lanes.group_state import group_state
 from ..lanes.tape import BODY_SCALARS
-from ..springs.internal_friction import internal_friction, internal_friction_adjoint
+from ..springs.sleep import sleep
+from ..springs.viscosity import viscosity, viscosity_adjoint
 
 __all__ = ["finishes"]
 
@@ -31,13 +32,17 @@ def finishes(
     Particles, Springs, Bodies, Tape = t.Particles, t.Springs, t.Bodies, t.Tape
     finish = table_contact(scalar, lanes).finish
     record_finish = table_contact_adjoint(scalar, lanes, with_sheets).record_finish
-    calms = internal_friction(scalar, lanes)
-    sleep_speed, calm_particle, damp_spring = (
-        getattr(calms, n) for n in ("sleep_speed", "calm_particle", "damp_spring")
-    )
-    record_spring = internal_friction_adjoint(scalar, lanes).record_spring
+    damp_fabrics = viscosity(scalar, lanes).damp_fabrics
+    record_damping = viscosity_adjoint(scalar, lanes).record_damping
+    rest_fabrics = sleep(scalar, lanes, taped).rest_fabrics
     finish_body = rigid_body(scalar, lanes).finish_body
     record_body = rigid_body_adjoint(scalar, lanes).record_body
+
+    @wp.func
+    def drowsiness(free: V, ramp: S):
+        """Factor on the sleep speed of boxes so long after a release."""
+        late = wp.min(wp.max(free - V(S(1.0)), V(S(0.0))), V(S(1.0)))
+        return V(S(1.0)) + late * (ramp - S(1.0))
 
     @wp.func
     def finish_all(
@@ -96,30 +101,17 @@ def finishes(
                     particles,
                 )
             moved2 = wp.max(moved2, ended2)
-        unrest2 = moved2
+        unrest2 = zero
         drowsy = one
-        if wp.static(taped):
-            sleep = zero
+        stirred = zero
         if wp.static(with_sheets):
-            if st.dry > S(0.0) or st.sleep > S(0.0):
-                sleep = sleep_speed(run.free_time, st.sleep, st.sleep_ramp)
-                drowsy = sleep_speed(run.free_time, S(1.0), st.sleep_ramp)
-                speed2 = zero
-                for i in range(at.particles):
-                    speed2 = wp.max(
-                        speed2, calm_particle(at.p0 + i, st.dry, sleep, run.on, particles)
-                    )
-                unrest2 = speed2 * (dt * dt)
-            if st.viscous > S(0.0):
-                for s in range(at.s0, at.s1):
-                    if springs.limit[s] > S(0.0):
-                        if wp.static(taped):
-                            record_spring(
-                                s, at.p0, tops[0], st.viscous, run.on, particles, springs, tape
-                            )
-                            tops[0] += 1
-                        else:
-                            damp_spring(s, at.p0, st.viscous, run.on, particles, springs)
+            drowsy = drowsiness(run.free_time, st.sleep_ramp)
+            if st.viscous > S(0.0) and run.substep % st.damp_every == 0:
+                if wp.static(taped):
+                    record_damping(at, tops[0], st.viscous, run.on, top, particles, springs, tape)
+                    tops[0] += 2 * at.particles
+                else:
+                    damp_fabrics(at, st.viscous, run.on, top, particles, springs)
             run.free_time = (run.free_time + V(dt)) * (one - run.holding)
         if wp.static(with_bodies):
             for lane in range(wp.static(L)):
@@ -127,6 +119,10 @@ def finishes(
                     gravity = R3(pace.gravity.x[lane], pace.gravity.y[lane], pace.gravity.z[lane])
                     for b in range(at.bodies):
                         body = at.b0 + lane * at.bodies + b
+                        if wp.static(with_sheets):
+                            if bodies.touching[body] > 0:
+                                if wp.length(bodies.v[body]) > st.rest_speed:
+                                    stirred[lane] = S(1.0)
                         if wp.static(taped):
                             tape.k[tops[2]] = record_body(
                                 tops[3],
@@ -149,14 +145,24 @@ def finishes(
                             drowsy[lane],
                             bodies,
                         )
-                        moved2[lane] = wp.max(moved2[lane], m)
                         unrest2[lane] = wp.max(unrest2[lane], m)
+        slow2 = moved2
+        moved2 = wp.max(moved2, unrest2)
+        if wp.static(with_sheets):
+            if st.sleep > S(0.0):
+                rest_fabrics(at, pace, st, stirred, run.on, tops[1], top, particles, springs, tape)
+                if wp.static(taped):
+                    tops[1] += at.particles
+                slow2 = zero
+                for i in range(at.p0, at.p0 + at.particles):
+                    slow2 = wp.max(slow2, dot(particles.v[i], particles.v[i]))
+                slow2 = slow2 * run.on * (dt * dt)
+        unrest2 = wp.max(unrest2, slow2)
         if wp.static(taped):
             tape.v[tops[1]] = run.on
             tape.v[tops[1] + 1] = fastest
             tape.v[tops[1] + 2] = run.holding
-            tape.v[tops[1] + 3] = sleep
-            tops[1] += 4
+            tops[1] += 3
         return run, tops, moved2, unrest2
 
     @wp.func

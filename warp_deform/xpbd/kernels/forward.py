@@ -95,7 +95,7 @@ def forward_kernel(
             begins = tape.resume == 0
         run = Run()
         if begins:
-            run = begin(at, group, particles, bodies, grips, cells)
+            run = begin(at, st, group, particles, bodies, grips, cells)
         # the table hides at once that a particle started under it
         watch_group(at, springs, shapes, group, particles, bodies, watch)
         tops = wp.vec4i()

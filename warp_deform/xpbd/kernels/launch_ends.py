@@ -9,6 +9,7 @@ import warp as wp
 from ...objects.push import MOST_PUSHES
 from ..lanes.algebra import add, sub  # noqa: F401  (operators are found by name)
 from ..lanes.group_state import group_state
+from ..springs.sleep import sleep
 from .grip import grip
 
 __all__ = ["launch_ends"]
@@ -26,10 +27,17 @@ def launch_ends(
     Span, Run, Settings, Group, Particles = t.Span, t.Run, t.Settings, t.Group, t.Particles
     Bodies, Grips, Watch, Cells, Tape = t.Bodies, t.Grips, t.Watch, t.Cells, t.Tape
     take, let_go = grip(scalar, lanes).take, grip(scalar, lanes).let_go
+    rouse = sleep(scalar, lanes).rouse
 
     @wp.func
     def begin(
-        at: Span, group: Group, particles: Particles, bodies: Bodies, grips: Grips, cells: Cells
+        at: Span,
+        st: Settings,
+        group: Group,
+        particles: Particles,
+        bodies: Bodies,
+        grips: Grips,
+        cells: Cells,
     ):
         zero = V(S(0.0))
         run = Run()
@@ -46,6 +54,8 @@ def launch_ends(
         run.drift = V3(zero, zero, zero)
         run.substep = int(0)
         run.near_count = int(0)
+        if wp.static(with_sheets):
+            rouse(at, run.on, st, particles)
         holding = zero
         longest = int(0)
         for lane in range(wp.static(L)):

@@ -1,4 +1,4 @@
-"""The phases of fabrics taken back: viscosity, contacts of triangles and edges, and tethers."""
+"""The phases of fabrics taken back: sleep, viscosity, contacts of triangles and edges, tethers."""
 
 import functools
 from types import SimpleNamespace
@@ -12,25 +12,34 @@ from ..lanes.algebra import add, any_less, sub  # noqa: F401  (operators are fou
 from ..lanes.lane_access import lane_access
 from ..lanes.sweep_state import sweep_state
 from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind
-from ..springs.internal_friction import internal_friction_adjoint
+from ..springs.sleep import sleep_adjoint
 from ..springs.tether import tether_adjoint
+from ..springs.viscosity import viscosity_adjoint
 
 __all__ = ["sweep_sheets"]
 
 
 @functools.cache
 def sweep_sheets(scalar: Any, lanes: int, with_edges: bool) -> SimpleNamespace:
-    """`sweep_viscosity`, `sweep_fabrics` and `sweep_tethers` of a group, see `sweeps`."""
+    """`sweep_sleep`, `sweep_viscosity`, `sweep_fabrics`, `sweep_tethers`; see `sweeps`."""
     t = sweep_state(scalar, lanes)
     S, V, V3, L = t.S, t.V, t.V3, t.L
     Span, Pace, By, Substep, Always = t.Span, t.Pace, t.By, t.Substep, t.Always
-    Settings, Springs, Particles, Sheets = t.Settings, t.Springs, t.Particles, t.Sheets
-    Tape, Adjoint = t.Tape, t.Adjoint
-    sweep_spring = internal_friction_adjoint(scalar, lanes).sweep_spring
+    Settings, Topology, Springs = t.Settings, t.Topology, t.Springs
+    Particles, Sheets, Tape, Adjoint = t.Particles, t.Sheets, t.Tape, t.Adjoint
+    sweep_rest = sleep_adjoint(scalar, lanes).sweep_rest
+    sweep_damping = viscosity_adjoint(scalar, lanes).sweep_damping
     sweep_triangle = triangle_contact_adjoint(scalar, lanes).sweep_triangle
     sweep_edge = edge_contact_adjoint(scalar, lanes).sweep_edge
     sweep_tether = tether_adjoint(scalar, lanes).sweep_tether
     count_lanes = lane_access(scalar, lanes).count_lanes
+
+    @wp.func
+    def sweep_sleep(at: Span, st: Settings, now: Substep, tops: wp.vec4i, tape: Tape, adj: Adjoint):
+        if st.sleep > S(0.0):
+            tops[1] -= at.particles
+            sweep_rest(at, tops[1], now.counts, tape, adj)
+        return tops
 
     @wp.func
     def sweep_viscosity(
@@ -39,17 +48,15 @@ def sweep_sheets(scalar: Any, lanes: int, with_edges: bool) -> SimpleNamespace:
         now: Substep,
         always: Always,
         tops: wp.vec4i,
+        top: Topology,
         springs: Springs,
         tape: Tape,
         adj: Adjoint,
     ):
-        if st.viscous > S(0.0):
+        if st.viscous > S(0.0) and now.number % st.damp_every == 0:
             count_lanes(now.counts + wp.static(int(Kind.VISCOSITY)), now.on, always.damped, adj)
-            for r in range(at.s1 - at.s0):
-                s = at.s1 - 1 - r
-                if springs.limit[s] > S(0.0):
-                    tops[0] -= 1
-                    sweep_spring(s, at.p0, tape.x[tops[0]], st.viscous, now.on, springs, adj)
+            tops[0] -= 2 * at.particles
+            sweep_damping(at, tops[0], st.viscous, now.on, top, springs, tape, adj)
         return tops
 
     @wp.func
@@ -138,5 +145,8 @@ def sweep_sheets(scalar: Any, lanes: int, with_edges: bool) -> SimpleNamespace:
         return wp.vec4i(tx, tops[1], tk, tops[3])
 
     return SimpleNamespace(
-        sweep_viscosity=sweep_viscosity, sweep_fabrics=sweep_fabrics, sweep_tethers=sweep_tethers
+        sweep_sleep=sweep_sleep,
+        sweep_viscosity=sweep_viscosity,
+        sweep_fabrics=sweep_fabrics,
+        sweep_tethers=sweep_tethers,
     )

@@ -35,7 +35,7 @@ def sweeps(
     t = sweep_state(scalar, lanes)
     S, V, L = t.S, t.V, t.L
     Span, Pace, By, Substep, Always = t.Span, t.Pace, t.By, t.Substep, t.Always
-    Settings, Topology, Pairs = t.Settings, t.Topology, t.Pairs
+    Topology, Pairs = t.Topology, t.Pairs
     Springs, Lines = t.Springs, t.Lines
     Grips, Tape, Adjoint, BodyAdjoint = t.Grips, t.Tape, t.Adjoint, t.BodyAdjoint
     sweep_distance = distance_adjoint(scalar, lanes, with_sheets).sweep_distance
@@ -53,11 +53,10 @@ def sweeps(
     count_lanes = lane_access(scalar, lanes).count_lanes
 
     @wp.func
-    def look_ahead(at: Span, springs: Springs, grips: Grips):
+    def look_ahead(at: Span, top: Topology, springs: Springs, grips: Grips):
         always = Always()
         bends = int(0)
         stretches = int(0)
-        damped = int(0)
         for s in range(at.s0, at.s1):
             mode = springs.mode[s]
             if mode == wp.static(int(SpringMode.BEND)) or mode == wp.static(int(SpringMode.BEAM)):
@@ -66,8 +65,6 @@ def sweeps(
                 stretches += 1
             elif mode == wp.static(int(SpringMode.CHAIN)):
                 stretches += 1
-            if springs.limit[s] > S(0.0):
-                damped += 1
         longest = int(0)
         for p in range(wp.static(L * MOST_PUSHES)):
             slot = at.world0 * wp.static(MOST_PUSHES) + p
@@ -75,7 +72,9 @@ def sweeps(
                 longest = wp.max(longest, grips.push_steps[slot])
         always.bends = bends * at.passes
         always.stretches = stretches * at.passes
-        always.damped = damped
+        pieces = top.piece_start[at.k]
+        last = top.piece_start[at.k + 1]
+        always.damped = springs.neighbour_first[last] - springs.neighbour_first[pieces]
         always.longest_push = longest
         return always
 
@@ -84,11 +83,10 @@ def sweeps(
         at: Span, always: Always, number: int, ahead: int, tops: wp.vec4i, tape: Tape, adj: Adjoint
     ):
         now = Substep()
-        tops[1] -= 4
+        tops[1] -= 3
         now.on = tape.v[tops[1]]
         now.fastest = tape.v[tops[1] + 1]
         now.holding = tape.v[tops[1] + 2]
-        now.sleep = tape.v[tops[1] + 3]
         now.number = number
         now.ahead = ahead
         now.counts = at.g * wp.static(KINDS)
@@ -104,7 +102,6 @@ def sweeps(
         again: bool,
         by: By,
         tops: wp.vec4i,
-        st: Settings,
         top: Topology,
         tape: Tape,
         adj: Adjoint,
@@ -124,7 +121,6 @@ def sweeps(
         for i in range(n):
             d = tape.x[tx]
             z = zero
-            sleep = zero
             if wp.static(with_sheets):
                 fetch_ahead(tape.x, tx + 3 * i - now.ahead, wp.static(3 * BYTES))
                 x = tape.x[tx + 3 * i]
@@ -137,7 +133,6 @@ def sweeps(
                     pace.fall,
                 )
                 z = x.z
-                sleep = now.sleep
             else:
                 fetch_ahead(tape.x, tx + i - now.ahead, wp.static(BYTES))
                 d = tape.x[tx + i]
@@ -156,8 +151,6 @@ def sweeps(
                 pace.dt,
                 pace.damping_factor,
                 pace.fall,
-                st.dry,
-                sleep,
                 now.counts,
                 adj,
             )

@@ -34,10 +34,12 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         calm_speed: S  # clamp while a world is calmed [m/s]
         margin: S  # pairs this much farther apart than touching are still listed [m]
         rest_speed: S  # slower than this is at rest [m/s]
-        viscous: S  # share of their relative velocity that ends of a spring lose in a substep
-        dry: S  # speed that a particle of a fabric loses in a substep [m/s]
-        sleep: S  # slower particles of a fabric stay where they are [m/s]
-        sleep_ramp: S  # `sleep` grows by this factor from 1 s to 2 s after a release
+        viscous: S  # share of their relative velocity that neighbours lose in a visit
+        damp_every: int  # substeps between two visits of viscosity
+        sleep: S  # mean speed below which a particle of a fabric falls asleep [m/s]; 0: none does
+        sleep_after: S  # over so long [s]
+        wake: S  # what would be faster wakes [m/s]
+        sleep_ramp: S  # by this factor a box's sleep speed grows from 1 s to 2 s after a release
         rest_steps: S  # so many substeps at rest end a world's launch
         check_every: int  # substeps between looks of the guards
         record_every: int  # substeps between recorded frames; 0: record nothing
@@ -57,6 +59,7 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         passes: wp.array(dtype=int)  # over the springs, in a substep
         pair_start: wp.array(dtype=int)
         shape_count: wp.array(dtype=int)
+        piece_start: wp.array(dtype=int)  # pieces of fabric, see `Springs`
 
     @wp.struct
     class Springs:
@@ -71,6 +74,11 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         watched: wp.array(dtype=int)  # 1: the stretch guard looks at it
         middle: wp.array(dtype=int)  # of a bending spring: the particle between the two
         run: wp.array(dtype=int)  # of a direct solve: springs from here on; 0: amid them
+        # of fabrics, piece by piece: pairs of neighbours, and particles
+        neighbours: wp.array(dtype=wp.vec2i)
+        neighbour_first: wp.array(dtype=int)  # (pieces + 1,), as the next
+        members: wp.array(dtype=int)
+        member_first: wp.array(dtype=int)
 
     @wp.struct
     class Pairs:
@@ -121,6 +129,9 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         xr: wp.array(dtype=V3)  # position when the contact list was last made
         w: wp.array(dtype=V)  # inverse mass [1/kg], 0 while gripped
         w0: wp.array(dtype=V)  # inverse mass when free
+        still: wp.array(dtype=V)  # of fabrics: how long it has been near `anchor`, see `sleep` [s]
+        anchor: wp.array(dtype=V3)  # [m]
+        dv: wp.array(dtype=V3)  # scratch: change of the velocity [m/s]
         tether: wp.array(dtype=V)  # farthest from what is held [m], see `tether`
 
     @wp.struct
@@ -324,6 +335,11 @@ def structures(scalar: Any, lanes: int) -> SimpleNamespace:
         xp: wp.array(dtype=V3)  # by position at the start of the substep
         w: wp.array(dtype=V)  # not a derivative: inverse masses as they were in the substep
         mass: wp.array(dtype=V)  # by free inverse mass
+        # scratch of `viscosity`: positions, velocities, derivatives, and these over the masses
+        then_x: wp.array(dtype=V3)
+        then_v: wp.array(dtype=V3)
+        then_g: wp.array(dtype=V3)
+        then_h: wp.array(dtype=V3)
         damping: wp.array(dtype=V)  # by `Pace.damping_factor`; per group, as those below
         table_friction: wp.array(dtype=V)
         contact_friction: wp.array(dtype=V)

@@ -33,7 +33,6 @@ def sweep_state(scalar: Any, lanes: int) -> SimpleNamespace:
         on: V
         fastest: V  # longest step that the clamp allowed [m]
         holding: V
-        sleep: V  # speed below which particles of fabrics stayed [m/s]
         number: int
         ahead: int  # so far ahead on the stack of V3 is what is fetched
         counts: int  # first of the group's counters of constraints that acted
@@ -45,7 +44,7 @@ def sweep_state(scalar: Any, lanes: int) -> SimpleNamespace:
 
         bends: int  # springs of this kind
         stretches: int
-        damped: int  # with internal viscosity
+        damped: int  # pairs of neighbours in fabrics
         longest_push: int  # [substeps]
 
     return SimpleNamespace(**vars(t), By=By, Substep=Substep, Always=Always)

@@ -71,16 +71,15 @@ class Kind(IntEnum):
     TRIANGLE_FACE = 13
     TRIANGLE_RIM = 14
     EDGE = 15
-    DRY_FRICTION = 16
-    SLEEP = 17
-    VISCOSITY = 18
-    BODY_TABLE = 19
-    BODY_BODY = 20
-    BODY_SLIP = 21
-    BODY_SLEEP = 22
-    BODY_CLAMP = 23
-    BOX_PARTICLE = 24
-    BOX_TRIANGLE = 25
+    SLEEP = 16
+    VISCOSITY = 17
+    BODY_TABLE = 18
+    BODY_BODY = 19
+    BODY_SLIP = 20
+    BODY_SLEEP = 21
+    BODY_CLAMP = 22
+    BOX_PARTICLE = 23
+    BOX_TRIANGLE = 24
 
 
 @functools.cache
@@ -116,7 +115,7 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
         words = springs + at.passes + particles + near + wp.static(TRIANGLE_WORDS) * listed
         words += wp.static(2 * L * (GRIP_WORDS + 4) + 8) + wp.static(BODY_WORDS) * (bodies + solid)
         return (
-            tops[0] + 2 * springs + 4 * particles + 2 * near <= end[0]
+            tops[0] + 2 * springs + 6 * particles + 2 * near <= end[0]
             and tops[1] + near + particles + 8 <= end[1]
             and tops[2] + words <= end[2]
             and tops[3]

@@ -14,7 +14,7 @@ from ..bodies.box_box import POINTS
 from ..springs.tether import NO_TETHER
 from .groups import NUMPY, PackedWorlds
 from .sheet_data import add_sheets
-from .topology import tethers
+from .topology import pieces, tethers
 
 __all__ = ["KERNEL_ARGUMENTS", "WATCHED", "SolverData"]
 
@@ -69,6 +69,10 @@ class SolverData(PackedWorlds):
         t, number = self.types, self.number
         tops = self.topologies
 
+        fabrics = [pieces(k) for k in tops]
+        neighbours = [pairs for found in fabrics for pairs in found]
+        members = [np.unique(pairs) for pairs in neighbours]
+
         def starts(field: str) -> np.ndarray:
             return np.concatenate([[0], np.cumsum([len(getattr(k, field)) for k in tops])])
 
@@ -87,8 +91,14 @@ class SolverData(PackedWorlds):
             ("springs.watched", joined("spring_watched")),
             ("springs.middle", joined("spring_middle")),
             ("springs.run", joined("spring_run")),
+            ("topology.piece_start", np.cumsum([0, *map(len, fabrics)])),
+            ("springs.neighbour_first", np.cumsum([0, *map(len, neighbours)])),
+            ("springs.member_first", np.cumsum([0, *map(len, members)])),
+            ("springs.members", np.concatenate([np.zeros(0, int), *members])),
         ):
             self.add_constant(name, np.asarray(values), wp.int32, np.int32)
+        joint = np.concatenate([np.zeros((0, 2), int), *neighbours])
+        self.add_constant("springs.neighbours", joint, wp.vec2i, np.int32)
         self.add_constant("topology.radius", joined("particle_radius"), t.S, number)
         for name in ("springs.ij", "pairs.ij"):
             self.add_constant(name, joined(_field(name)), wp.vec2i, np.int32)
@@ -145,9 +155,9 @@ class SolverData(PackedWorlds):
 
     def _fill_particles(self) -> None:
         count, L = int(self.group_particle[-1]), self.lanes
-        for name in ("x", "v", "xp", "xr"):
+        for name in ("x", "v", "xp", "xr", "dv", "anchor"):
             self.add_array(f"particles.{name}", count, self.types.V3, (3, L), self.number)
-        for name in ("w", "w0", "tether"):
+        for name in ("w", "w0", "tether", "still"):
             self.add_array(f"particles.{name}", count, self.types.V, (L,), self.number)
         room = count if self.has_lines else 0
         for name in ("along", "bend"):
@@ -298,6 +308,7 @@ class SolverData(PackedWorlds):
             for w in range(self.world_count):
                 self.lane("particles.x", w)[:] = positions[self.particle_ids[w]]
                 self.lane("particles.v", w)[:] = velocities[self.particle_ids[w]]
+                self.wake(w)
         views["particles.w"][:] = views["particles.w0"]
         if self.has_bodies:
             poses, twists = self.model.body_q.numpy(), self.model.body_qd.numpy()
@@ -305,6 +316,11 @@ class SolverData(PackedWorlds):
                 self.set_bodies(w, poses[self.body_ids[w]], twists[self.body_ids[w]])
         views["bodies.w"][:] = views["bodies.w0"]
         self.clear_grips()
+
+    def wake(self, world: int) -> None:
+        """Nothing of a world's fabrics sleeps, or has lain still yet."""
+        self.lane("particles.still", world)[:] = 0.0
+        self.lane("particles.anchor", world)[:] = self.lane("particles.x", world)
 
     def clear_watch(self) -> None:
         """Nothing is noted yet."""

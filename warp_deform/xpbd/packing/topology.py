@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import newton
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from ...errors import InputError
 from ...objects.attributes import NAMESPACE, SpringMode
 from ..springs.tether import NO_TETHER
 from .sheets import Sheets
 
-__all__ = ["WorldTopology", "read_worlds", "runs", "tethers"]
+__all__ = ["WorldTopology", "pieces", "read_worlds", "runs", "tethers"]
 
 _RUN_OF_A_PASS = 10
 _BENDING = (int(SpringMode.BEND), int(SpringMode.BEAM))
@@ -161,6 +161,15 @@ def runs(ij: np.ndarray, middle: np.ndarray, mode: np.ndarray) -> np.ndarray:
             first, met = s, {i, int(middle[s])}
         met.add(j)
     return out
+
+
+def pieces(topology: WorldTopology) -> list[np.ndarray]:
+    """Pairs of neighbours (N, 2) in each piece of fabric: the ends of the springs that join it."""
+    ij = topology.spring_ij[np.isin(topology.spring_ij, topology.sheet_triangle).all(axis=1)]
+    size = (topology.particle_count, topology.particle_count)
+    graph = csr_array((np.ones(len(ij)), (ij[:, 0], ij[:, 1])), shape=size)
+    piece = connected_components(graph, directed=False)[1][ij[:, 0]]
+    return [ij[piece == p] for p in np.unique(piece)]
 
 
 def _slices(worlds: np.ndarray, count: int, what: str) -> list[np.ndarray]:

@@ -12,7 +12,8 @@ from ..packing.mirrored import Mirrored
 __all__ = ["Checkpoints"]
 
 _STATE = (
-    "particles.x", "particles.v", "particles.xp", "particles.xr", "particles.w", "near.pair",
+    "particles.x", "particles.v", "particles.xp", "particles.xr", "particles.w",
+    "particles.still", "particles.anchor", "near.pair",
     "near.mask", "grips.particle", "grips.body", "grips.tick", "grips.knot", "grips.shift",
     "bodies.x", "bodies.q", "bodies.v", "bodies.omega", "bodies.xp", "bodies.qp", "bodies.w",
     "bodies.touching", "bodies.support", *(f"watch.{name}" for name in WATCHED),

@@ -19,6 +19,7 @@ from ..kernels.forward import forward_kernel
 from ..lanes.tape import COUNTERS, STATE, Kind
 from ..packing.data import KERNEL_ARGUMENTS
 from ..packing.mirrored import Mirrored
+from ..springs.viscosity import DAMP_EVERY
 from .checkpoint import Checkpoints
 from .tape_room import Stacks, TapeRoom, new_stacks
 
@@ -57,9 +58,9 @@ class Recorder:
 
     Args:
         memory: most bytes of checkpoints and tapes; a rollout that does not fit is refused
-        sleep: False leaves dry friction and sleep of fabrics out: they hold what a derivative
-            should move
+        sleep: False leaves the sleep of fabrics out, which holds what a derivative should move
         dt: length of a substep [s]; None: the solver's
+        damp_every: see `FusedXPBD.run`
     """
 
     def __init__(
@@ -70,11 +71,12 @@ class Recorder:
         memory: int = 2**30,
         sleep: bool = True,
         dt: float | None = None,
+        damp_every: int = DAMP_EVERY,
     ) -> None:
         if storage not in ("replay", "full"):
             raise InputError(f"storage must be replay or full, not {storage!r}")
         self.solver, self.storage, self.memory, self.sleep = solver, storage, memory, sleep
-        self.dt = dt or solver.config.dt
+        self.dt, self.damp_every = dt or solver.config.dt, damp_every
         data = solver.data
         variant = (data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets, data.has_edges)
         variant += (data.has_lines,)
@@ -144,6 +146,8 @@ class Recorder:
         t, L, groups = data.types, data.lanes, data.group_count
         particles, knots = int(data.group_particle[-1]), data.knot_room
         arrays = {name: self._mirrored(particles, t.V3, (3, L)) for name in ("x", "v", "xp")}
+        scratch = ("then_x", "then_v", "then_g", "then_h")
+        arrays |= {name: self._mirrored(particles, t.V3, (3, L)) for name in scratch}
         arrays |= {name: self._mirrored(particles, t.V, (L,)) for name in ("w", "mass")}
         for name in ("damping", "table_friction", "contact_friction", "stiffness"):
             arrays[name] = self._mirrored(groups, t.V, (L,))
@@ -276,9 +280,9 @@ class Recorder:
 
     def _new_settings(self) -> Any:
         # one of its own: it is changed here and between launches
-        settings = self.solver._new_settings(self.solver.config, 0, 0, self.dt)
+        settings = self.solver._new_settings(self.solver.config, 0, 0, self.dt, self.damp_every)
         if not self.sleep:
-            settings.dry = settings.sleep = 0.0
+            settings.sleep = 0.0
         return settings
 
     def _read(self) -> dict[str, np.ndarray]:

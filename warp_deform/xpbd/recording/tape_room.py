@@ -133,7 +133,7 @@ class TapeRoom:
             words = springs + top.passes + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
             bodies = top.body_count * data.lanes
             words += BODY_WORDS * bodies
-            rows.append((2 * springs + 4 * particles, particles + 8, words, BODY_SCALARS * bodies))
+            rows.append((2 * springs + 6 * particles, particles + 8, words, BODY_SCALARS * bodies))
         return np.array(rows)
 
     def _solid(self) -> np.ndarray:
