@@ -23,7 +23,7 @@ def main() -> None:
     options = parser.parse_args()
 
     quiet_warp()
-    env = gymnasium.make("WarpDeform/BagAloneOpen-v1").unwrapped
+    env = gymnasium.make("WarpDeform/BagAloneOpen-v2").unwrapped
     observation, info = env.reset(seed=options.seed)
     before = observation["color"]
     print(f"the opening is {info['score']:.0%} of the circle that it was")

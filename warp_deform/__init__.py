@@ -6,7 +6,7 @@ The public names below load their modules on first use.
     import gymnasium
     import warp_deform
 
-    env = gymnasium.make("WarpDeform/CableShape-v1")
+    env = gymnasium.make("WarpDeform/CableShape-v2")
     observation, info = env.reset(seed=0)
 """
 

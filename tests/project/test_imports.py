@@ -129,9 +129,9 @@ def test_every_task_has_a_gymnasium_id() -> None:
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("cable-ring", "WarpDeform/CableRing-v1"),
-        ("cable-ring-notarget", "WarpDeform/CableRingNotarget-v1"),
-        ("bag-items-1", "WarpDeform/BagItems1-v2"),
+        ("cable-ring", "WarpDeform/CableRing-v2"),
+        ("cable-ring-notarget", "WarpDeform/CableRingNotarget-v2"),
+        ("bag-items-1", "WarpDeform/BagItems1-v3"),
     ],
 )
 def test_gymnasium_id(name: str, expected: str) -> None:

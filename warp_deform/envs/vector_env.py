@@ -32,7 +32,7 @@ Batch = dict[str, np.ndarray]
 class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
     """`num_envs` episodes of a task, simulated together: the fast way to gather experience.
 
-        envs = gymnasium.make_vec("WarpDeform/CableRing-v1", num_envs=16)
+        envs = gymnasium.make_vec("WarpDeform/CableRing-v2", num_envs=16)
         observations, infos = envs.reset(seed=0)          # episodes 0 to 15
         observations, rewards, terminations, truncations, infos = envs.step(actions)
 

@@ -54,7 +54,7 @@ class BagItems1(BagTask):
     name = "bag-items-1"
     stages = (OPEN, INSERT, CARRY)
     success_score = 0.5
-    version = 2
+    version = 3
     looks_aloft = True
     ground_truth_rows = ((Row.POSE, 1), *BAG_ROWS, (Row.POSE, 1))
     objects: ClassVar[tuple[str, ...]] = ("bag", "cube")

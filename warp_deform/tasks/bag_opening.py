@@ -55,6 +55,7 @@ _INSIDE = 0.75  # share of the rays sideways and down that meet the shell around
 class BagTask(Task):
     """A task with bags of one kind; the first bag is the one that is to be opened."""
 
+    version = 2
     solver = BAG_SOLVER
     primitive: ClassVar[PrimitiveConfig] = BAG_PRIMITIVE
     max_actions = 8

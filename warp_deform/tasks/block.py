@@ -40,6 +40,7 @@ class BlockNotarget(Task):
 
     name = "block-notarget"
     goal_conditioned = True
+    version = 2
     max_actions = 2
     stages = (Stage(lift=0.30, speed=0.5),)
     place_yaws = 24

@@ -56,6 +56,7 @@ class CableMaskGoal(Task):
 
     name = "cable-mask-goal"
     goal_conditioned = True
+    version = 2
     max_actions = 10
     stages = (Stage(lift=0.05, speed=0.10),)
     solver = CHAIN_SOLVER

@@ -53,6 +53,7 @@ class CableRing(Task):
     """
 
     name = "cable-ring"
+    version = 2
     stages = (CABLE_STAGE,)
     solver = CABLE_SOLVER
     gradient_damping = CABLE_GRADIENT_DAMPING

@@ -44,6 +44,7 @@ class CableShape(Task):
     """
 
     name = "cable-shape"
+    version = 2
     stages = (CABLE_STAGE,)
     solver = CABLE_SOLVER
     gradient_damping = CABLE_GRADIENT_DAMPING

@@ -52,6 +52,7 @@ class FabricFlat(Task):
     """
 
     name = "fabric-flat"
+    version = 2
     max_actions = 10
     stages = (Stage(lift=0.05, speed=FABRIC_SPEED),)
     solver = FABRIC_SOLVER

@@ -206,7 +206,7 @@ def test_robomimic_holds_the_episodes(
         assert data.attrs["total"] == sum(episode.info.actions for episode in episodes)
         environment = json.loads(data.attrs["env_args"])
         assert (environment["env_name"], environment["type"]) == (
-            "WarpDeform/CableShapeNotarget-v1",
+            "WarpDeform/CableShapeNotarget-v2",
             2,
         )
         assert sorted(data) == sorted(f"demo_{i}" for i in range(COUNT))

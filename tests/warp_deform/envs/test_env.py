@@ -41,7 +41,7 @@ def finish(env: PickPlaceEnv, action: np.ndarray) -> dict:
 
 
 def test_made_by_id_and_by_name_are_the_same() -> None:
-    by_id = gymnasium.make("WarpDeform/BlockNotarget-v1")
+    by_id = gymnasium.make("WarpDeform/BlockNotarget-v2")
     hashes = [env.reset(seed=7)[1]["state_hash"] for env in (by_id, PickPlaceEnv(BLOCK))]
     assert hashes[0] == hashes[1]
 

@@ -23,7 +23,7 @@ BLOCK = "block-notarget"
 def test_vector_episodes_are_those_of_single_environments() -> None:
     block, seeds = PickPlaceEnv(BLOCK), [31, 4, 18]
     envs = gymnasium.make_vec(
-        "WarpDeform/BlockNotarget-v1", num_envs=3, vectorization_mode="vector_entry_point"
+        "WarpDeform/BlockNotarget-v2", num_envs=3, vectorization_mode="vector_entry_point"
     )
     assert isinstance(envs, PickPlaceVectorEnv)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP

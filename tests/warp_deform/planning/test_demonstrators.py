@@ -228,7 +228,7 @@ def test_collections_say_who_demonstrated_and_replay(tmp_path) -> None:
 
 def test_environments_demonstrate_by_name() -> None:
     env = PickPlaceEnv(LINE)
-    envs = gymnasium.make_vec("WarpDeform/CableLineNotarget-v1", num_envs=2)
+    envs = gymnasium.make_vec("WarpDeform/CableLineNotarget-v2", num_envs=2)
     _, info = env.reset(seed=4)
     envs.reset(seed=[4, 9])
     scripted = env.demonstrate()

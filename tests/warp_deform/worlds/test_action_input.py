@@ -93,7 +93,7 @@ def test_what_the_space_holds_is_taken_unchanged() -> None:
 @pytest.mark.parametrize("value", [-1.0, 1.0])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_saturated_policy_may_be_rescaled(value: float, dtype) -> None:
-    env = RescaleAction(gymnasium.make("WarpDeform/BlockNotarget-v1"), dtype(-1), dtype(1))
+    env = RescaleAction(gymnasium.make("WarpDeform/BlockNotarget-v2"), dtype(-1), dtype(1))
     env.reset(seed=0)
     assert env.step(np.full(7, value, dtype))[-1]["outcome"]
     envs = VectorRescaleAction(PickPlaceVectorEnv(BLOCK, 2), dtype(-1), dtype(1))
