@@ -23,7 +23,7 @@ from warp_deform.rollout import GripPath, rollout
 from warp_deform.solver import SolverFusedXPBD
 from warp_deform.tasks.bag_physics import BAG_SOLVER
 
-LIFT, SPEED, WAY = 0.30, 0.25, 0.30  # [m], [m/s], [m] along y
+LIFT, SPEED, WAY = 0.40, 0.25, 0.30  # [m], [m/s], [m] along y
 
 
 def main(out: Path | None = None) -> float:

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from warp_deform.objects import CableConfig, add_cable
 from warp_deform.quiet import quiet_warp
 from warp_deform.rollout import DifferentiableRollout, GripPath, rollout
-from warp_deform.solver import SolverFusedXPBD
+from warp_deform.solver import SolverConfig, SolverFusedXPBD
 
 CORD = CableConfig(mass=0.01, link_stiffness=600.0, fold_stiffness=300.0, bend_stiffness=1.0)
 NAMES = ("table_friction", "contact_friction", "damping", "stiffness")
@@ -34,7 +34,8 @@ class Pull:
         SolverFusedXPBD.register_custom_attributes(builder)
         start = np.column_stack([xy + np.array([0.35, 0.0]), CORD.radius + over])
         self.cord = add_cable(builder, CORD, start)
-        solver = SolverFusedXPBD(builder.finalize(device="cpu"), precision="float64")
+        air = SolverConfig(damping=1.0)  # in which it comes to rest
+        solver = SolverFusedXPBD(builder.finalize(device="cpu"), air, precision="float64")
         rollout(solver, [0], least=1.0, most=1.0)
         self.start, self.calls = solver.particle_q(0), 0
         self.path = GripPath(np.array([0, 0.5, 0.8, 1.2, 1.5]), self.start[-1] + LEAD, particle=23)
