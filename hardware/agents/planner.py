@@ -168,7 +168,7 @@ class PlannerChooser:
             seed=0,
         )
         self._worlds = Worlds(task, 1, robot="panda", lanes=_LANES)
-        self._lookahead = Lookahead(task, robot="panda", precision="float32", count=_LANES)
+        self._lookahead = Lookahead(task, robot="panda", precision="float32", count=2 * _LANES)
 
 
 def chord_error(beads: np.ndarray, targets: np.ndarray, *, links: int, spacing: float) -> float:

@@ -111,7 +111,8 @@ def planner(config: SearchConfig) -> Act[Any]:
 
 
 def _lookahead(worlds: Worlds) -> Lookahead:
-    count = CANDIDATES * min(worlds.count, SLOTS)
+    # a search has more candidates than fill one group, and threads share groups
+    count = CANDIDATES * min(max(2, worlds.count), SLOTS)
     return lookahead_for(worlds.task, worlds.robot.name, worlds.precision, count)
 
 

@@ -57,6 +57,7 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
         precision: str = "float32",
         pairs_per_particle: int = 48,
         bundles: Path | None = None,
+        threads: int | None = None,
     ) -> None:
         """Pack `model`.
 
@@ -65,6 +66,8 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
             precision: "float32" or "float64"
             pairs_per_particle: room in the contact list; a guard fires when it does not suffice
             bundles: folder that gets a reproducing file whenever a guard fires
+            threads: that share a launch on the CPU, a group of lanes at a time; None takes one a
+                core (see `default_threads`)
         """
         SolverBase.__init__(self, model)
         FusedXPBD.__init__(
@@ -75,6 +78,7 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
             precision=precision,
             pairs_per_particle=pairs_per_particle,
             bundles=bundles,
+            threads=threads,
         )
         self._clamped: list[float] = []
         """By world: substeps that the clamp acted in, steps in a row."""

@@ -105,7 +105,7 @@ def replay_bundle(path: str | Path) -> dict[str, np.ndarray]:
         structs.append(struct)
     alias_lanes(structs, scalar)
     kernel = forward_kernel(scalar, header["lanes"], *(header[name] for name in _VARIANT))
-    wp.launch(kernel, dim=header["groups"], inputs=[settings, *structs], device="cpu")
+    wp.launch(kernel, dim=header["groups"], inputs=[settings, *structs, 0], device="cpu")
     return {
         key: array.numpy().view(dtype).reshape(shape).copy() for key, array, shape, dtype in held
     }

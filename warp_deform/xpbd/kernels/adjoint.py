@@ -72,8 +72,9 @@ def adjoint_kernel(
         tape: Tape,
         adj: Adjoint,
         ba: BodyAdjoint,
+        first: int,
     ):
-        g = wp.tid()
+        g = first + wp.tid()
         at = span_of(g, top, group, sheets)
         pace = pace_of(g, st, group)
         always = look_ahead(at, top, springs, grips)

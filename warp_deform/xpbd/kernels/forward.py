@@ -36,7 +36,7 @@ def forward_kernel(
     with_lines: bool = False,
     taped: bool = False,
 ) -> Any:
-    """The kernel for a precision and a width; launch it with one thread per group.
+    """The kernel for a precision and a width; launch it with one thread per group, from `first` on.
 
     `with_bodies` False leaves the code of rigid bodies out, which halves the compile time;
     `with_sheets` False that of triangles, `with_edges` False that of their edges, `with_lines`
@@ -84,8 +84,9 @@ def forward_kernel(
         cells: Cells,
         lines: Lines,
         tape: Tape,
+        first: int,
     ):
-        g = wp.tid()
+        g = first + wp.tid()
         zero = V(S(0.0))
         at = span_of(g, top, group, sheets)
         pace = pace_of(g, st, group)

@@ -114,27 +114,16 @@ class Recorder:
         self._bound = bound
         self._checkpoints = Checkpoints(data, self._control)
         self._adjoint = self._new_adjoint()
-        self._forward = self._recorded(
+        self._forward = self.solver.group_launch(
             self._kernels[0], [self._settings, *data.structs()[:-1], data.types.Tape()]
         )
         self._by_state, by_bodies = self._adjoint_structs()
         swept = [data.struct(name) for name in _SWEPT]
         for name, array in self._notes.items():
             setattr(swept[_SWEPT.index("contacts")], name, array)
-        self._sweep = self._recorded(
+        self._sweep = self.solver.group_launch(
             self._kernels[1],
             [self._settings, *swept, data.types.Tape(), self._by_state, by_bodies],
-        )
-
-    def _recorded(self, kernel: Any, inputs: list[Any]) -> Any:
-        """A launch that is cheap to repeat."""
-        return wp.launch(
-            kernel,
-            dim=self.solver.data.group_count,
-            inputs=inputs,
-            device=self.solver.model.device,
-            record_cmd=True,
-            record_tape=False,
         )
 
     def _mirrored(self, count: int, dtype: Any, shape: tuple[int, ...]) -> Mirrored:
@@ -276,7 +265,7 @@ class Recorder:
         self._settings.max_steps = end
         self._forward.set_param_at_index(0, self._settings)
         self._forward.set_param_at_index(len(KERNEL_ARGUMENTS), tape.struct)
-        self._forward.launch()
+        self._forward.launch(end - begin)
 
     def _new_settings(self) -> Any:
         # one of its own: it is changed here and between launches
@@ -341,7 +330,7 @@ class Recorder:
                 (2 + len(_SWEPT), struct),
             ):
                 sweep.set_param_at_index(at, value)
-            sweep.launch()
+            sweep.launch(segment.end - segment.begin)
 
     def _derivatives(self) -> dict[str, np.ndarray]:
         for mirrored in self._adjoint.values():
