@@ -64,7 +64,7 @@ def test_bits_depend_neither_on_storage_nor_on_lanes() -> None:
     cotangent = np.random.default_rng(0).normal(size=(1, 1, BEADS, 3))
     found = []
     for worlds, lanes, storage in ((3, 4, "full"), (3, 4, "replay"), (1, 1, "replay")):
-        solver = solver_of(bend=50.0, worlds=worlds, lanes=lanes, precision="float32")
+        solver = solver_of(bend=50.0, worlds=worlds, lanes=lanes)
         world = worlds - 1
         shake(solver, 7, world)
         run = DifferentiableRollout(solver, storage=storage)

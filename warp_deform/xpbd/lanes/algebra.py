@@ -21,6 +21,7 @@ import warp as wp
 from ...errors import InputError
 
 __all__ = [
+    "BACKWARD_LEVEL",
     "LANES",
     "PRECISIONS",
     "add",
@@ -42,6 +43,9 @@ __all__ = [
 LANES = (1, 4, 8, 16)
 PRECISIONS = (wp.float32, wp.float64)
 
+BACKWARD_LEVEL: int | None = None
+"""What our tests set to 0, as they differentiate little and often for the first time."""
+
 _KERNEL_OPTIONS: dict[str, Any] = {
     # no fused multiply-add: the same bits on every x86-64 processor
     "fuse_fp": False,
@@ -54,26 +58,46 @@ _KERNEL_OPTIONS: dict[str, Any] = {
 }
 
 
-def kernel_options(scalar: Any, lanes: int) -> dict[str, Any]:
-    """Options of the modules of kernels over `scalar`s.
+def kernel_options(scalar: Any, lanes: int, backward: bool = False) -> dict[str, Any]:
+    """Options of the modules of kernels over `scalar`s; at every level they give the same bits.
 
     Checks are what float64 without lanes is for, and they wait for the compiler more than they run:
-    -O1 gives the same bits, compiles much sooner and runs a little slower.
+    -O1 compiles sooner and runs a little slower. Backward kernels without lanes wait for it longest
+    and run least: `BACKWARD_LEVEL` says how far they are optimised, None: as forward ones.
     """
-    for_checks = scalar == wp.float64 and lanes == 1
-    return _KERNEL_OPTIONS | ({"optimization_level": 1} if for_checks else {})
+    level = 1 if scalar == wp.float64 and lanes == 1 else None
+    if backward and lanes == 1 and BACKWARD_LEVEL is not None:
+        level = BACKWARD_LEVEL
+    return _KERNEL_OPTIONS | ({} if level is None else {"optimization_level": level})
 
 
 _C_TYPE = {wp.float32: "float", wp.float64: "double"}
 _C_SQRT = {wp.float32: "sqrtf", wp.float64: "sqrt"}
 
 
+def _each_lane(scalar: Any, lanes: int, of_lane: str, at_once: str, taken: str = "ab") -> str:
+    """C++ of a function of vectors: `of_lane` in terms of `$a`, or `at_once` of registers `A`.
+
+    The compiler would find the registers behind loops, but takes a fifth of its time for that. Its
+    types for them are Clang's, so CUDA has loops.
+    """
+    c_type = _C_TYPE[scalar]
+    loop = f"for (int i = 0; i < {lanes}; ++i) r.c[i] = {of_lane};"
+    for name in taken:
+        loop = loop.replace(f"${name}", f"{name}.c[i]")
+    body = [loop]
+    if lanes > 1:
+        kind = f"ext_vector_type({lanes}), aligned(alignof({c_type})), may_alias"
+        read = ", ".join(f"{name.upper()} = *(const W*){name}.c" for name in taken)
+        registers = f"typedef {c_type} W __attribute__(({kind})); const W {read};"
+        body = ["#ifdef __CUDACC__", loop, "#else", f"{registers} *(W*)r.c = {at_once};", "#endif"]
+    return "\n".join([f"wp::vec_t<{lanes}, {c_type}> r;", *body, "return r;"])
+
+
 def _overloads(scalar: Any, lanes: int) -> tuple[SimpleNamespace, dict[str, list[Any]]]:
     """Types of one precision and width, and the functions that implement the algebra on them."""
     vector = wp.types.vector(lanes, scalar)
-    c_type, c_sqrt = _C_TYPE[scalar], _C_SQRT[scalar]
-    c_vector = f"wp::vec_t<{lanes}, {c_type}>"
-    each = f"for (int i = 0; i < {lanes}; ++i)"
+    each = functools.partial(_each_lane, scalar, lanes)
 
     @wp.struct
     class V3:
@@ -81,59 +105,66 @@ def _overloads(scalar: Any, lanes: int) -> tuple[SimpleNamespace, dict[str, list
         y: vector
         z: vector
 
-    @wp.func_native(f"{c_vector} r; {each} r.c[i] = {c_sqrt}(a.c[i]); return r;")
+    @wp.func_native(each(f"{_C_SQRT[scalar]}($a)", "__builtin_elementwise_sqrt(A)", "a"))
     def root(a: vector) -> vector: ...
 
-    @wp.func_native(f"{c_vector} r; {each} r.c[i] = m.c[i] > 0 ? a.c[i] : b.c[i]; return r;")
+    @wp.func_native(each("$m > 0 ? $a : $b", "M > (W)0 ? A : B", "mab"))
     def select(m: vector, a: vector, b: vector) -> vector: ...
 
-    @wp.func_native(f"{c_vector} r; {each} r.c[i] = a.c[i] < b.c[i] ? 1 : 0; return r;")
+    @wp.func_native(each("$a < $b ? 1 : 0", "A < B ? (W)1 : (W)0"))
     def less(a: vector, b: vector) -> vector: ...
 
-    @wp.func_native(f"bool r = false; {each} r |= a.c[i] < s; return r;")
+    @wp.func_native(f"bool r = false; for (int i = 0; i < {lanes}; ++i) r |= a.c[i] < s; return r;")
     def any_less(a: vector, s: scalar) -> bool: ...
 
-    @wp.func_native(f"{c_vector} r; {each} r.c[i] = (a.c[i] - a.c[i]) == 0 ? 0 : 1; return r;")
+    @wp.func_native(each("($a - $a) == 0 ? 0 : 1", "(A - A) == (W)0 ? (W)0 : (W)1", "a"))
     def nonfinite(a: vector) -> vector: ...
+
+    @wp.func_native(each("$a + $b", "A + B"))
+    def add_lanes(a: vector, b: vector) -> vector: ...
+
+    @wp.func_native(each("$a - $b", "A - B"))
+    def sub_lanes(a: vector, b: vector) -> vector: ...
+
+    @wp.func_native(each("$a * $b", "A * B"))
+    def mul_lanes(a: vector, b: vector) -> vector: ...
+
+    @wp.func_native(each("$a / $b", "A / B"))
+    def div(a: vector, b: vector) -> vector: ...
+
+    @wp.func_native(each("$a * s", "A * (W)s", "a"))
+    def mul_lanes_scalar(a: vector, s: scalar) -> vector: ...
 
     @wp.func
     def add(a: V3, b: V3):
-        return V3(a.x + b.x, a.y + b.y, a.z + b.z)
+        return V3(add_lanes(a.x, b.x), add_lanes(a.y, b.y), add_lanes(a.z, b.z))
 
     @wp.func
     def sub(a: V3, b: V3):
-        return V3(a.x - b.x, a.y - b.y, a.z - b.z)
+        return V3(sub_lanes(a.x, b.x), sub_lanes(a.y, b.y), sub_lanes(a.z, b.z))
 
     @wp.func
     def mul_vector(a: V3, s: vector):
-        return V3(wp.cw_mul(a.x, s), wp.cw_mul(a.y, s), wp.cw_mul(a.z, s))
+        return V3(mul_lanes(a.x, s), mul_lanes(a.y, s), mul_lanes(a.z, s))
 
     @wp.func
     def mul_scalar(a: V3, s: scalar):
-        return V3(a.x * s, a.y * s, a.z * s)
-
-    @wp.func
-    def mul_lanes(a: vector, b: vector):
-        return wp.cw_mul(a, b)
-
-    @wp.func
-    def div(a: vector, b: vector):
-        return wp.cw_div(a, b)
+        return V3(mul_lanes_scalar(a.x, s), mul_lanes_scalar(a.y, s), mul_lanes_scalar(a.z, s))
 
     @wp.func
     def dot(a: V3, b: V3):
-        return wp.cw_mul(a.x, b.x) + wp.cw_mul(a.y, b.y) + wp.cw_mul(a.z, b.z)
+        return add_lanes(add_lanes(mul_lanes(a.x, b.x), mul_lanes(a.y, b.y)), mul_lanes(a.z, b.z))
 
     @wp.func
     def length(a: V3):
-        return root(wp.cw_mul(a.x, a.x) + wp.cw_mul(a.y, a.y) + wp.cw_mul(a.z, a.z))
+        return root(dot(a, a))
 
     @wp.func
     def cross(a: V3, b: V3):
         return V3(
-            wp.cw_mul(a.y, b.z) - wp.cw_mul(a.z, b.y),
-            wp.cw_mul(a.z, b.x) - wp.cw_mul(a.x, b.z),
-            wp.cw_mul(a.x, b.y) - wp.cw_mul(a.y, b.x),
+            sub_lanes(mul_lanes(a.y, b.z), mul_lanes(a.z, b.y)),
+            sub_lanes(mul_lanes(a.z, b.x), mul_lanes(a.x, b.z)),
+            sub_lanes(mul_lanes(a.x, b.y), mul_lanes(a.y, b.x)),
         )
 
     types = SimpleNamespace(
@@ -151,9 +182,9 @@ def _overloads(scalar: Any, lanes: int) -> tuple[SimpleNamespace, dict[str, list
         "less": [less],
         "any_less": [any_less],
         "nonfinite": [nonfinite],
-        "add": [add],
-        "sub": [sub],
-        "mul": [mul_vector, mul_scalar, mul_lanes],
+        "add": [add, add_lanes],
+        "sub": [sub, sub_lanes],
+        "mul": [mul_vector, mul_scalar, mul_lanes, mul_lanes_scalar],
         "div": [div],
         "dot": [dot],
         "length": [length],
