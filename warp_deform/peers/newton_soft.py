@@ -43,6 +43,8 @@ class NewtonSoftSettings:
     """Of the angle between triangles [N m/rad]."""
     contact_stiffness: float = 1e4
     """Penalty stiffness of contacts [N/m]."""
+    contact_damping: float = 0.0
+    """Their damping [N s/m]."""
     friction: float = 0.5
 
     def __post_init__(self) -> None:
@@ -103,11 +105,11 @@ class NewtonSoftWorld:
     """One fabric or bag in VBD, its frame recorded as a CPU graph."""
 
     def __init__(self, scene: SoftScene, settings: NewtonSoftSettings | None = None) -> None:
-        self._settings = settings = settings or _SETTINGS[scene.name]
+        self._settings = settings = settings or _SETTINGS.get(scene.name, NewtonSoftSettings())
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, -9.8))
         builder.default_shape_cfg.mu = settings.friction
         builder.default_shape_cfg.ke = settings.contact_stiffness
-        builder.default_shape_cfg.kd = 0.0
+        builder.default_shape_cfg.kd = settings.contact_damping
         builder.add_ground_plane()
         _add_mesh(builder, scene, settings)
         if scene.cube is not None:
@@ -118,7 +120,7 @@ class NewtonSoftWorld:
         builder.color(include_bending=True)
         self._model = model = builder.finalize(device="cpu")
         model.soft_contact_ke = settings.contact_stiffness
-        model.soft_contact_kd = 0.0
+        model.soft_contact_kd = settings.contact_damping
         model.soft_contact_mu = settings.friction
         margin = min(_THICKNESS, _SHARE * float(np.median(scene.lengths)))
         self._pipeline = newton.CollisionPipeline(model)

@@ -8,7 +8,8 @@ are 0.1 kg cubes of half extent 5 mm, point-to-point constraints of at most 100 
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,6 +22,27 @@ from .timing import FRAME_RATE, PeerTiming, measure
 __all__ = ["PyBulletWorld"]  # the rest is imported from `warp_deform.peers`
 
 HZ = 240
+
+
+@dataclass(frozen=True, kw_only=True)
+class PyBulletSettings:
+    """How PyBullet runs a scene; the defaults are the original's."""
+
+    hz: int = HZ
+    """Steps per second; a multiple of the frame rate."""
+    iterations: int = 50
+    world: Literal["deformable", "rigid"] = "deformable"
+    """The original opens a deformable world for every task; a rigid one is cheaper."""
+
+    def __post_init__(self) -> None:
+        if self.hz < FRAME_RATE or self.hz % FRAME_RATE:
+            raise InputError(
+                f"PyBulletSettings.hz must be a multiple of {FRAME_RATE}, got {self.hz}"
+            )
+        if self.iterations < 1:
+            raise InputError(f"PyBulletSettings.iterations must be positive, got {self.iterations}")
+
+
 _MAX_FORCE = 100.0  # [N]
 _NOTE = (
     "as the original: cubes as beads, point-to-point joints of at most 100 N, no bending limit; "
@@ -67,13 +89,16 @@ def import_pybullet() -> Any:
 class PyBulletWorld:
     """One scene in a PyBullet client of its own."""
 
-    def __init__(self, scene: PeerScene) -> None:
+    def __init__(self, scene: PeerScene, settings: PyBulletSettings | None = None) -> None:
+        self._settings = settings = settings or PyBulletSettings()
         self._bullet = bullet = import_pybullet()
         self._client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
         bullet.setPhysicsEngineParameter(enableFileCaching=0, **self._client)
-        bullet.resetSimulation(bullet.RESET_USE_DEFORMABLE_WORLD, **self._client)
+        if settings.world == "deformable":
+            bullet.resetSimulation(bullet.RESET_USE_DEFORMABLE_WORLD, **self._client)
+        bullet.setPhysicsEngineParameter(numSolverIterations=settings.iterations, **self._client)
         bullet.setGravity(0, 0, -9.8, **self._client)
-        bullet.setTimeStep(1 / HZ, **self._client)
+        bullet.setTimeStep(1 / settings.hz, **self._client)
         self._add_table()
         self._bodies = self._add_block(scene) if scene.cable is None else self._add_beads(scene)
 
@@ -131,8 +156,8 @@ class PyBulletWorld:
         return [body]
 
     def frame(self) -> None:
-        """Advance by four steps of 1/240 s."""
-        for _ in range(HZ // FRAME_RATE):
+        """Advance by 1 / FRAME_RATE simulated seconds."""
+        for _ in range(self._settings.hz // FRAME_RATE):
             self._bullet.stepSimulation(**self._client)
 
     def beads(self) -> np.ndarray:

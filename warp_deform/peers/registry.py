@@ -6,6 +6,8 @@ from collections.abc import Callable
 from functools import partial
 
 from ..errors import InputError
+from .mujoco_peer import time_mujoco
+from .mujoco_soft import time_mujoco_soft
 from .newton_peer import NEWTON_SOLVERS, time_newton
 from .newton_soft import time_newton_soft
 from .pybullet_peer import time_pybullet
@@ -18,10 +20,12 @@ __all__: list[str] = []  # `warp_deform.peers` is the import path of what is her
 
 PEERS: dict[str, Callable[..., PeerTiming]] = {
     "pybullet": time_pybullet,
+    "mujoco": time_mujoco,
     **{f"newton-{name}": partial(time_newton, solver=name) for name in NEWTON_SOLVERS},
 }
 SOFT_PEERS: dict[str, Callable[..., PeerTiming]] = {
     "pybullet": time_pybullet_soft,
+    "mujoco": time_mujoco_soft,
     "newton-vbd": time_newton_soft,
 }
 """Those that also run `SOFT_SCENES`: fabrics and bags with self-contact."""

@@ -5,17 +5,20 @@ Source: Seita et al., ICRA 2021, and its released code (meshes, masses, margins,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from ..errors import InputError
+from ..objects.bag import BagConfig, bag_shell
 from ..objects.cloth import ClothConfig, cloth_sheet
 
 __all__ = ["SoftSceneName"]  # the rest is imported from `warp_deform.peers`
 
-SoftSceneName = Literal["cloth10", "cloth25", "cloth50", "bag", "bag-cube"]
+SoftSceneName = Literal[
+    "cloth10", "cloth25", "cloth50", "crumple10", "crumple25", "bag", "bag-cube", "shell-cube"
+]
 SOFT_SCENES: tuple[str, ...] = get_args(SoftSceneName)
 
 _CENTRE = (0.5, 0.0)
@@ -24,6 +27,10 @@ _CLOTH_MASS = 0.5  # [kg]
 _SETTLE, _FOLD, _LIE = 0.8, 1.3, 1.2  # [s], as `bench.cloth` plays it
 _FOLD_TIMES = (0.0, 0.3, 1.0, _FOLD)  # [s]
 _LIFT, _LOW = 0.08, 0.01  # [m]; heights of the corner above where it lay
+_STAND = 0.02  # [m]; clear height under a sheet that falls on its edge
+_ROLL, _LEAN = 0.3, 0.1  # [rad]; how far such a sheet is turned in its plane, and leans
+_CURVE = 0.2  # [m]; radius of the arc that it starts as: how a plane buckles is left to rounding
+_CRUMPLE = 1.0  # [s]
 
 _BAG_RADIUS = 0.1  # [m]
 _BAG_MASS = 1.0  # [kg]
@@ -90,8 +97,9 @@ class SoftScene:
 def soft_scene(name: str, *, seed: int = 0) -> SoftScene:
     """A start above the table; `seed` draws the direction of the fold or the tilt of the bag.
 
-    The sheet falls flat by 3 cm, one corner is carried inwards, and it lies folded. The bag falls
-    with its opening up and crumples.
+    The sheet of `cloth` falls flat by 3 cm, one corner is carried inwards, and it lies folded; that
+    of `crumple` is arched, falls almost upright on a corner and crumples. The bag falls with its
+    opening up and crumples: `bag` has the original's mesh, `shell-cube` that of the tasks.
 
     Raises:
         InputError: there is no scene of that name.
@@ -101,7 +109,10 @@ def soft_scene(name: str, *, seed: int = 0) -> SoftScene:
     rng = np.random.default_rng(seed)
     if name.startswith("cloth"):
         return _sheet(name, int(name.removeprefix("cloth")), rng)
-    return _bag(name, rng)
+    if name.startswith("crumple"):
+        return _upright_sheet(name, int(name.removeprefix("crumple")), rng)
+    bag = _bag(name, rng)
+    return _on_shell(bag) if name.startswith("shell") else bag
 
 
 def _sheet(name: str, rows: int, rng: np.random.Generator) -> SoftScene:
@@ -123,6 +134,49 @@ def _sheet(name: str, rows: int, rng: np.random.Generator) -> SoftScene:
         knots=np.array([[0, 0, 0], [0, 0, _LIFT], [*way, _LIFT], [*way, _LOW]]),
         before=_SETTLE,
         after=_LIE,
+    )
+
+
+def _upright_sheet(name: str, rows: int, rng: np.random.Generator) -> SoftScene:
+    """An arched sheet that stands on a corner, leaning; seeds turn and lean it by other angles."""
+    flat = _sheet(name, rows, rng)
+    yaw, more = rng.uniform(0, 2 * np.pi), rng.uniform(0.7, 1.3, 2)
+    lean = _rotation(np.array([np.pi / 2 - more[0] * _LEAN, 0, 0]))
+    turn = _rotation(np.array([0, 0, yaw]))
+    roll = _rotation(np.array([0, 0, more[1] * _ROLL]))
+    across, along, _ = (flat.vertices - [*_CENTRE, _CLOTH_DROP]).T
+    # chords, not arcs, have the edges' lengths
+    spacing = flat.lengths[0]
+    angle = along / spacing * 2 * np.arcsin(spacing / (2 * _CURVE))
+    arched = np.column_stack([across, _CURVE * np.sin(angle), _CURVE * (1 - np.cos(angle))])
+    vertices = arched @ (turn @ lean @ roll).T + [*_CENTRE, 0]
+    vertices[:, 2] += _STAND - vertices[:, 2].min()
+    nothing = np.zeros((0, 3))
+    return replace(
+        flat, vertices=vertices, times=nothing[:, 0], knots=nothing, before=_CRUMPLE, after=0.0
+    )
+
+
+def _on_shell(bag: SoftScene) -> SoftScene:
+    """The same bag on the mesh of the tasks, which is coarser at its pole."""
+    shell = bag_shell(BagConfig())
+    # both have the pole first, and rows of 32 above
+    middle = bag.vertices[-_RING:].mean(axis=0)
+    up = middle - bag.vertices[0]
+    up /= np.linalg.norm(up)
+    ahead = bag.vertices[-_RING] - middle
+    ahead /= np.linalg.norm(ahead)
+    turn = np.column_stack([ahead, np.cross(up, ahead), up])
+    centre = bag.vertices[0] + _BAG_RADIUS * up
+    pairs = np.sort(shell.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    sides = {(int(i), int(j)) for i, j in pairs}
+    halves = {(int(i), int(j)) for i, j in np.sort(shell.diagonals, axis=1)}
+    return replace(
+        bag,
+        vertices=shell.vertices @ turn.T + centre,
+        triangles=shell.faces,
+        edges=np.array(sorted(sides - halves)),
+        ring=shell.ring,
     )
 
 
@@ -156,7 +210,7 @@ def _bag(name: str, rng: np.random.Generator) -> SoftScene:
         mass=_BAG_MASS,
         margin=_BAG_MARGIN,
         ring=number[-1],
-        cube=centre - [0, 0, _CUBE_DEPTH] if name == "bag-cube" else None,
+        cube=centre - [0, 0, _CUBE_DEPTH] if name.endswith("cube") else None,
         times=no_path[:, 0],
         knots=no_path,
         before=_BAG_FALL,

@@ -101,8 +101,8 @@ def test_unknown_names_are_refused():
         peer_scene("rope")
     with pytest.raises(InputError, match="vbd, vbd-bodies, xpbd"):
         time_newton("cable", "mujoco")
-    with pytest.raises(InputError, match="pybullet, newton-vbd"):
-        time_peer("mujoco", "cable")
+    with pytest.raises(InputError, match="pybullet, mujoco, newton-vbd"):
+        time_peer("flex", "cable")
     with pytest.raises(InputError, match="even"):
         NewtonSettings(solver="xpbd", beads="bodies", substeps=3, iterations=2)
     with pytest.raises(InputError, match="iterations"):
