@@ -1,0 +1,235 @@
+"""What the search found: the cheapest believable setting of each engine, a table, and a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from peers_measures import believable
+from peers_settings import SCENES
+
+__all__ = ["TOLERANCE", "cheapest", "draw", "error", "front", "picks", "table"]
+
+MOST_TIMED = 5
+LANES = "ours, 8 lanes"
+SHIPPED = ", as shipped"
+TOLERANCE = {
+    "cable": 0.5,
+    "heap": 7.0,
+    "ring": 3.0,
+    "block": 0.5,
+    "cloth10": 10.0,
+    "cloth25": 10.0,
+    "crumple10": 4.0,
+    "crumple25": 4.0,
+    "shell-cube": 3.0,
+}
+"""Error up to which settings count as equal [mm]."""
+_AT_THE_END = ("cable",)  # its places after a second do not depend on chance
+_COLOURS = {
+    "ours": "black",
+    LANES: "tab:grey",
+    "mujoco": "tab:blue",
+    "newton-vbd": "tab:green",
+    "newton-xpbd": "tab:olive",
+    "pybullet": "tab:red",
+}
+
+
+def error(row: dict[str, Any]) -> float:
+    """Of a row against its engine's own fine solution [mm]; infinite where it is not finite."""
+    name = "end_mm" if row["scene"] in _AT_THE_END else "early_mm"
+    return float(row["errors"].get(name, float("inf")))
+
+
+def label(row: dict[str, Any]) -> str:
+    """The engine, ours in lanes apart."""
+    lanes = row["settings"].get("lanes", 1)
+    return row["engine"] + (f", {lanes} lanes" if lanes > 1 else "")
+
+
+def front(rows: list[dict[str, Any]], engine: str) -> list[dict[str, Any]]:
+    """Of an engine's believable rows those that no other beats in both cost and error.
+
+    Ours keeps all of its steps, alone and in lanes.
+    """
+    mine = [row for row in rows if row["engine"] == engine and row["errors"]["finite"]]
+    if engine == "ours":
+        return mine
+    best: list[dict[str, Any]] = []
+    for row in sorted(filter(believable, mine), key=lambda row: row["ms"]):
+        if not best or error(row) < 0.9 * error(best[-1]):
+            best.append(row)
+    if len(best) > MOST_TIMED:
+        # the cheapest, the most exact, and some between them
+        step = (len(best) - 1) / (MOST_TIMED - 1)
+        best = [best[round(k * step)] for k in range(MOST_TIMED)]
+    return best
+
+
+def cheapest(rows: list[dict[str, Any]], most: float) -> dict[str, Any] | None:
+    """The cheapest believable row with an error up to `most` [mm]."""
+    fit = [row for row in rows if believable(row) and error(row) <= most]
+    return min(fit, key=lambda row: row["ms"], default=None)
+
+
+def picks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A flat row for every scene and engine, from what was timed.
+
+    It is the cheapest believable setting whose error is within the scene's tolerance or, of an
+    engine that has none, its most exact believable one; `equal` tells them apart. `least_ms` is of
+    the cheapest believable one, whatever its error. Ours also has rows of its tasks' substep.
+    """
+    out = []
+    for scene in SCENES:
+        timed = [row for row in rows if row["kind"] == "time" and row["scene"] == scene]
+        engines: dict[str, list[dict[str, Any]]] = {}
+        for row in filter(believable, timed):
+            engines.setdefault(label(row), []).append(row)
+        found = {name: cheapest(of, TOLERANCE[scene]) for name, of in engines.items()}
+        ours = {name: row["ms"] for name, row in found.items() if row and name.startswith("ours")}
+        shipped = {
+            name + SHIPPED: of
+            for name, rows_of in engines.items()
+            if name.startswith("ours")
+            and (of := [r for r in rows_of if _as_shipped(r)])
+            and of[0] is not found[name]
+        }
+        found |= {name: of[0] for name, of in shipped.items() if error(of[0]) <= TOLERANCE[scene]}
+        found |= {name: None for name in shipped if name not in found}
+        engines |= shipped
+        least = {name: min(row["ms"] for row in of) for name, of in engines.items()}
+        for name, of in engines.items():
+            row = found[name] or min(of, key=error)
+            out.append(
+                {
+                    "scene": scene,
+                    "engine": name,
+                    "settings": _settings(row),
+                    "equal": found[name] is not None,
+                    "ms": row["ms"],
+                    "error_mm": error(row),
+                    "stretch_end": row["errors"].get("stretch_end"),
+                    "pierced_percent": row["errors"].get("pierced_percent"),
+                    "times_ours": row["ms"] / ours["ours"] if "ours" in ours else None,
+                    "times_lanes": row["ms"] / ours[LANES] if LANES in ours else None,
+                    "least_ms": least[name],
+                    "least_times_ours": least[name] / least["ours"] if "ours" in least else None,
+                }
+            )
+    return out
+
+
+def _as_shipped(row: dict[str, Any]) -> bool:
+    """Whether ours has the substep of its tasks."""
+    return row["settings"]["hz"] == 1200
+
+
+def _settings(row: dict[str, Any]) -> str:
+    values = row["settings"]
+    if row["engine"] == "ours":
+        return f"{values['hz']} Hz"
+    if "substeps" in values:
+        parts = [f"{60 * values['substeps']} Hz x {values['iterations']}"]
+        names = ("beads", "link_stiffness", "contact_damping", "stiffness")
+    else:
+        solver = f", {values['solver']}" if "solver" in values else ""
+        parts = [f"{values['hz']} Hz{solver} x {values['iterations']}"]
+        names = ("world",) if row["engine"] == "pybullet" else ("contact", "tolerance")
+        if row["engine"] == "mujoco":
+            links = row["scene"] in ("cable", "heap", "ring")
+            names = (*names, *(("links",) if links else ()))
+            parts += ["sleep"] if values.get("sleep") else []
+            parts += ["elliptic"] if values["cone"] == "elliptic" else []
+    return ", ".join(
+        [*parts, *(f"{k.replace('_', ' ')} {_short(values[k])}" for k in names if k in values)]
+    )
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The picks as a Markdown table."""
+    lines = [
+        "| scene, error up to | engine | settings | error, mm | stretch | pierced, % | ms | / ours "
+        "| / ours in lanes | believable at all, ms | / ours |",
+        "|---" * 11 + "|",
+    ]
+    for row in picks(rows):
+        cells = [
+            f"{row['scene']}, {TOLERANCE[row['scene']]:g} mm",
+            row["engine"],
+            row["settings"],
+            _cell(row["error_mm"], ".2g") + ("" if row["equal"] else " (more)"),
+            _cell(row["stretch_end"], ".3f"),
+            _cell(row["pierced_percent"], ".1f"),
+            _cell(row["ms"], ".3g"),
+            _cell(row["times_ours"], ".1f"),
+            _cell(row["times_lanes"], ".1f"),
+            _cell(row["least_ms"], ".3g"),
+            _cell(row["least_times_ours"], ".1f"),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Error over cost, a panel a scene: lines are what was timed, crosses are not believable."""
+    matplotlib.use("Agg")
+    from matplotlib import pyplot, ticker
+
+    timed = [row for row in rows if row["kind"] == "time"]
+    scenes = [scene for scene in SCENES if any(row["scene"] == scene for row in timed)]
+    columns = min(3, len(scenes))
+    lines = -(-len(scenes) // columns)
+    figure, panels = pyplot.subplots(
+        lines, columns, figsize=(4.2 * columns, 3.4 * lines), layout="constrained", squeeze=False
+    )
+    for panel, scene in zip(panels.flat, scenes, strict=False):
+        for name, colour in _COLOURS.items():
+            mine = sorted(
+                (row for row in timed if row["scene"] == scene and label(row) == name),
+                key=lambda row: row["ms"],
+            )
+            if not mine:
+                continue
+            style = "--" if "lanes" in name else "-"
+            panel.loglog(
+                [row["ms"] for row in mine], [error(row) for row in mine], style, color=colour,
+                label=name, linewidth=1.2,
+            )  # fmt: skip
+            for fits, mark in ((True, "o"), (False, "x")):
+                of = [row for row in mine if believable(row) == fits]
+                panel.loglog(
+                    [row["ms"] for row in of], [error(row) for row in of], mark, color=colour,
+                    markersize=4,
+                )  # fmt: skip
+        panel.axhline(TOLERANCE[scene], color="0.8", linewidth=0.8, zorder=0)
+        panel.set_title(scene)
+        panel.grid(which="major", alpha=0.3)
+        for axis in (panel.xaxis, panel.yaxis):
+            axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+            axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_formatter(ticker.NullFormatter())
+    for panel in panels[-1]:
+        panel.set_xlabel("CPU ms per simulated second and world")
+    for panel in panels[:, 0]:
+        panel.set_ylabel("error, mm")
+    for panel in list(panels.flat)[len(scenes) :]:
+        panel.set_visible(False)
+    shown = {}
+    for panel in panels.flat[: len(scenes)]:
+        lines_of, names = panel.get_legend_handles_labels()
+        shown |= dict(zip(names, lines_of, strict=True))
+    figure.legend(
+        list(shown.values()), list(shown), loc="outside lower center", ncols=len(shown), fontsize=8
+    )
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)

@@ -1,0 +1,248 @@
+"""What is searched: the settings of every engine on every scene, and of their fine solutions.
+
+Every grid holds what an expert of that engine would try: step, iterations, solver, the model of a
+link, stiffness, compliance of contacts, and the tolerance where there is one.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+from peers_ours import OursSettings
+
+from warp_deform.peers import (
+    MujocoSettings,
+    MujocoSoftSettings,
+    NewtonSettings,
+    NewtonSoftSettings,
+    PyBulletSettings,
+)
+
+__all__ = ["ENGINES", "LANES", "SCENES", "STARTS", "fine", "grid", "settings_of"]
+
+LINKS = ("cable", "heap", "ring")
+SHEETS = ("cloth10", "crumple10", "crumple25", "cloth25", "shell-cube")
+SCENES = (*LINKS, "block", *SHEETS)
+STARTS = dict.fromkeys(SCENES, 3) | dict.fromkeys(SHEETS, 2)
+STARTS |= {"crumple25": 1, "cloth25": 1, "shell-cube": 1}
+"""Plays of a setting, each from another start."""
+LANES = 8
+OUR_RATES = (120, 240, 600, 1200, 2400, 4800)
+NOT_ENGINES: dict[str, tuple[str, ...]] = {
+    "newton-xpbd": SHEETS,  # it offers no self-contact
+    "newton-vbd": (),
+    "pybullet": (),
+    "mujoco": (),
+    "ours": (),
+}
+ENGINES = tuple(NOT_ENGINES)
+
+
+def grid(engine: str, scene: str) -> list[Any]:
+    """The settings to try, cheap ones first; empty where the engine does not run the scene."""
+    if scene in NOT_ENGINES[engine]:
+        return []
+    return list(dict.fromkeys(_GRIDS[engine](scene)))
+
+
+def fine(engine: str, scene: str) -> Any:
+    """The settings of an engine's own fine solution."""
+    soft, large = scene in SHEETS, scene in ("crumple25", "cloth25", "shell-cube")
+    if engine == "ours":
+        return OursSettings(hz=9600 if soft else 19200, precision="float64")
+    if engine == "mujoco":
+        if soft:
+            return MujocoSoftSettings(hz=960 if large else 2400, iterations=100, tolerance=1e-9)
+        return MujocoSettings(hz=9600, iterations=50, tolerance=1e-12)
+    if engine == "newton-vbd" and soft:
+        return NewtonSoftSettings(substeps=20 if large else 30, iterations=10, contact_damping=10.0)
+    if engine == "newton-vbd":
+        if scene == "block":
+            return NewtonSettings(solver="vbd", beads="bodies", substeps=80, iterations=10)
+        return NewtonSettings(
+            solver="vbd",
+            beads="particles",
+            substeps=64,
+            iterations=10,
+            contact_stiffness=1e4,
+            contact_damping=60.0,
+        )
+    if engine == "newton-xpbd":
+        return NewtonSettings(solver="xpbd", beads="bodies", substeps=64, iterations=4)
+    return PyBulletSettings(hz=9600, world="rigid")
+
+
+def settings_of(engine: str, scene: str, values: dict[str, Any]) -> Any:
+    """The settings that a row tells."""
+    kind = type(fine(engine, scene))
+    return kind(**values)
+
+
+def _ours(scene: str) -> list[OursSettings]:
+    return [OursSettings(hz=hz, lanes=lanes) for lanes in (1, LANES) for hz in OUR_RATES]
+
+
+def _mujoco(scene: str) -> list[Any]:
+    if scene in SHEETS:
+        return _mujoco_soft(scene)
+    if scene == "block":
+        return [
+            MujocoSettings(
+                hz=hz, solver=solver, iterations=count, contact=contact, cone=cone, sleep=sleep
+            )
+            for hz, (solver, count), contact, cone, sleep in product(
+                (60, 120, 180, 240, 480, 960),
+                (("Newton", 3), ("Newton", 20), ("CG", 10), ("PGS", 10)),
+                (2.0, 4.0),
+                ("pyramidal", "elliptic"),
+                (False, True),
+            )
+        ]
+    points = [
+        MujocoSettings(
+            hz=hz,
+            solver=solver,
+            iterations=count,
+            stiff=stiff,
+            tolerance=tolerance,
+            contact=contact,
+        )
+        for hz, (solver, count), stiff, tolerance, contact in product(
+            (60, 120, 180, 240, 480, 960),
+            (("Newton", 3), ("Newton", 10), ("CG", 10), ("CG", 20), ("PGS", 10)),
+            (2.0, 3.0),
+            (1e-6, 1e-4),
+            (2.0, 4.0),
+        )
+        if (stiff, contact) in ((2.0, 2.0), (3.0, 2.0), (2.0, 4.0))
+        and (tolerance == 1e-4 or stiff == contact)
+    ]
+    others = [
+        MujocoSettings(hz=hz, iterations=10, cone=cone, integrator=integrator, jacobian=jacobian)
+        for hz, cone, integrator, jacobian in product(
+            (120, 240),
+            ("pyramidal", "elliptic"),
+            ("Euler", "discrete"),
+            ("dense", "sparse"),
+        )
+    ]
+    spheres = [
+        MujocoSettings(hz=hz, solver=solver, iterations=count, links="connect", sleep=sleep)
+        for hz, (solver, count), sleep in product(
+            (120, 240), (("CG", 10), ("CG", 20), ("Newton", 5), ("PGS", 20)), (False, True)
+        )
+    ]
+    return [*points, *others, *spheres]
+
+
+def _mujoco_soft(scene: str) -> list[MujocoSoftSettings]:
+    large = scene in ("cloth25", "crumple25", "shell-cube")
+    rates = (120, 240) if large else (120, 180, 240, 480, 960)
+    counts = (("CG", 10), ("CG", 20), *(() if large else (("CG", 50), ("Newton", 5))))
+    first = [
+        MujocoSoftSettings(hz=hz, solver=solver, iterations=count, contact=contact)
+        for hz, (solver, count), contact in product(rates, counts, (2.0, 4.0))
+        if contact == 2.0 or (solver, count) == ("CG", 20)
+    ]
+    more = [
+        MujocoSoftSettings(hz=hz, iterations=20, **change)
+        for hz, change in product(
+            (240,) if large else (120, 240),
+            (
+                {"radius": 0.003},
+                {"condim": 1},
+                {"selfcollide": "bvh"},
+                {"selfcollide": "sap"},
+                {"edges": "vert"},
+                {"damping": 1e-2},
+                {"damping": 0.0},
+                {"cone": "elliptic"},
+                {"tolerance": 1e-4},
+                {"sleep": True},
+                {"integrator": "discrete"},
+                {"stiff": 4.0},
+            ),
+        )
+        if not (scene not in ("cloth10", "cloth25") and "edges" in change)  # planar sheets only
+    ]
+    return [*first, *more]
+
+
+STIFFNESSES = ((1e3, 10.0), (1e4, 10.0), (1e4, 0.0))  # and damping of contacts
+
+
+def _newton_vbd(scene: str) -> list[Any]:
+    if scene in SHEETS:
+        large = scene in ("cloth25", "crumple25", "shell-cube")
+        steps = (4, 10) if large else (2, 4, 6, 10)
+        return [
+            NewtonSoftSettings(
+                substeps=count, iterations=each, stiffness=stiffness, contact_damping=damping
+            )
+            for count, each, (stiffness, damping) in product(
+                steps, (2, 6) if large else (2, 4), ((1e4, 10.0),) if large else STIFFNESSES
+            )
+        ]
+    if scene == "block":
+        return [
+            NewtonSettings(
+                solver="vbd", beads="bodies", substeps=count, iterations=each, contact_stiffness=k
+            )
+            for count, each, k in product((2, 4, 8), (1, 2), (1e4, 1e5))
+        ]
+    particles = [
+        NewtonSettings(
+            solver="vbd",
+            beads="particles",
+            substeps=count,
+            iterations=each,
+            link_stiffness=stiffness,
+            contact_damping=damping,
+            contact_stiffness=contact,
+        )
+        for count, each, stiffness, damping, contact in product(
+            (2, 4, 8), (1, 2, 4), (2e4, 2e5), (10.0, 60.0), (1e4,)
+        )
+    ]
+    bodies = [
+        NewtonSettings(solver="vbd", beads="bodies", substeps=count, iterations=each)
+        for count, each in ((4, 2), (10, 5))
+    ]
+    return [*particles, *bodies]
+
+
+def _newton_xpbd(scene: str) -> list[NewtonSettings]:
+    if scene == "block":
+        return [
+            NewtonSettings(solver="xpbd", beads="bodies", substeps=count, iterations=each)
+            for count, each in product((2, 4, 8, 16), (2, 4))
+        ]
+    return [
+        NewtonSettings(
+            solver="xpbd", beads="bodies", substeps=count, iterations=each, joint_relaxation=relaxed
+        )
+        for count, each, relaxed in product((4, 8, 12, 16), (2, 4), (1.0,))
+    ]
+
+
+def _pybullet(scene: str) -> list[PyBulletSettings]:
+    if scene in SHEETS:
+        return []  # at the original's settings it has rows of its own, in `benchmarks/physics.py`
+    return [
+        PyBulletSettings(hz=hz, iterations=count, world=world)
+        for world, hz, count in product(
+            ("rigid", "deformable"), (60, 120, 240, 480, 960), (5, 10, 50)
+        )
+        if (world == "rigid" and (scene == "block" or (hz in (240, 480) and count < 50)))
+        or (hz, count) == (240, 50)
+    ]
+
+
+_GRIDS = {
+    "ours": _ours,
+    "mujoco": _mujoco,
+    "newton-vbd": _newton_vbd,
+    "newton-xpbd": _newton_xpbd,
+    "pybullet": _pybullet,
+}
