@@ -3,8 +3,9 @@
 A pair is listed that is nearer than touching distance + the slacks of its two sides, so it cannot
 come to touch unlisted before a particle has used up its slack (Verlet, 1967). Then the pairs of
 what has moved are listed anew, and only those: most of a sheet lies still while a part is carried.
-What moves gets more slack than what lies, so the list of a sheet at rest is short. The list and its
-order follow from the world's own past only.
+What moves gets more slack than what lies, so the list of a sheet at rest is short. A particle that
+has gone through a triangle since they were listed keeps its side when they are listed anew, so that
+their contact leads it back. The list and its order follow from the world's own past only.
 """
 
 import functools
@@ -137,10 +138,54 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         )
 
     @wp.func
-    def drop_moved(start: int, count: int, links: int, sheets: Sheets, cells: Cells):
-        """Takes pairs with a moved particle off the list; returns how many are left."""
-        remaining = int(0)
+    def crossed(at: int, links: int, sheets: Sheets, cells: Cells):
+        """Whether a listed particle has gone through its triangle, by less than they touch."""
+        tri = sheets.triangle[cells.face[at]]
+        p = xyz(cells.place[links + cells.particle[at]])
+        a = xyz(cells.place[links + tri[0]])
+        b = xyz(cells.place[links + tri[1]])
+        c = xyz(cells.place[links + tri[2]])
+        gap = cells.gap[at]
+        result = bool(False)
+        if wp.dot(p - a, wp.cross(b - a, c - a)) * gap < S(0.0):
+            u = barycentric(p, a, b, c)
+            if wp.min(u[0], wp.min(u[1], u[2])) > S(0.0):
+                d = p - (a * u[0] + b * u[1] + c * u[2])
+                result = wp.length_sq(d) < gap * gap
+        return result
+
+    @wp.func
+    def keep_crossed(start: int, count: int, links: int, sheets: Sheets, cells: Cells):
+        """Brings crossed pairs with a moved particle to the front; returns how many they are."""
+        kept = int(0)
         for at in range(start, start + count):
+            i = cells.particle[at]
+            f = cells.face[at]
+            if cells.moved[links + i] + moved_corners(links, sheets.triangle[f], cells) > 0:
+                if crossed(at, links, sheets, cells):
+                    to = start + kept
+                    gap = cells.gap[at]
+                    cells.particle[at] = cells.particle[to]
+                    cells.face[at] = cells.face[to]
+                    cells.gap[at] = cells.gap[to]
+                    cells.particle[to] = i
+                    cells.face[to] = f
+                    cells.gap[to] = gap
+                    kept += 1
+        return kept
+
+    @wp.func
+    def is_kept(start: int, kept: int, i: int, f: int, cells: Cells):
+        result = bool(False)
+        for at in range(start, start + kept):
+            result = result or (cells.particle[at] == i and cells.face[at] == f)
+        return result
+
+    @wp.func
+    def drop_moved(start: int, kept: int, count: int, links: int, sheets: Sheets, cells: Cells):
+        """Takes pairs with a moved particle off the list behind `kept`; returns what is left."""
+        remaining = int(kept)
+        for at in range(start + kept, start + count):
             i = cells.particle[at]
             f = cells.face[at]
             tri = sheets.triangle[f]
@@ -188,8 +233,10 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         far = R3(box[1, 0], box[1, 1], box[1, 2])
         loosest = box[2, 0]
         listed = int(0)
+        kept = int(0)
         if not anew:
-            listed = drop_moved(start, cells.count[slot], links, sheets, cells)
+            kept = keep_crossed(start, cells.count[slot], links, sheets, cells)
+            listed = drop_moved(start, kept, cells.count[slot], links, sheets, cells)
         # the cells cover what triangles with a moved corner can reach
         low = near
         high = far
@@ -265,7 +312,9 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
                             i = cells.key[hit]
                             if i < 0:
                                 i = -1 - i
-                            if cells.stamp[links + i] != f + 1:
+                            if cells.stamp[links + i] != f + 1 and not is_kept(
+                                start, kept, i, f, cells
+                            ):
                                 p4 = cells.sorted[hit]
                                 p = xyz(p4)
                                 gap = sheets.skin[base + i] + thick

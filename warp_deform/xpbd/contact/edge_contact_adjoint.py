@@ -11,6 +11,7 @@ from ..lanes.structures import structures
 from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind, tape
 from .closest_point import closest_point_adjoint
 from .edge_contact import edge_contact
+from .table_support import CARRIED, table_support
 from .triangle_contact_adjoint import triangle_contact_adjoint
 
 __all__ = ["edge_contact_adjoint"]
@@ -21,13 +22,14 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     """`record_edges` solves the listed pairs of one lane, leaves those that acted on the tape and
     returns their number; `sweep_edge` takes one back.
 
-    Branches: only pairs that meet inside both edges act, on the side on which they were listed;
-    depth is limited by the overlap or by `recovery`.
+    Branches: only pairs that meet inside both edges act, on the sides on which they are kept; depth
+    is limited by the overlap or by `recovery`; who lies on the table.
     """
     t = structures(scalar, lanes)
     S, R3, L = t.S, t.R3, t.L
     R2 = wp.types.vector(2, S)
-    Sheets, Cells, Tape, Adjoint = t.Sheets, t.Cells, t.Tape, t.Adjoint
+    Topology, Sheets, Cells = t.Topology, t.Sheets, t.Cells
+    Tape, Adjoint = t.Tape, t.Adjoint
     access = lane_access(scalar, lanes)
     count_one = access.count_one
     get, get_mass = access.get, access.get_mass
@@ -37,15 +39,19 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     tri_ = triangle_contact_adjoint(scalar, lanes)
     record_four, add_to, add_mass = tri_.record_four, tri_.add_to, tri_.add_mass
     position = tape(scalar, lanes).position
+    support = table_support(scalar, lanes)
+    raised, carried, unraised = support.raised, support.carried, support.unraised
 
     @wp.func
     def record_edges(
         g: int,
         lane: int,
         p0: int,
+        radii: int,
         at_word: int,
         at_scalar: int,
         max_recovery: S,
+        top: Topology,
         sheets: Sheets,
         cells: Cells,
         tape: Tape,
@@ -59,7 +65,7 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             b = get(cells.x, p0 + e[1], lane)
             c = get(cells.x, p0 + f[0], lane)
             d = get(cells.x, p0 + f[1], lane)
-            acts = project_edge(k, lane, p0, max_recovery, sheets, cells)
+            acts = project_edge(k, lane, p0, radii, max_recovery, top, sheets, cells)
             if acts:
                 word = at_word + count * wp.static(TRIANGLE_WORDS)
                 tape.k[word] = cells.edge_a[k]
@@ -76,8 +82,10 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         finished: int,
         lane: int,
         p0: int,
+        radii: int,
         max_recovery: S,
         counts: int,
+        top: Topology,
         sheets: Sheets,
         tape: Tape,
         adj: Adjoint,
@@ -85,10 +93,14 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         first = sheets.edge[tape.k[word]]
         second = sheets.edge[tape.k[word + 1]]
         signed = tape.s[at]
-        a = position(at + 1, tape)
-        b = position(at + 4, tape)
-        c = position(at + 7, tape)
-        d = position(at + 10, tape)
+        xa = position(at + 1, tape)
+        xb = position(at + 4, tape)
+        xc = position(at + 7, tape)
+        xd = position(at + 10, tape)
+        a = raised(xa, top.radius[radii + first[0]])
+        b = raised(xb, top.radius[radii + first[1]])
+        c = raised(xc, top.radius[radii + second[0]])
+        d = raised(xd, top.radius[radii + second[1]])
         ia = p0 + first[0]
         ib = p0 + first[1]
         ic = p0 + second[0]
@@ -112,6 +124,14 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         wc = get_mass(adj.w_flat, ic, lane)
         wd = get_mass(adj.w_flat, id, lane)
         w = wa * nu * nu + wb * u * u + wc * nv * nv + wd * v * v
+        # who is carried, and their share of w
+        ca = carried(n[2], a, xa, S(1.0))
+        cb = carried(n[2], b, xb, S(1.0))
+        cc = carried(-n[2], c, xc, S(1.0))
+        cd = carried(-n[2], d, xd, S(1.0))
+        borne = ca * wa * nu * nu + cb * wb * u * u + cc * wc * nv * nv + cd * wd * v * v
+        upright = S(CARRIED) * n[2] * n[2]
+        w -= upright * borne
         sa = a - get(tape.x_flat, finished + 3 * first[0] + 1, lane)
         sb = b - get(tape.x_flat, finished + 3 * first[1] + 1, lane)
         sc = c - get(tape.x_flat, finished + 3 * second[0] + 1, lane)
@@ -133,12 +153,17 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         yc = -wp.dot(gc, step)
         yd = -wp.dot(gd, step)
         gw = -wp.dot(g_step, step) / w
-        add_mass(ia, lane, wa, nu * (ya + gw * nu), adj)
-        add_mass(ib, lane, wb, u * (yb + gw * u), adj)
-        add_mass(ic, lane, wc, nv * (yc + gw * nv), adj)
-        add_mass(id, lane, wd, v * (yd + gw * v), adj)
+        wga = gw * (S(1.0) - upright * ca)
+        wgb = gw * (S(1.0) - upright * cb)
+        wgc = gw * (S(1.0) - upright * cc)
+        wgd = gw * (S(1.0) - upright * cd)
+        add_mass(ia, lane, wa, nu * (ya + wga * nu), adj)
+        add_mass(ib, lane, wb, u * (yb + wgb * u), adj)
+        add_mass(ic, lane, wc, nv * (yc + wgc * nv), adj)
+        add_mass(id, lane, wd, v * (yd + wgd * v), adj)
         g_depth = wp.dot(g_step, n) / w
         gn = g_step * (depth / w)
+        gn[2] = gn[2] - S(2.0) * S(CARRIED) * n[2] * borne * gw
         g_moved = R3()
         gr = R3()
         if allowed < overlap:
@@ -148,9 +173,9 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         else:
             gn -= r * g_depth
             gr = n * (-g_depth)
-        gu = yb * wb - ya * wa + S(2.0) * gw * (wb * u - wa * nu)
+        gu = yb * wb - ya * wa + S(2.0) * (wgb * wb * u - wga * wa * nu)
         gu += wp.dot(g_moved, sb - sa) + wp.dot(gr, e)
-        gv = yd * wd - yc * wc + S(2.0) * gw * (wd * v - wc * nv)
+        gv = yd * wd - yc * wc + S(2.0) * (wgd * wd * v - wgc * wc * nv)
         gv -= wp.dot(g_moved, sd - sc) + wp.dot(gr, f)
         gm = (gn - n * wp.dot(n, gn)) * (side / size)
         # shares: from a along e, and from there to c against f
@@ -159,9 +184,13 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         ge = wp.cross(f, gm) + R3(y[1, 0], y[1, 1], y[1, 2])
         gf = wp.cross(gm, e) - R3(y[2, 0], y[2, 1], y[2, 2])
         g = gr + g_moved
-        add_to(adj.x_flat, adj.xp_flat, ia, lane, g * nu - across - ge, g_moved * (-nu))
-        add_to(adj.x_flat, adj.xp_flat, ib, lane, g * u + ge, g_moved * (-u))
-        add_to(adj.x_flat, adj.xp_flat, ic, lane, across - g * nv - gf, g_moved * nv)
-        add_to(adj.x_flat, adj.xp_flat, id, lane, gf - g * v, g_moved * v)
+        ha = unraised(g * nu - across - ge, a, xa)
+        hb = unraised(g * u + ge, b, xb)
+        hc = unraised(across - g * nv - gf, c, xc)
+        hd = unraised(gf - g * v, d, xd)
+        add_to(adj.x_flat, adj.xp_flat, ia, lane, ha, g_moved * (-nu))
+        add_to(adj.x_flat, adj.xp_flat, ib, lane, hb, g_moved * (-u))
+        add_to(adj.x_flat, adj.xp_flat, ic, lane, hc, g_moved * nv)
+        add_to(adj.x_flat, adj.xp_flat, id, lane, hd, g_moved * v)
 
     return SimpleNamespace(record_edges=record_edges, sweep_edge=sweep_edge)

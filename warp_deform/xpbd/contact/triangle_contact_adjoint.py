@@ -11,6 +11,7 @@ from ..lanes.structures import structures
 from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS, Kind, tape
 from .closest_point import closest_point, closest_point_adjoint
 from .friction import friction_adjoint
+from .table_support import CARRIED, table_support
 from .triangle_contact import ACTS, CARRIES, triangle_contact
 
 __all__ = ["triangle_contact_adjoint"]
@@ -22,18 +23,21 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     tape; it returns 2 * their number, plus 1 where `held` touched a triangle below it.
     `sweep_triangle` takes one back and returns the derivative by friction.
 
-    Branches: inside, rim or corner of the triangle; on which side it was listed; depth limited by
-    the overlap or by `recovery`.
+    Branches: inside, rim or corner of the triangle; on which side the particle is kept; depth
+    limited by the overlap or by `recovery`; who lies on the table.
     """
     t = structures(scalar, lanes)
     S, R3, L = t.S, t.R3, t.L
-    Sheets, Cells, Tape, Adjoint = t.Sheets, t.Cells, t.Tape, t.Adjoint
+    Topology, Sheets, Cells = t.Topology, t.Sheets, t.Cells
+    Tape, Adjoint = t.Tape, t.Adjoint
     access = lane_access(scalar, lanes)
     get, put, get_mass, put_scalar = access.get, access.put, access.get_mass, access.put_scalar
     barycentric = closest_point(scalar, lanes).barycentric
     sweep_barycentric = closest_point_adjoint(scalar, lanes).sweep_barycentric
     project_triangle = triangle_contact(scalar, lanes).project_triangle
     position = tape(scalar, lanes).position
+    support = table_support(scalar, lanes)
+    raised, carried, unraised = support.raised, support.carried, support.unraised
     soft_gradients = friction_adjoint(scalar, lanes).coulomb_soft_scalar_gradients
 
     @wp.func
@@ -60,11 +64,13 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         g: int,
         lane: int,
         p0: int,
+        radii: int,
         held: int,
         at_word: int,
         at_scalar: int,
         mu: S,
         max_recovery: S,
+        top: Topology,
         sheets: Sheets,
         cells: Cells,
         tape: Tape,
@@ -80,7 +86,9 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             a = get(cells.x, p0 + tri[0], lane)
             b = get(cells.x, p0 + tri[1], lane)
             c = get(cells.x, p0 + tri[2], lane)
-            result = project_triangle(k, lane, p0, held, mu, max_recovery, sheets, cells)
+            result = project_triangle(
+                k, lane, p0, radii, held, mu, max_recovery, top, sheets, cells
+            )
             if result >= wp.static(CARRIES):
                 hit = 1
             if result % wp.static(CARRIES) == wp.static(ACTS):
@@ -100,9 +108,11 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         finished: int,
         lane: int,
         p0: int,
+        radii: int,
         mu: S,
         max_recovery: S,
         counts: int,
+        top: Topology,
         sheets: Sheets,
         tape: Tape,
         adj: Adjoint,
@@ -111,10 +121,14 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         face = tape.k[word + 1]
         tri = sheets.triangle[face]
         signed = tape.s[at]
-        p = position(at + 1, tape)
-        a = position(at + 4, tape)
-        b = position(at + 7, tape)
-        c = position(at + 10, tape)
+        xi = position(at + 1, tape)
+        xa = position(at + 4, tape)
+        xb = position(at + 7, tape)
+        xc = position(at + 10, tape)
+        p = raised(xi, top.radius[radii + local])
+        a = raised(xa, top.radius[radii + tri[0]])
+        b = raised(xb, top.radius[radii + tri[1]])
+        c = raised(xc, top.radius[radii + tri[2]])
         i = p0 + local
         ia = p0 + tri[0]
         ib = p0 + tri[1]
@@ -143,6 +157,14 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         wb = get_mass(adj.w_flat, ib, lane)
         wc = get_mass(adj.w_flat, ic, lane)
         w = wi + wa * u[0] * u[0] + wb * u[1] * u[1] + wc * u[2] * u[2]
+        # who is carried, and their share of w
+        ci = carried(n[2], p, xi, S(1.0))
+        ca = carried(-n[2], a, xa, S(1.0))
+        cb = carried(-n[2], b, xb, S(1.0))
+        cc = carried(-n[2], c, xc, S(1.0))
+        borne = ci * wi + ca * wa * u[0] * u[0] + cb * wb * u[1] * u[1] + cc * wc * u[2] * u[2]
+        upright = S(CARRIED) * n[2] * n[2]
+        firm = w - upright * borne
         sa = a - get(tape.x_flat, finished + 3 * tri[0] + 1, lane)
         sb = b - get(tape.x_flat, finished + 3 * tri[1] + 1, lane)
         sc = c - get(tape.x_flat, finished + 3 * tri[2] + 1, lane)
@@ -154,9 +176,12 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         slip = moved - n * approach
         slip2 = wp.dot(slip, slip)
         rub = mu * sheets.friction[face]
-        budget = depth * rub
+        load = depth * (w / firm)
+        budget = load * rub
         share, by_budget, by_slip2 = soft_gradients(slip2, budget)
-        step = (n * depth - slip * share) / w
+        press = n * (depth / firm)
+        drag = slip * (share / w)
+        step = press - drag
 
         gp = get(adj.x_flat, i, lane)
         ga = get(adj.x_flat, ia, lane)
@@ -167,23 +192,29 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         ya = -wp.dot(ga, step)
         yb = -wp.dot(gb, step)
         yc = -wp.dot(gc, step)
-        gw = -wp.dot(g_step, step) / w
-        add_mass(i, lane, wi, wp.dot(gp, step) + gw, adj)
-        add_mass(ia, lane, wa, u[0] * (ya + gw * u[0]), adj)
-        add_mass(ib, lane, wb, u[1] * (yb + gw * u[1]), adj)
-        add_mass(ic, lane, wc, u[2] * (yc + gw * u[2]), adj)
-        # by depth, slip and normal
         b_ = g_step / w
         across = -wp.dot(b_, slip)
         g_budget = across * by_budget
-        g_depth = wp.dot(b_, n) + g_budget * rub
+        g_firm = -(wp.dot(g_step, press) + g_budget * budget) / firm
+        gw = (wp.dot(g_step, drag) + g_budget * budget) / w + g_firm
+        g_borne = -upright * g_firm
+        wga = gw + g_borne * ca
+        wgb = gw + g_borne * cb
+        wgc = gw + g_borne * cc
+        add_mass(i, lane, wi, wp.dot(gp, step) + gw + g_borne * ci, adj)
+        add_mass(ia, lane, wa, u[0] * (ya + wga * u[0]), adj)
+        add_mass(ib, lane, wb, u[1] * (yb + wgb * u[1]), adj)
+        add_mass(ic, lane, wc, u[2] * (yc + wgc * u[2]), adj)
+        # by depth, slip and normal
+        g_depth = wp.dot(g_step, n) / firm + g_budget * rub * (w / firm)
         g_slip = slip * (S(2.0) * across * by_slip2) - b_ * share
         g_approach = -wp.dot(g_slip, n)
         g_overlap = g_depth
         if allowed < overlap:
             g_approach -= g_depth
             g_overlap = S(0.0)
-        gn = b_ * depth - g_slip * approach + moved * g_approach
+        gn = g_step * (depth / firm) - g_slip * approach + moved * g_approach
+        gn[2] = gn[2] - S(2.0) * S(CARRIED) * n[2] * borne * g_firm
         g_moved = g_slip + n * g_approach
         # by the offset from the nearest point, its weights, and the triangle's plane
         gd = R3()
@@ -199,17 +230,21 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             gd = (gn - n * wp.dot(n, gn)) / l - n * g_overlap
         # the weights add up to 1, so positions count from a
         gu = R3(
-            ya * wa + S(2.0) * gw * wa * u[0] - wp.dot(g_moved, sa),
-            yb * wb + S(2.0) * gw * wb * u[1] - wp.dot(g_moved, sb) - wp.dot(gd, b - a),
-            yc * wc + S(2.0) * gw * wc * u[2] - wp.dot(g_moved, sc) - wp.dot(gd, c - a),
+            ya * wa + S(2.0) * wga * wa * u[0] - wp.dot(g_moved, sa),
+            yb * wb + S(2.0) * wgb * wb * u[1] - wp.dot(g_moved, sb) - wp.dot(gd, b - a),
+            yc * wc + S(2.0) * wgc * wc * u[2] - wp.dot(g_moved, sc) - wp.dot(gd, c - a),
         )
         hp, ha, hb, hc = sweep_barycentric(u, gu, d, a, b, c)
         g = g_moved + gd
-        add_to(adj.x_flat, adj.xp_flat, i, lane, hp + g, -g_moved)
-        add_to(adj.x_flat, adj.xp_flat, ia, lane, ha - g * u[0] - ge - gf, g_moved * u[0])
-        add_to(adj.x_flat, adj.xp_flat, ib, lane, hb - g * u[1] + ge, g_moved * u[1])
-        add_to(adj.x_flat, adj.xp_flat, ic, lane, hc - g * u[2] + gf, g_moved * u[2])
-        return g_budget * depth * sheets.friction[face]
+        hp = unraised(hp + g, p, xi)
+        ha = unraised(ha - g * u[0] - ge - gf, a, xa)
+        hb = unraised(hb - g * u[1] + ge, b, xb)
+        hc = unraised(hc - g * u[2] + gf, c, xc)
+        add_to(adj.x_flat, adj.xp_flat, i, lane, hp, -g_moved)
+        add_to(adj.x_flat, adj.xp_flat, ia, lane, ha, g_moved * u[0])
+        add_to(adj.x_flat, adj.xp_flat, ib, lane, hb, g_moved * u[1])
+        add_to(adj.x_flat, adj.xp_flat, ic, lane, hc, g_moved * u[2])
+        return g_budget * load * sheets.friction[face]
 
     return SimpleNamespace(
         record_triangles=record_triangles,

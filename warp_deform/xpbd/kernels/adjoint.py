@@ -129,7 +129,7 @@ def adjoint_kernel(
                     adj,
                 )
             if wp.static(with_sheets):
-                by, tops = sweep_fabrics(at, pace, now, by, tops, sheets, tape, adj)
+                by, tops = sweep_fabrics(at, pace, now, by, tops, top, sheets, tape, adj)
             by, tops = sweep_contacts(at, pace, now, by, tops, pairs, tape, adj)
             if wp.static(with_sheets):
                 tops = sweep_tethers(at, now, tops, particles, tape, adj)

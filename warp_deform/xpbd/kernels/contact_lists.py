@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from ..contact.cell_list import cell_list
-from ..contact.edge_contact import edge_contact
+from ..contact.edge_list import edge_list
 from ..contact.sphere_contact import sphere_contact
 from ..lanes.algebra import add, any_less, mul, select, sub  # noqa: F401  (operators by name)
 from ..lanes.group_state import group_state
@@ -32,7 +32,7 @@ def contact_lists(scalar: Any, lanes: int, with_sheets: bool, with_edges: bool) 
     cells_ = cell_list(scalar, lanes)
     common_step, moved_since = cells_.common_step, cells_.moved_since
     list_triangles = cells_.list_triangles
-    list_edges = edge_contact(scalar, lanes).list_edges
+    list_edges = edge_list(scalar, lanes).list_edges
 
     @wp.func
     def list_contacts(

@@ -151,6 +151,7 @@ def forward_kernel(
                 pace,
                 run,
                 tops,
+                top,
                 particles,
                 springs,
                 lines,

@@ -51,7 +51,7 @@ def particle_solve(
     record_edges = edge_contact_adjoint(scalar, lanes).record_edges
     Span, Pace, Run = t.Span, t.Pace, t.Run
     Particles, Springs, Lines, Pairs, Near = t.Particles, t.Springs, t.Lines, t.Pairs, t.Near
-    Grips, Sheets, Cells, Tape = t.Grips, t.Sheets, t.Cells, t.Tape
+    Grips, Sheets, Cells, Tape, Topology = t.Grips, t.Sheets, t.Cells, t.Tape, t.Topology
 
     @wp.func
     def solve_springs(
@@ -113,6 +113,7 @@ def particle_solve(
         pace: Pace,
         run: Run,
         tops: wp.vec4i,
+        top: Topology,
         particles: Particles,
         springs: Springs,
         lines: Lines,
@@ -201,11 +202,13 @@ def particle_solve(
                                 at.g,
                                 lane,
                                 p0,
+                                at.radii,
                                 grips.particle[world0 + lane],
                                 tk,
                                 ts,
                                 contact_mu[lane],
                                 max_recovery,
+                                top,
                                 sheets,
                                 cells,
                                 tape,
@@ -218,7 +221,17 @@ def particle_solve(
                             tk += 1
                             if wp.static(with_edges):
                                 acted_count = record_edges(
-                                    at.g, lane, p0, tk, ts, max_recovery, sheets, cells, tape
+                                    at.g,
+                                    lane,
+                                    p0,
+                                    at.radii,
+                                    tk,
+                                    ts,
+                                    max_recovery,
+                                    top,
+                                    sheets,
+                                    cells,
+                                    tape,
                                 )
                                 tk += wp.static(TRIANGLE_WORDS) * acted_count
                                 ts += wp.static(TRIANGLE_SCALARS) * acted_count
@@ -229,15 +242,19 @@ def particle_solve(
                                 at.g,
                                 lane,
                                 p0,
+                                at.radii,
                                 grips.particle[world0 + lane],
                                 contact_mu[lane],
                                 max_recovery,
+                                top,
                                 sheets,
                                 cells,
                             )
                             cells.met[world0 + lane] = wp.where(hit, 1, 0)
                             if wp.static(with_edges):
-                                project_edges(at.g, lane, p0, max_recovery, sheets, cells)
+                                project_edges(
+                                    at.g, lane, p0, at.radii, max_recovery, top, sheets, cells
+                                )
         return wp.vec4i(tx, tv, tk, ts)
 
     return SimpleNamespace(solve_particles=solve_particles)
