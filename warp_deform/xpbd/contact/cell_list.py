@@ -3,8 +3,8 @@
 A pair is listed that is nearer than touching distance + the slacks of its two sides, so it cannot
 come to touch unlisted before a particle has used up its slack (Verlet, 1967). Then the pairs of
 what has moved are listed anew, and only those: most of a sheet lies still while a part is carried.
-What moves gets more slack than what lies, so the list of a sheet at rest is short. A particle that
-has gone through a triangle since they were listed keeps its side when they are listed anew, so that
+What moves gets more slack than what lies, so the list of a sheet at rest is short. What has been
+pressed into a triangle's plane, or through it, keeps its side when the two are listed anew, so that
 their contact leads it back. The list and its order follow from the world's own past only.
 """
 
@@ -20,7 +20,7 @@ from ..lanes.structures import structures
 from .cell_sort import RUN, cell_sort
 from .closest_point import closest_point
 
-__all__ = ["cell_list"]
+__all__ = ["FLAT", "cell_list"]
 
 MOST = 0.2
 """Largest slack of a particle, as a share of a fabric's cell: more would list its neighbours."""
@@ -28,6 +28,9 @@ LEAST = 0.3
 """Least slack of a particle, as a share of the largest."""
 STEPS = 16.0
 """Substeps at its present speed for which a particle's slack lasts, between these limits."""
+FLAT = 0.25
+"""What is nearer to a plane than this share of the distance at which they touch may be on either
+side of it by chance."""
 SOON = 0.4
 """Share of its slack after which a particle's pairs are listed anew, if others have to be."""
 
@@ -138,8 +141,10 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         )
 
     @wp.func
-    def crossed(at: int, links: int, sheets: Sheets, cells: Cells):
-        """Whether a listed particle has gone through its triangle, by less than they touch."""
+    def pressed(at: int, links: int, sheets: Sheets, cells: Cells):
+        """Whether a listed particle has gone through its triangle, or nearly: its place no longer
+        tells on which side it belongs.
+        """
         tri = sheets.triangle[cells.face[at]]
         p = xyz(cells.place[links + cells.particle[at]])
         a = xyz(cells.place[links + tri[0]])
@@ -147,22 +152,25 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         c = xyz(cells.place[links + tri[2]])
         gap = cells.gap[at]
         result = bool(False)
-        if wp.dot(p - a, wp.cross(b - a, c - a)) * gap < S(0.0):
+        m = wp.cross(b - a, c - a)
+        above = wp.dot(p - a, m) * wp.sign(gap)
+        flat = S(FLAT) * wp.abs(gap) * wp.length(m)
+        if above < flat:
             u = barycentric(p, a, b, c)
-            if wp.min(u[0], wp.min(u[1], u[2])) > S(0.0):
-                d = p - (a * u[0] + b * u[1] + c * u[2])
-                result = wp.length_sq(d) < gap * gap
+            d = p - (a * u[0] + b * u[1] + c * u[2])
+            if wp.length_sq(d) < gap * gap:
+                result = above > -flat or wp.min(u[0], wp.min(u[1], u[2])) > S(0.0)
         return result
 
     @wp.func
-    def keep_crossed(start: int, count: int, links: int, sheets: Sheets, cells: Cells):
-        """Brings crossed pairs with a moved particle to the front; returns how many they are."""
+    def keep_pressed(start: int, count: int, links: int, sheets: Sheets, cells: Cells):
+        """Brings pressed pairs with a moved particle to the front; returns how many they are."""
         kept = int(0)
         for at in range(start, start + count):
             i = cells.particle[at]
             f = cells.face[at]
             if cells.moved[links + i] + moved_corners(links, sheets.triangle[f], cells) > 0:
-                if crossed(at, links, sheets, cells):
+                if pressed(at, links, sheets, cells):
                     to = start + kept
                     gap = cells.gap[at]
                     cells.particle[at] = cells.particle[to]
@@ -235,7 +243,7 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         listed = int(0)
         kept = int(0)
         if not anew:
-            kept = keep_crossed(start, cells.count[slot], links, sheets, cells)
+            kept = keep_pressed(start, cells.count[slot], links, sheets, cells)
             listed = drop_moved(start, kept, cells.count[slot], links, sheets, cells)
         # the cells cover what triangles with a moved corner can reach
         low = near

@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from ..lanes.structures import structures
+from .cell_list import FLAT
 from .cell_sort import RUN, cell_sort
 from .edge_contact import INSIDE, edge_contact
 
@@ -24,8 +25,8 @@ def edge_list(scalar: Any, lanes: int) -> SimpleNamespace:
     """`list_edges` lists pairs of edges of one lane, and returns how many found no room.
 
     It follows `list_triangles` (see `cell_list`), whose slacks and moved particles it takes over.
-    A pair that has crossed since it was listed keeps its sides when it is listed anew, so that its
-    contact leads it back.
+    A pair that has crossed, or nearly, keeps its sides when it is listed anew, so that its contact
+    leads it back.
     """
     t = structures(scalar, lanes)
     S, R3, L, V4 = t.S, t.R3, t.L, t.V4
@@ -93,8 +94,8 @@ def edge_list(scalar: Any, lanes: int) -> SimpleNamespace:
         )
 
     @wp.func
-    def crossed(at: int, links: int, sheets: Sheets, cells: Cells):
-        """Whether two listed edges have gone through each other, and not too far."""
+    def pressed(at: int, links: int, sheets: Sheets, cells: Cells):
+        """Whether two listed edges have gone through each other, or nearly, and not too far."""
         e = sheets.edge[cells.edge_a[at]]
         f = sheets.edge[cells.edge_b[at]]
         a = xyz(cells.place[links + e[0]])
@@ -103,24 +104,29 @@ def edge_list(scalar: Any, lanes: int) -> SimpleNamespace:
         d = xyz(cells.place[links + f[1]])
         gap = cells.edge_gap[at]
         result = bool(False)
-        if wp.dot(a - c, wp.cross(b - a, d - c)) * gap < S(0.0):
+        m = wp.cross(b - a, d - c)
+        above = wp.dot(a - c, m) * wp.sign(gap)
+        flat = S(FLAT) * wp.abs(gap) * wp.length(m)
+        if above < flat:
             at_both = nearest(a, b, c, d)
             u = at_both[0]
             v = at_both[1]
+            apart2 = wp.length_sq(a + (b - a) * u - c - (d - c) * v) / (gap * gap)
             low = S(INSIDE)
             high = S(1.0) - low
             if u > low and u < high and v > low and v < high:
-                apart2 = wp.length_sq(a + (b - a) * u - c - (d - c) * v)
-                result = apart2 < S(RECALL * RECALL) * gap * gap
+                result = apart2 < S(RECALL * RECALL)
+            else:
+                result = above > -flat and apart2 < S(1.0)
         return result
 
     @wp.func
-    def keep_crossed(start: int, count: int, links: int, sheets: Sheets, cells: Cells):
-        """Brings crossed pairs with a moved end to the front; returns how many they are."""
+    def keep_pressed(start: int, count: int, links: int, sheets: Sheets, cells: Cells):
+        """Brings pressed pairs with a moved end to the front; returns how many they are."""
         kept = int(0)
         for at in range(start, start + count):
             if moved_ends(at, links, sheets, cells) > 0:
-                if crossed(at, links, sheets, cells):
+                if pressed(at, links, sheets, cells):
                     to = start + kept
                     first = cells.edge_a[at]
                     second = cells.edge_b[at]
@@ -171,7 +177,7 @@ def edge_list(scalar: Any, lanes: int) -> SimpleNamespace:
         listed = int(0)
         kept = int(0)
         if not anew:
-            kept = keep_crossed(start, cells.edge_count[slot], places, sheets, cells)
+            kept = keep_pressed(start, cells.edge_count[slot], places, sheets, cells)
             listed = drop_moved(start, kept, cells.edge_count[slot], places, sheets, cells)
         # the cells cover what moved edges can reach
         half = S(0.0)
