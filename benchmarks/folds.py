@@ -4,6 +4,7 @@
 
 Sheets of 10 x 10 and of 25 x 25 particles, side by side in lanes: a random particle of the rim is
 carried a random way over the sheet, and, once it is at rest, any particle of the heap as far again.
+The fabric of the tasks is folded four times, so that it ends as a heap of several layers.
 Edges are counted exactly at rest after each. Costs are of the same rollouts, in CPU ms per
 simulated second and sheet, and speak for no other machine; their ratio does.
 """
@@ -26,28 +27,35 @@ from warp_deform.collecting.workers import single_threaded
 from warp_deform.objects import ClothConfig
 from warp_deform.quiet import quiet_warp
 from warp_deform.rollout import rollout
+from warp_deform.solver import SolverConfig
+from warp_deform.tasks.cloth_physics import CLOTH_SOLVER, FABRIC, FABRIC_SOLVER
 
 SHEETS = {10: 16, 25: 8}
 """Rows of a sheet, and how many sheets are folded."""
+OF_TASKS = 32
+"""Sheets of the tasks' fabric that are folded."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Sheets at rest after their first or their second fold.
+    """Sheets at rest after one of their folds.
 
     Attributes:
+        fabric: "plain", of `ClothConfig`'s defaults but for what is named here, or "tasks"
         edge_contact: share of `ClothConfig`
-        pierced_least, pierced_most: edges of a sheet that pierce it
+        pierced_least, pierced_mean, pierced_most: edges of a sheet that pierce it
         shortest: edge of all sheets, over its rest length
         guards: sheets that a guard stopped
     """
 
+    fabric: str
     rows: int
     edge_contact: float
     fold: int
     sheets: int
     edges: int
     pierced_least: int
+    pierced_mean: float
     pierced_most: int
     shortest: float
     guards: int
@@ -67,14 +75,16 @@ def main() -> None:
             for edge_contact in (0.0, 0.2)
             for row in folded(rows, sheets, edge_contact)
         ]
+        results += folded_in_tasks(8 if options.quick else OF_TASKS)
     if options.json:
-        print(json.dumps({"rows": [asdict(row) for row in results]}))
+        print(json.dumps({"rows": [asdict(row) for row in results]}, indent=1))
         return
-    print("| rows | edge contact | fold | pierced | of | shortest | CPU ms |\n" + "|---" * 7 + "|")
+    print("| fabric | rows | edge contact | fold | pierced | mean | of | shortest | CPU ms |")
+    print("|---" * 9 + "|")
     for row in results:
         print(
-            f"| {row.rows} | {row.edge_contact} | {row.fold} | {row.pierced_least} to "
-            f"{row.pierced_most} | {row.edges} | {row.shortest:.2f} "
+            f"| {row.fabric} | {row.rows} | {row.edge_contact} | {row.fold} | {row.pierced_least} "
+            f"to {row.pierced_most} | {row.pierced_mean:.2f} | {row.edges} | {row.shortest:.2f} "
             f"| {row.cpu_ms_per_second:.1f} |"
         )
 
@@ -82,13 +92,25 @@ def main() -> None:
 def folded(rows: int, sheets: int, edge_contact: float) -> list[Row]:
     """Fold sheets twice; the draws are the same with and without contact between edges."""
     config = replace(ClothConfig(), rows=rows, columns=rows, edge_contact=edge_contact)
-    solver, cloth = cloth_solver(config, worlds=sheets, lanes=8)
+    return _folded("plain", config, CLOTH_SOLVER, sheets, 2)
+
+
+def folded_in_tasks(sheets: int) -> list[Row]:
+    """Fold the fabric of the tasks four times."""
+    return _folded("tasks", FABRIC, FABRIC_SOLVER, sheets, 4)
+
+
+def _folded(
+    fabric: str, config: ClothConfig, physics: SolverConfig, sheets: int, folds: int
+) -> list[Row]:
+    solver, cloth = cloth_solver(config, worlds=sheets, lanes=8, config=physics)
     flat = _positions(solver, 0)
     rim = np.flatnonzero((np.abs(flat[:, :2] - [0.5, 0.0]).max(axis=1)) > 0.099)
     measured, rng = [], np.random.default_rng(0)
     # compiled, and the kernels' caches filled, before anything is timed
     rollout(solver, range(sheets), most=0.05)
-    for fold, choices in enumerate((rim, np.arange(len(flat))), 1):
+    for fold in range(1, folds + 1):
+        choices = rim if fold == 1 else np.arange(len(flat))
         paths = {}
         for w in range(sheets):
             particle = int(rng.choice(choices))
@@ -102,12 +124,14 @@ def folded(rows: int, sheets: int, edge_contact: float) -> list[Row]:
         pierced = [piercing(x, cloth.faces) for x in ends]
         measured.append(
             Row(
-                rows=rows,
-                edge_contact=edge_contact,
+                fabric=fabric,
+                rows=config.rows,
+                edge_contact=config.edge_contact,
                 fold=fold,
                 sheets=sheets,
                 edges=len(edges_of(cloth.faces)),
                 pierced_least=min(pierced),
+                pierced_mean=float(np.mean(pierced)),
                 pierced_most=max(pierced),
                 shortest=min(float(edge_ratios(x, flat, cloth.faces).min()) for x in ends),
                 guards=sum(

@@ -27,12 +27,14 @@ FABRIC_SOLVER = replace(CLOTH_SOLVER, table_friction=0.5, margin=0.006)
 """With more room in the contact list than `CLOTH_SOLVER` gives it is made anew less often, which
 costs a quarter less."""
 
-FABRIC = ClothConfig(edge_contact=0.2, bend_stiffness=1.0)
+FABRIC = ClothConfig(edge_contact=0.2, bend_stiffness=1.0, exclusion=0.9)
 """The fabric of the tasks. It is as stiff as canvas, so that what crumples under a pull smooths
-again as in the original; its edges do not pass through each other."""
+again as in the original; its edges do not pass through each other, nor do a vertex and the
+triangles beside its own."""
 
 FABRIC_SPEED = 0.40
 """Speed of the tip that holds a fabric [m/s]."""
 
-FABRIC_PRIMITIVE = PrimitiveConfig(sheet_release=0.006)
-"""A vertex is let go about one layer above the table, and falls."""
+FABRIC_PRIMITIVE = PrimitiveConfig(sheet_release=0.006, sheet_meets=True)
+"""A vertex is let go about one layer above the table, or on the layers that it is lowered onto, and
+falls. What holds it is stronger than any contact, and would be pressed through them."""

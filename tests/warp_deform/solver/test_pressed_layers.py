@@ -24,7 +24,7 @@ def two_layers() -> tuple[SolverFusedXPBD, float]:
     for layer in range(2):
         middle = 0.5 + 0.4 * layer * sheet.spacing, 0.3 * layer * sheet.spacing
         add_cloth(builder, sheet, cloth_sheet(sheet, middle, height=sheet.radius + layer * h))
-    return finalize(builder, replace(FABRIC_SOLVER, sleep_speed=0.0), lanes=1), h
+    return finalize(builder, replace(FABRIC_SOLVER, sleep_speed=0.0), lanes=8), h
 
 
 @pytest.mark.parametrize("acceleration", [100.0, 400.0])

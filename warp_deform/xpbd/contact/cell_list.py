@@ -19,6 +19,7 @@ from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from .cell_sort import RUN, cell_sort
 from .closest_point import closest_point
+from .triangle_contact import RIM
 
 __all__ = ["FLAT", "cell_list"]
 
@@ -158,8 +159,10 @@ def cell_list(scalar: Any, lanes: int) -> SimpleNamespace:
         if above < flat:
             u = barycentric(p, a, b, c)
             d = p - (a * u[0] + b * u[1] + c * u[2])
-            if wp.length_sq(d) < gap * gap:
-                result = above > -flat or wp.min(u[0], wp.min(u[1], u[2])) > S(0.0)
+            if wp.min(u[0], wp.min(u[1], u[2])) > S(0.0):
+                result = wp.length_sq(d) < gap * gap
+            else:
+                result = above > -flat and wp.length_sq(d) < S(RIM * RIM) * gap * gap
         return result
 
     @wp.func

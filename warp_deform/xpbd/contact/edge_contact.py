@@ -13,6 +13,7 @@ import warp as wp
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from .table_support import CARRIED, table_support
+from .triangle_contact import RIM
 
 __all__ = ["INSIDE", "edge_contact"]
 
@@ -26,8 +27,8 @@ PARALLEL = 0.01
 def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     """`project_edges` solves the pairs that `edge_list` lists for one lane, in that order.
 
-    Two edges stay on the sides on which they were listed. They have gone past each other's ends,
-    and change sides, where their lines cross but they are as far apart as they touch.
+    Two edges stay on the sides on which they were listed, and change them when one has come round
+    an end of the other.
 
     `nearest(a, b, c, d)`: shares along a-b and c-d of the nearest points of the two.
     """
@@ -125,7 +126,7 @@ def edge_contact(scalar: Any, lanes: int) -> SimpleNamespace:
                     put(cells.x, p0 + f[1], lane, xd - step * wd)
                     acts = True
             elif apart < S(0.0):
-                if wp.length_sq(a + (b - a) * u - c - (d - c) * v) > h * h:
+                if wp.length_sq(a + (b - a) * u - c - (d - c) * v) > S(RIM * RIM) * h * h:
                     cells.edge_gap[k] = -signed
         return acts
 

@@ -10,6 +10,7 @@ from ..lanes.structures import structures
 from .cell_list import FLAT
 from .cell_sort import RUN, cell_sort
 from .edge_contact import INSIDE, edge_contact
+from .triangle_contact import RIM
 
 __all__ = ["edge_list"]
 
@@ -117,7 +118,7 @@ def edge_list(scalar: Any, lanes: int) -> SimpleNamespace:
             if u > low and u < high and v > low and v < high:
                 result = apart2 < S(RECALL * RECALL)
             else:
-                result = above > -flat and apart2 < S(1.0)
+                result = above > -flat and apart2 < S(RIM * RIM)
         return result
 
     @wp.func

@@ -15,10 +15,13 @@ from ..lanes.structures import structures
 from .closest_point import closest_point
 from .table_support import CARRIED, table_support
 
-__all__ = ["ACTS", "CARRIES", "triangle_contact"]
+__all__ = ["ACTS", "CARRIES", "RIM", "triangle_contact"]
 
 ACTS = 1
 CARRIES = 2
+RIM = 0.3
+"""What is behind a plane, and farther than this share of the distance at which they touch from the
+rim of what lies in it, has come round the rim."""
 
 
 @functools.cache
@@ -26,9 +29,9 @@ def triangle_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     """`project_triangles(...)`: solve the listed pairs of one lane, in the order of the list.
 
     A particle stays on the side of a triangle on which it was listed, also while they are listed
-    anew (see `cell_list`). It has come round the rim, and changes sides, where it is behind the
-    triangle's plane and no nearer than they touch. The normal is the triangle's where the nearest
-    point is inside, else from the nearest point to the particle. As between
+    anew (see `cell_list`). It changes sides when it has come round the rim, or is through and
+    farther than they touch. The normal is the triangle's where the nearest point is inside, else
+    from the nearest point to the particle. As between
     particles, a correction separates at `recovery` at most, counting what already separates, so an
     overlap that takes many substeps to undo does not gather speed.
 
@@ -95,7 +98,7 @@ def triangle_contact(scalar: Any, lanes: int) -> SimpleNamespace:
                     if l < h and l > S(1.0e-8):
                         n = d / l
                         depth = h - l
-                elif l > h:
+                elif l > S(RIM) * h:
                     cells.gap[k] = -signed
             if depth > S(0.0):
                 # what hangs beside it does not carry it
