@@ -24,7 +24,9 @@ def two_layers() -> tuple[SolverFusedXPBD, float]:
     for layer in range(2):
         middle = 0.5 + 0.4 * layer * sheet.spacing, 0.3 * layer * sheet.spacing
         add_cloth(builder, sheet, cloth_sheet(sheet, middle, height=sheet.radius + layer * h))
-    return finalize(builder, replace(FABRIC_SOLVER, sleep_speed=0.0), lanes=8), h
+    return finalize(
+        builder, replace(FABRIC_SOLVER, sleep_speed=0.0), lanes=8, precision="float32"
+    ), h
 
 
 @pytest.mark.parametrize("acceleration", [100.0, 400.0])
@@ -57,7 +59,6 @@ def folded(worlds: int, folds: int, seed: int) -> list[int]:
 
 def test_random_folds_of_the_fabric_of_the_tasks_hardly_pierce_it():
     counts = np.array(folded(16, 4, seed=11)) / 261
-    print(counts.mean(), counts.max())
     assert counts.mean() <= 0.001 and counts.max() <= 0.01
 
 
@@ -70,5 +71,4 @@ def test_thrown_and_pulled_bags_hardly_pierce_themselves():
         paths = {w: pull(solver.particle_q(w), bag.ring, BAG.opening_radius) for w in range(8)}
         rollout(solver, range(8), paths=paths, least=0.1, most=5.0)
         counts += [pierced(solver.particle_q(w), bag.faces) / edges for w in range(8)]
-    print(np.mean(counts), np.max(counts))
     assert np.mean(counts) <= 0.001 and np.max(counts) <= 0.02
