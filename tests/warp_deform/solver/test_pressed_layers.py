@@ -29,7 +29,7 @@ def two_layers() -> tuple[SolverFusedXPBD, float]:
     ), h
 
 
-@pytest.mark.parametrize("acceleration", [100.0, 400.0])
+@pytest.mark.parametrize("acceleration", [1000.0, 4000.0])
 def test_what_presses_a_layer_onto_the_one_below_does_not_go_through_it(acceleration: float):
     solver, h = two_layers()
     count = SMALL.rows * SMALL.columns
@@ -38,7 +38,7 @@ def test_what_presses_a_layer_onto_the_one_below_does_not_go_through_it(accelera
     push = Push(middle, np.array([0.0, 0.0, -acceleration]), 0.2)
     frames = rollout(solver, [0], pushes={0: (push,)}, least=0.2, most=0.2, record=0.01)[0].frames
     lowest = frames.particle_q[:, middle, 2].min() - SMALL.radius
-    assert lowest > 0.5 * h
+    assert lowest > 0.9 * h
 
 
 def folded(worlds: int, folds: int, seed: int) -> list[int]:
