@@ -330,8 +330,8 @@ def test_edges_keep_a_second_fold_from_piercing():
                 paths[w] = fold_path(x[corner], tuple(way), particle=corner)
             rollout(solver, range(4), paths=paths, least=0.3, most=4.0)
         counts[share] = sum(piercing(positions(solver, w), cloth.faces) for w in range(4))
-    assert counts[0.2] < 0.5 * counts[0.0]
-    assert counts[0.2] <= 0.02 * 4 * len(edges_of(cloth.faces))
+    assert counts[0.2] <= 0.5 * counts[0.0]
+    assert counts[0.2] <= 0.001 * 4 * len(edges_of(cloth.faces))
 
 
 def test_a_held_corner_stops_where_it_meets_the_layer_below():
