@@ -35,6 +35,5 @@ triangles beside its own."""
 FABRIC_SPEED = 0.40
 """Speed of the tip that holds a fabric [m/s]."""
 
-FABRIC_PRIMITIVE = PrimitiveConfig(sheet_release=0.006, sheet_meets=True)
-"""A vertex is let go about one layer above the table, or on the layers that it is lowered onto, and
-falls. What holds it is stronger than any contact, and would be pressed through them."""
+FABRIC_PRIMITIVE = PrimitiveConfig(sheet_release=0.006)
+"""A vertex is let go about one layer above the table, and falls."""
