@@ -59,5 +59,7 @@ def test_held_out_places_are_learnt_in_three_minutes(tmp_path: Path) -> None:
     held_out = Demonstrations(tmp_path / "held-out", task=TASK)
     before, after = (place_errors(RunFolder(out).snapshot(step), held_out) for step in (0, 200))
     assert len(before) > 30
-    # 0.37 to 0.42 of it for three seeds; which one depends on the rounding of the processor
-    assert np.median(after) < np.median(before) / 2
+    # a share is steadier than a median: half of the places are a choice among many beads
+    close = [float((errors < 0.02).mean()) for errors in (before, after)]
+    assert close[1] > 0.25 and close[1] > 3 * close[0]  # 0.42 and 0.07
+    assert after.mean() < 0.75 * before.mean()  # 0.064 and 0.123 m
