@@ -7,9 +7,11 @@ from .task import Stage
 
 __all__ = ["CABLE_GRADIENT_DAMPING", "CABLE_SOLVER", "CABLE_STAGE"]
 
-CABLE_SOLVER = SolverConfig(table_friction=0.5, contact_friction=0.1)
-"""Friction between beads is low: at 0.3 a pull tightens about one heap in a hundred into a knot
-that holds for ever, where the original's links give way; at 0.1 none of 800 did."""
+CABLE_SOLVER = SolverConfig(table_friction=0.35, contact_friction=0.2)
+"""Tuned on seeds of no test: with less friction than the original's 0.5 on the table, the scripted
+demonstrator needs about as many actions as there (cable-shape 6.5 and 6.9). Friction between beads
+is low: at 0.3 a pull tightens about one heap in a hundred into a knot that holds for ever, where
+the original's links give way."""
 
 CABLE_STAGE = Stage(lift=0.04, speed=0.15)
 """Low and slow, as in the original, so that the cable follows on the table."""
