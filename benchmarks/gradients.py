@@ -1,11 +1,16 @@
 """What derivatives cost: taped forward and backward beside the plain forward, in the same run.
 
-    python benchmarks/gradients.py [--scenes cable heap cloth10 bag bag-cube block] [--json]
+    python benchmarks/gradients.py [--scenes cable cable-alone heap cloth10 bag] [--json]
 
-Process CPU milliseconds per simulated second and world, 8 worlds in 8 lanes, float32, kernels
-compiled before, median over repeats; MB (10^6 bytes) of tape and checkpoints at their peak
-likewise. `full` keeps every tape, `replay` checkpoints and one tape, and its backward runs every
-segment again.
+Process CPU milliseconds per simulated second and world, 8 worlds in 8 lanes (cable-alone: one in a
+lane of its own), float32, kernels compiled before, the least over repeats that take turns; MB (10^6
+bytes) of tape and checkpoints at their peak likewise. `full` keeps every tape, `replay` checkpoints
+and one tape, and its backward runs every segment again; `auto` keeps tapes in a quarter of the
+memory. `parts` is a backward with derivatives by single springs and particles.
+
+What bounds it: `substep_bytes` are on the tape per substep and world, and `gigabytes_per_second` is
+what writing them would need if nothing else made the taped run dearer than the plain one;
+`plain_ns` and `backward_ns` are nanoseconds per constraint that acted.
 The worlds start as `warp-deform bench` starts them and run without a grip: beads crumpled (cable)
 or stacked (heap), a sheet crumpled above the table, a bag dropped, alone or with the two boxes of
 bag-items-2 in it (bag-cube), the L-block dropped while it slides and turns.
@@ -18,6 +23,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import newton
 import numpy as np
@@ -42,12 +48,15 @@ from warp_deform.rollout import DifferentiableRollout, rollout
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.bag_physics import BAG_SOLVER
 from warp_deform.tasks.cloth_physics import CLOTH_SOLVER
+from warp_deform.xpbd.recording.recorder import STORAGES
 
 LANES = 8
 CABLE, CLOTH, BAG = CableConfig(), ClothConfig(), BagConfig()
 BOX = BoxConfig(parts=(BoxPart((0.035, 0.035, 0.03)),), mass=0.1, friction=1.5)
 BLOCK = l_block()
-MEMORY = 2**31
+MEMORY = 2**30
+NO_CONSTRAINTS = {"contact_slowed", "table_slip", "body_slip", "speed_clamp", "release", "reached"}
+"""What is counted beside what it belongs to."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,9 @@ class Scene:
     seconds: float
     start: Callable[[np.random.Generator], np.ndarray]
     bodies: Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]] | None = None
+    lanes: int = LANES
+    often: int = 1
+    """Repeats for each one that is asked for: short runs are measured more often."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +81,20 @@ class Cost:
 
     scene: str
     storage: str
+    lanes: int
     plain_ms: float
     taped_ms: float
     backward_ms: float
+    parts_ms: float
     taped_ratio: float
     backward_ratio: float
+    whole_ratio: float
+    whole_with_parts_ratio: float
     memory_mb: float
+    substep_bytes: float
+    gigabytes_per_second: float
+    plain_ns: float
+    backward_ns: float
 
 
 def _crumpled(rng: np.random.Generator) -> np.ndarray:
@@ -127,15 +147,29 @@ SCENES = {
         SolverConfig(),
         1.0,
         _crumpled,
+        often=10,
+    ),
+    "cable-alone": Scene(
+        lambda b: add_cable(b, CABLE, cable_line(CABLE, (0.4, 0.0), (0.6, 0.0))),
+        SolverConfig(),
+        1.0,
+        _crumpled,
+        lanes=1,
+        often=10,
     ),
     "heap": Scene(
         lambda b: add_cable(b, CABLE, cable_line(CABLE, (0.4, 0.0), (0.6, 0.0))),
         SolverConfig(),
         1.0,
         _heap,
+        often=10,
     ),
     "cloth10": Scene(
-        lambda b: add_cloth(b, CLOTH, cloth_sheet(CLOTH, (0.5, 0.0))), CLOTH_SOLVER, 0.5, _sheet
+        lambda b: add_cloth(b, CLOTH, cloth_sheet(CLOTH, (0.5, 0.0))),
+        CLOTH_SOLVER,
+        0.5,
+        _sheet,
+        often=4,
     ),
     "bag": Scene(lambda b: add_bag(b, BAG), BAG_SOLVER, 0.25, _bag),
     "bag-cube": Scene(_add_bag_and_boxes, BAG_SOLVER, 0.25, _bag, _boxes),
@@ -145,47 +179,67 @@ SCENES = {
         1.0,
         _no_particles,
         _sliding,
+        often=10,
     ),
 }
 
 
 def measure(name: str, repeats: int) -> list[Cost]:
-    """Costs of one scene with both storages; every repeat starts elsewhere, all runs alike."""
+    """Costs of one scene with each storage; all runs start alike and take turns."""
     scene = SCENES[name]
     solver = _solver(scene)
-    worlds = range(LANES)
-    runs = {s: DifferentiableRollout(solver, storage=s, memory=MEMORY) for s in ("full", "replay")}
-    plain: list[float] = []
-    taped: dict[str, list[float]] = {s: [] for s in runs}
-    swept: dict[str, list[float]] = {s: [] for s in runs}
-    for repeat in range(repeats + 1):  # the first one loads kernels and finds sizes
-        _start(solver, scene, repeat)
+    worlds = range(scene.lanes)
+    runs = {s: DifferentiableRollout(solver, storage=s, memory=MEMORY) for s in STORAGES}
+    spent: dict[tuple[str, str], float] = {}
+    counts: dict[str, int] = {}
+
+    def timed(storage: str, what: str, run: Callable[[], Any]) -> Any:
         begin = time.process_time()
-        rollout(solver, worlds, least=1e3, most=scene.seconds)
-        plain.append(time.process_time() - begin)
+        result = run()
+        took = time.process_time() - begin
+        spent[storage, what] = min(took, spent.get((storage, what), np.inf))
+        return result
+
+    for repeat in range(repeats * scene.often + 1):  # the first one loads kernels and finds sizes
+        if repeat == 1:
+            spent.clear()
+        _start(solver, scene)
+        timed("", "plain", lambda: rollout(solver, worlds, least=1e3, most=scene.seconds))
         for storage, run in runs.items():
-            _start(solver, scene, repeat)
-            begin = time.process_time()
-            ends = run.forward(worlds, [scene.seconds])
-            middle = time.process_time()
-            run.backward(np.ones_like(ends), bodies=np.ones_like(run.body_poses))
-            taped[storage].append(middle - begin)
-            swept[storage].append(time.process_time() - middle)
-    per = scene.seconds * LANES
-    base = float(np.median(plain[1:]))
+            _start(solver, scene)
+            ends = timed(storage, "taped", lambda run=run: run.forward(worlds, [scene.seconds]))
+            by = {"positions": np.ones_like(ends), "bodies": np.ones_like(run.body_poses)}
+            for what, parts in (("backward", False), ("parts", True)):
+                found = timed(
+                    storage, what, lambda run=run, by=by, on=parts: run.backward(**by, parts=on)
+                )
+            counts = found.counts()
+    per = scene.seconds * scene.lanes
+    base = spent["", "plain"]
+    tape = [s.tape for s in runs["full"].recorder._segments if s.tape is not None]
+    used = sum(float((t.used() * runs["full"].recorder._room.sizes).sum()) for t in tape)
+    acted = sum(n for kind, n in counts.items() if kind not in NO_CONSTRAINTS)
     costs = []
     for storage, run in runs.items():
-        forward, backward = np.median(taped[storage][1:]), np.median(swept[storage][1:])
+        forward, backward, of_parts = (spent[storage, w] for w in ("taped", "backward", "parts"))
         costs.append(
             Cost(
                 scene=name,
                 storage=storage,
+                lanes=scene.lanes,
                 plain_ms=1e3 * base / per,
-                taped_ms=1e3 * float(forward) / per,
-                backward_ms=1e3 * float(backward) / per,
-                taped_ratio=float(forward) / base,
-                backward_ratio=float(backward) / base,
+                taped_ms=1e3 * forward / per,
+                backward_ms=1e3 * backward / per,
+                parts_ms=1e3 * of_parts / per,
+                taped_ratio=forward / base,
+                backward_ratio=backward / base,
+                whole_ratio=(forward + backward) / base,
+                whole_with_parts_ratio=(forward + of_parts) / base,
                 memory_mb=run.recorder.nbytes / 1e6 / per,
+                substep_bytes=used / (per / solver.config.dt),
+                gigabytes_per_second=used / (forward - base) / 1e9,
+                plain_ns=1e9 * base / acted,
+                backward_ns=1e9 * backward / acted,
             )
         )
     return costs
@@ -196,14 +250,14 @@ def _solver(scene: Scene) -> SolverFusedXPBD:
     for part in (one, builder):
         SolverFusedXPBD.register_custom_attributes(part)
     scene.add(one)
-    builder.replicate(one, LANES)
-    return SolverFusedXPBD(builder.finalize(device="cpu"), scene.solver, lanes=LANES)
+    builder.replicate(one, scene.lanes)
+    return SolverFusedXPBD(builder.finalize(device="cpu"), scene.solver, lanes=scene.lanes)
 
 
-def _start(solver: SolverFusedXPBD, scene: Scene, repeat: int) -> None:
+def _start(solver: SolverFusedXPBD, scene: Scene) -> None:
     solver.data.reset()
-    for world in range(LANES):
-        rng = np.random.default_rng([repeat, world])
+    for world in range(scene.lanes):
+        rng = np.random.default_rng(world)
         if solver.data.has_particles:
             solver.data.lane("particles.x", world)[:] = scene.start(rng)
             solver.data.lane("particles.v", world)[:] = 0.0
@@ -214,20 +268,20 @@ def _start(solver: SolverFusedXPBD, scene: Scene, repeat: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=6)
     parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
     options = parser.parse_args()
     quiet_warp()
     rows: list[Cost] = []
-    print("| scene | storage | plain | taped | backward | taped / plain | backward / plain | MB |")
+    print("| scene | storage | plain | taped | backward | whole / plain | with parts | MB |")
     print("|---|---|---|---|---|---|---|---|")
     for name in options.scenes:
         for cost in measure(name, options.repeats):
             rows.append(cost)
             print(
                 f"| {cost.scene} | {cost.storage} | {cost.plain_ms:.3f} | {cost.taped_ms:.3f} "
-                f"| {cost.backward_ms:.3f} | {cost.taped_ratio:.2f} | {cost.backward_ratio:.2f} "
-                f"| {cost.memory_mb:.2f} |",
+                f"| {cost.backward_ms:.3f} | {cost.whole_ratio:.2f} "
+                f"| {cost.whole_with_parts_ratio:.2f} | {cost.memory_mb:.2f} |",
                 flush=True,
             )
     if options.json:

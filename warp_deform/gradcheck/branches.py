@@ -20,9 +20,9 @@ def taken(run: DifferentiableRollout) -> list[np.ndarray]:
     one lane a group.
     """
     words: list[list[np.ndarray]] = []
-    for segment in run.recorder._segments:
-        arrays = segment.tape.arrays
-        whole, first, top = (arrays[name].numpy() for name in ("k", "first", "top"))
+    for tape in (segment.tape for segment in run.recorder._segments):
+        assert tape is not None
+        whole, first, top = (tape.arrays[name].numpy() for name in ("k", "first", "top"))
         words.append([whole[a:b].copy() for a, b in zip(first[:, 2], top[:, 2], strict=True)])
     return [np.concatenate(parts) for parts in zip(*words, strict=True)]
 

@@ -8,7 +8,7 @@ a ladder of steps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,9 +16,10 @@ from ..rollout.differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gr
 from ..rollout.rollouts import GripPath
 from ..support.quaternion import quat_by_rotation
 from ..worlds.worlds import Worlds
-from .branches import counted, taken
+from ..xpbd.packing.parts import PARTS, parts
 from .draws import Draw, touching_of
 from .limits import RATIO, central, kink
+from .rolls import ARM, Loss, put_back, roll
 
 __all__ = ["PARAMETERS", "RUNGS", "STEPS", "WORLDS", "Sample", "compare", "fired"]
 
@@ -36,17 +37,18 @@ STEPS = {
     "table_friction": 3e-2,
     "contact_friction": 3e-2,
     "stiffness": 0.3,
+    "spring_stiffness": 0.1,
+    "rest_lengths": 1e-7,
+    "radii": 1e-7,
 }
-"""Largest steps of the differences over a substep, in SI units (inverse masses: as a share of each;
-turns: as motion at `ARM`): far above rounding. Contacts are a micrometre deep, so the ladder leads
-down to where few directions cross a branch."""
+"""Largest steps of the differences over a substep, in SI units (inverse masses and stiffness of
+springs: as a share of each; turns: as motion at `ARM`): far above rounding. Contacts are a
+micrometre deep, so the ladder leads down to where few directions cross a branch."""
 PARAMETERS = tuple(STEPS)
 RUNGS = 5
 SMOOTH_RUNGS, DEEPEST = 3, 9
 """Where fewer than so many of the lowest rungs cross no branch, a ladder goes on downwards while
 rounding is below the bound, to so many rungs at most."""
-ARM = 0.05
-"""A turn moves a point so far from the centre by as much as a unit of position does [m]."""
 AIR = 1.0
 """What has no air is checked in this much [1/s]."""
 EPSILON = 2.2e-16
@@ -63,9 +65,9 @@ _GROWING = (
     "body_velocities",
     "body_inverse_masses",
     *WORLD_PARAMETERS,
+    *PARTS,
 )
 """Their effect grows with the length of the rollout, so steps shrink with it."""
-_OF_PATH = ("way_points", "knot_times", "knot_rotations")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,42 +98,6 @@ class Sample:
         return abs(self.ours - self.theirs) / self.scale
 
 
-@dataclass(frozen=True, eq=False)
-class _Loss:
-    """A random linear loss of positions [m] and steps (velocities times dt) at the end."""
-
-    positions: np.ndarray
-    velocities: np.ndarray
-    bodies: np.ndarray
-    body_velocities: np.ndarray
-
-    @staticmethod
-    def draw(worlds: Worlds, rng: np.random.Generator) -> _Loss:
-        data, dt = worlds.solver.data, worlds.solver.config.dt
-        particles = data.lane("particles.x", 0).shape
-        rows = data.body_rows(0)
-        bodies = rows.stop - rows.start
-        turn = np.array([1.0, 1.0, 1.0, *[2 * ARM] * 4])
-        return _Loss(
-            positions=rng.normal(size=particles),
-            velocities=rng.normal(size=particles) * dt,
-            bodies=rng.normal(size=(bodies, 7)) * turn,
-            body_velocities=rng.normal(size=(bodies, 6)) * dt * np.array([1.0] * 3 + [ARM] * 3),
-        )
-
-    def size(self) -> float:
-        """Length of its derivative by positions."""
-        return float(np.sqrt((self.positions**2).sum() + (self.bodies**2).sum()))
-
-    def change(self, ends: dict[str, np.ndarray], i: int, j: int) -> float:
-        """Between worlds: the difference of the ends first, as less is lost to rounding."""
-        return sum(float((vars(self)[n] * (ends[n][i] - ends[n][j])).sum()) for n in ends)
-
-    def backward(self, run: DifferentiableRollout, count: int) -> Gradients:
-        each = np.ones((count, 1, 1, 1))
-        return run.backward(**{name: each * by for name, by in vars(self).items()})
-
-
 def compare(
     run: DifferentiableRollout,
     worlds: Worlds,
@@ -152,7 +118,7 @@ def compare(
     for world in range(WORLDS):
         worlds.restore(world, draw.state)
     usual = float(worlds.solver.data.per_world("group.damping", 0)[0])
-    base, loss = _base(worlds, draw.path), _Loss.draw(worlds, rng)
+    base, loss = _base(worlds, draw.path), Loss.draw(worlds, rng)
     names = [
         name
         for name, value in base.items()
@@ -186,7 +152,7 @@ def _compare_some(
     draw: Draw,
     substeps: int,
     base: dict[str, np.ndarray],
-    loss: _Loss,
+    loss: Loss,
     names: Sequence[str],
     along: Sequence[np.ndarray],
     bound: float,
@@ -212,10 +178,8 @@ def _compare_some(
             step = steps[k] / RATIO**rung
             moved[name][2 * k + 1] = _moved(name, base[name], step * direction)
             moved[name][2 * k + 2] = _moved(name, base[name], -step * direction)
-        ends = _roll(run, worlds, draw, substeps, moved)
-        of_moved = loss.backward(run, count)
+        ends, words, counts, of_moved = roll(run, worlds, draw, substeps, moved, loss)
         gradients = gradients or of_moved
-        words, counts = taken(run), counted(of_moved.fired)
         middle = middle or (words[0], counts[0])
         for k in range(len(names)):
             pair = (2 * k + 1, 2 * k + 2)
@@ -225,7 +189,7 @@ def _compare_some(
                 np.array_equal(words[i], middle[0]) and (counts[i] == middle[1]).all()
                 for i in (0, *pair)
             )
-    _put_back(worlds, base)
+    put_back(worlds, base, WORLDS)
     assert gradients is not None
     growth = float(np.linalg.norm(gradients.positions[0])) / loss.size()
     samples = []
@@ -255,7 +219,7 @@ def _compare_some(
     return samples
 
 
-def _noise(loss: _Loss, second: np.ndarray) -> float:
+def _noise(loss: Loss, second: np.ndarray) -> float:
     """What rounding leaves of a loss, by second differences (n,) with the smallest steps: contacts
     magnify it, and these show hardly anything else.
     """
@@ -271,62 +235,6 @@ def _depths(
     most = np.floor(np.log(steps / finest) / np.log(RATIO)).astype(int) + 1
     crossed = ~same[-SMOOTH_RUNGS:].all(axis=0)
     return np.where(crossed, np.clip(most, RUNGS, DEEPEST), RUNGS)
-
-
-def _roll(
-    run: DifferentiableRollout,
-    worlds: Worlds,
-    draw: Draw,
-    substeps: int,
-    moved: dict[str, list[np.ndarray]],
-) -> dict[str, np.ndarray]:
-    """What the loss is of, in each world, from values of all parameters in each."""
-    data, dt, path = worlds.solver.data, worlds.solver.config.dt, draw.path
-    count = len(moved["damping"])
-    paths = {}
-    if path is not None:
-        for w in range(count):
-            paths[w] = replace(
-                path,
-                positions=moved["way_points"][w],
-                times=moved["knot_times"][w],
-                rotations=moved["knot_rotations"][w] if "knot_rotations" in moved else None,
-            )
-    for w in range(count):
-        _set_body_masses(worlds, w, moved["body_inverse_masses"][w])
-        touching_of(worlds, w)[:] = draw.touching
-    stacked = {name: np.stack(values) for name, values in moved.items() if name not in _OF_PATH}
-    ends = run.forward(
-        range(count),
-        [substeps * dt],
-        paths=paths,
-        positions=stacked["positions"],
-        velocities=stacked["velocities"],
-        body_poses=stacked["body_poses"],
-        body_velocities=stacked["body_velocities"],
-        parameters={n: stacked[n] for n in (*WORLD_PARAMETERS, "inverse_masses")},
-    )
-    return {
-        "positions": ends[:, 0],
-        "velocities": np.stack([data.lane("particles.v", w) for w in range(count)]),
-        "bodies": run.body_poses[:, 0],
-        "body_velocities": np.stack([data.body_poses(w)[1] for w in range(count)]),
-    }
-
-
-def _put_back(worlds: Worlds, base: dict[str, np.ndarray]) -> None:
-    """What `Worlds.restore` takes for granted."""
-    for w in range(WORLDS):
-        worlds.solver.set_world(w, **{n: float(base[n]) for n in WORLD_PARAMETERS})
-        for name in ("w0", "w"):
-            worlds.solver.data.lane(f"particles.{name}", w)[:] = base["inverse_masses"]
-        _set_body_masses(worlds, w, base["body_inverse_masses"])
-
-
-def _set_body_masses(worlds: Worlds, world: int, inverse: np.ndarray) -> None:
-    data = worlds.solver.data
-    for name in ("w0", "w"):
-        data.arrays[f"bodies.{name}"].view[data.body_rows(world)] = inverse
 
 
 def _base(worlds: Worlds, path: GripPath | None) -> dict[str, np.ndarray]:
@@ -349,6 +257,7 @@ def _base(worlds: Worlds, path: GripPath | None) -> dict[str, np.ndarray]:
     for name in WORLD_PARAMETERS:
         values[name] = data.per_world(f"group.{name}", 0).astype(float).reshape(())
     values["damping"] = np.maximum(values["damping"], AIR)
+    values |= {name: parts(data, 0, name).astype(float) for name in PARTS}
     return values
 
 
@@ -357,6 +266,8 @@ def _direction(name: str, base: np.ndarray, rng: np.random.Generator) -> np.ndar
     if name in WORLD_PARAMETERS:
         return np.minimum(1.0, base / (2 * STEPS[name]))  # they stay positive
     direction = rng.normal(size=(len(base), 6) if name == "body_poses" else base.shape)
+    if name in PARTS:
+        return direction * (base > 0)  # a bend around none stays one
     if name == "knot_times":
         direction[0] = 0.0  # paths start at time 0
     return direction
@@ -364,7 +275,7 @@ def _direction(name: str, base: np.ndarray, rng: np.random.Generator) -> np.ndar
 
 def _moved(name: str, base: np.ndarray, by: np.ndarray) -> np.ndarray:
     """`base` after a step in the units of directions."""
-    if name in ("inverse_masses", "body_inverse_masses"):
+    if name in _SHARES:
         return base * (1 + by)
     if name == "body_velocities":
         return base + by * _TWIST
@@ -378,8 +289,10 @@ def _moved(name: str, base: np.ndarray, by: np.ndarray) -> np.ndarray:
 def _gradient(gradients: Gradients, name: str, base: dict[str, np.ndarray]) -> np.ndarray:
     """Of world 0, in the units of directions."""
     value = np.asarray(getattr(gradients, name)[0])
-    if name in ("inverse_masses", "body_inverse_masses"):
+    if name in _SHARES:
         return value * base[name]
+    if name in PARTS:
+        return value * (base[name] > 0)
     if name == "body_velocities":
         return value * _TWIST
     if name == "body_poses":
@@ -390,4 +303,5 @@ def _gradient(gradients: Gradients, name: str, base: dict[str, np.ndarray]) -> n
     return value
 
 
+_SHARES = ("inverse_masses", "body_inverse_masses", "spring_stiffness")
 _TWIST = np.array([1.0] * 3 + [1 / ARM] * 3)

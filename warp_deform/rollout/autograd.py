@@ -14,13 +14,14 @@ from ..errors import InputError
 from ..objects.push import Push
 from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
+from ..xpbd.packing.parts import PARTS
 from .differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
 from .rollouts import GripPath
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
 
 _STATE = ("positions", "velocities", "body_poses", "body_velocities")
-_PARAMETERS = (*WORLD_PARAMETERS, "inverse_masses")
+_PARAMETERS = (*WORLD_PARAMETERS, "inverse_masses", *PARTS)
 _KNOTS = {"way_points": "positions", "knot_times": "times", "knot_rotations": "rotations"}
 """Tensors by the fields of `GripPath` that they stand for."""
 
@@ -59,6 +60,9 @@ def rollout_tensors(
     body_poses: torch.Tensor | None = None,
     body_velocities: torch.Tensor | None = None,
     inverse_masses: torch.Tensor | None = None,
+    spring_stiffness: torch.Tensor | None = None,
+    rest_lengths: torch.Tensor | None = None,
+    radii: torch.Tensor | None = None,
     damping: torch.Tensor | None = None,
     table_friction: torch.Tensor | None = None,
     contact_friction: torch.Tensor | None = None,
@@ -68,7 +72,7 @@ def rollout_tensors(
     knot_times: Mapping[int, torch.Tensor] | None = None,
     knot_rotations: Mapping[int, torch.Tensor] | None = None,
     pushes: Mapping[int, Sequence[Push]] | None = None,
-    storage: str = "replay",
+    storage: str = "auto",
     memory: int = 2**30,
     sleep: bool = True,
     until_rest: bool = False,
@@ -96,11 +100,15 @@ def rollout_tensors(
         velocities: of the particles at the start (W, P, 3) [m/s]
         body_poses: of the bodies' frames at the start (W, B, 7), position [m] and quat_xyzw
         body_velocities: twists at the start (W, B, 6), linear [m/s], angular [rad/s]
-        damping: (W,) [1/s]; this and the next four stay set
+        damping: (W,) [1/s]; this and the next seven stay set
         table_friction: (W,)
         contact_friction: (W,)
         stiffness: (W,)
         inverse_masses: (W, P) [1/kg]
+        spring_stiffness: of each spring (S,) [N/m], in the order of the model's. This and the next
+            two are those of all worlds of the topology, see `set_parts`
+        rest_lengths: of each spring (S,) [m]; strain limits and floors are shares of it
+        radii: of the particles (P,) [m]
         paths: by world
         way_points: by world (K, 3) [m], in place of the positions of its path
         knot_times: by world (K,) [s], in place of its times
@@ -129,6 +137,9 @@ def rollout_tensors(
         "body_poses": (body_poses, (count, bodies, 7)),
         "body_velocities": (body_velocities, (count, bodies, 6)),
         "inverse_masses": (inverse_masses, (count, particles)),
+        "spring_stiffness": (spring_stiffness, (len(top.spring_ij),)),
+        "rest_lengths": (rest_lengths, (len(top.spring_ij),)),
+        "radii": (radii, (particles,)),
         "damping": (damping, (count,)),
         "table_friction": (table_friction, (count,)),
         "contact_friction": (contact_friction, (count,)),
@@ -211,10 +222,15 @@ class _Rollout(torch.autograd.Function):
         positions, velocities, bodies, body_velocities = (
             None if given is None else given.detach().cpu().numpy() for given in cotangents
         )
-        gradients = ctx.run.backward(
-            positions, velocities, bodies=bodies, body_velocities=body_velocities
-        )
         wanted = ctx.needs_input_grad[3:]
+        needed = {key for key, need in zip(ctx.keys, wanted, strict=True) if need}
+        gradients = ctx.run.backward(
+            positions,
+            velocities,
+            bodies=bodies,
+            body_velocities=body_velocities,
+            parts=not needed.isdisjoint(("inverse_masses", *PARTS)),
+        )
         out = [
             torch.as_tensor(_by(gradients, key)).to(dtype=like[0], device=like[1]) if need else None
             for key, like, need in zip(ctx.keys, ctx.likes, wanted, strict=True)
@@ -228,4 +244,4 @@ def _by(gradients: Gradients, key: Any) -> np.ndarray:
         by_world: dict[int, np.ndarray] = getattr(gradients, key[0])
         return by_world[key[1]]
     value: np.ndarray = getattr(gradients, key)
-    return value
+    return value.sum(axis=0) if key in PARTS else value

@@ -15,6 +15,8 @@ from ..support.quaternion import quat_rotate_vjp, quat_tangent
 from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
 from ..xpbd.lanes.tape import Kind
+from ..xpbd.packing.parts import PARTS, set_parts
+from ..xpbd.recording.derivatives import spring_rows
 from ..xpbd.recording.recorder import Recorder
 from ..xpbd.springs.viscosity import DAMP_EVERY
 from .rollouts import GripPath, prepare
@@ -33,6 +35,9 @@ class Gradients:
         velocities: (W, P, 3), by the particles at the start
         inverse_masses: (W, P), by those of free particles; what is pinned, or while it is held, has
             none
+        radii: (W, P), by the radii of the particles
+        spring_stiffness: (W, S), by the stiffness of each spring, in the order of the model's
+        rest_lengths: (W, S), by their rest lengths; strain limits and floors are shares of these
         damping: (W,), by the parameters of the worlds
         table_friction: (W,), by the parameters of the worlds
         contact_friction: (W,), by the parameters of the worlds
@@ -50,6 +55,9 @@ class Gradients:
     positions: np.ndarray
     velocities: np.ndarray
     inverse_masses: np.ndarray
+    radii: np.ndarray
+    spring_stiffness: np.ndarray
+    rest_lengths: np.ndarray
     damping: np.ndarray
     table_friction: np.ndarray
     contact_friction: np.ndarray
@@ -88,7 +96,7 @@ class DifferentiableRollout:
         self,
         solver: FusedXPBD,
         *,
-        storage: str = "replay",
+        storage: str = "auto",
         memory: int = 2**30,
         sleep: bool = True,
         dt: float | None = None,
@@ -100,6 +108,7 @@ class DifferentiableRollout:
         )
         self.watch: list[WatchValues] = []
         self._worlds: list[int] = []
+        self._spring_rows = spring_rows(solver.data)
         self.times = np.zeros(0)
         self.velocities = np.zeros((0, 0, 0, 3))
         self.body_poses = np.zeros((0, 0, 0, 7))
@@ -135,8 +144,10 @@ class DifferentiableRollout:
                 None: as the worlds are
             body_velocities: twists at the start (W, B, 6), linear at the centre of mass [m/s],
                 angular [rad/s]; None: as the worlds are
-            parameters: by name "damping", "table_friction", "contact_friction", "stiffness" (W,) or
-                "inverse_masses" (W, P) [1/kg]; they stay set
+            parameters: by name "damping", "table_friction", "contact_friction", "stiffness" (W,),
+                "inverse_masses" (W, P) [1/kg], or what all worlds of this topology have in common:
+                "spring_stiffness" (S,) [N/m], "rest_lengths" (S,) [m], "radii" (P,) [m], see
+                `set_parts`; they stay set
             until_rest: worlds freeze once they rest, as in `rollout`; otherwise they run on
 
         Raises:
@@ -148,6 +159,7 @@ class DifferentiableRollout:
             raise InputError(
                 "derivatives are taken of worlds of one topology at a time, at least one"
             )
+        self._place()
         marks = [round(check_number(t, "times", POSITIVE) / dt) for t in times]
         self._marks = marks
         self.times = np.array(marks) * dt
@@ -204,6 +216,9 @@ class DifferentiableRollout:
 
     def _set(self, name: str, values: np.ndarray) -> None:
         data = self.solver.data
+        if name in PARTS:
+            set_parts(data, self._worlds[0], name, values)
+            return
         if name not in (*WORLD_PARAMETERS, "inverse_masses") or len(values) != len(self._worlds):
             raise InputError(
                 f"no parameter {name!r} of shape {values.shape} for {len(self._worlds)} worlds"
@@ -222,6 +237,7 @@ class DifferentiableRollout:
         *,
         bodies: np.ndarray | None = None,
         body_velocities: np.ndarray | None = None,
+        parts: bool = True,
     ) -> Gradients:
         """Derivatives of a loss from those by the positions (W, T, P, 3) and the velocities at the
         times of `forward`. May be called again with others.
@@ -230,6 +246,8 @@ class DifferentiableRollout:
             bodies: derivatives by `body_poses` (W, T, B, 7); what is across the sphere of unit
                 quaternions does not count
             body_velocities: derivatives by the twists (W, T, B, 6)
+            parts: False leaves those by single particles and springs out, which take longer: then
+                `inverse_masses`, `radii`, `spring_stiffness` and `rest_lengths` are not numbers
         """
         given = {"particles.x": positions, "particles.v": velocities}
         cotangents: dict[int, dict[str, np.ndarray]] = {}
@@ -240,7 +258,7 @@ class DifferentiableRollout:
                 if values is not None
             }
             self._body_cotangents(cotangents[mark], t, mark, bodies, body_velocities)
-        out = self.recorder.backward(cotangents)
+        out = self.recorder.backward(cotangents, parts=parts)
         knots = {
             name: {w: out[name][rows] for w, rows in self._knots.items()}
             for name in ("position", "time", "rotation")
@@ -249,6 +267,9 @@ class DifferentiableRollout:
             positions=self._worldwise(out["x"]),
             velocities=self._worldwise(out["v"]),
             inverse_masses=self._worldwise(out["mass"]),
+            radii=self._worldwise(out["radius"]),
+            spring_stiffness=self._of_springs(out["spring_stiffness"]),
+            rest_lengths=self._of_springs(out["rest"]),
             **{name: self._of_groups(out[name]) for name in WORLD_PARAMETERS},
             body_poses=self._by_frames(out["body.x"], out["body.q"]),
             body_velocities=np.concatenate(
@@ -279,7 +300,7 @@ class DifferentiableRollout:
 
     def _of_bodies(self, rows: np.ndarray) -> np.ndarray:
         """An array by row of bodies -> (W, B, ...)."""
-        return np.stack([rows[self.solver.data.body_rows(w)] for w in self._worlds])
+        return rows[self._bodies]
 
     def _body_cotangents(
         self,
@@ -321,29 +342,35 @@ class DifferentiableRollout:
             )
         return np.concatenate([by_x, by_q], axis=-1)
 
+    def _place(self) -> None:
+        """Where the arrays of groups hold the worlds' numbers."""
+        data = self.solver.data
+        slots = data.slot[self._worlds]
+        self._group, self._lane = np.divmod(slots, data.lanes)
+        top = data.topologies[data.world_topology[self._worlds[0]]]
+        first = data.group_particle[self._group]
+        self._particles = first[:, None] + np.arange(top.particle_count)
+        springs = np.array([self._spring_rows[g][0].start for g in self._group])
+        self._springs = springs[:, None] + np.arange(len(top.spring_ij))
+        bodies = data.group_body[self._group] + self._lane * top.body_count
+        self._bodies = bodies[:, None] + np.arange(top.body_count)
+
     def _worldwise(self, lanes: np.ndarray) -> np.ndarray:
         """An array of particles in lanes (P..., 3, L) or (P..., L) -> (W, P, 3) or (W, P)."""
-        data, rows = self.solver.data, []
-        for w in self._worlds:
-            group, lane = divmod(int(data.slot[w]), data.lanes)
-            first, last = data.group_particle[group : group + 2]
-            rows.append(lanes[first:last, ..., lane])
-        return np.stack(rows)
+        return lanes[self._particles, ..., self._lane[:, None]]
 
     def _lanewise(self, name: str, values: np.ndarray) -> np.ndarray:
-        data = self.solver.data
-        out = np.zeros_like(data.arrays[name].view)
-        for k, w in enumerate(self._worlds):
-            group, lane = divmod(int(data.slot[w]), data.lanes)
-            first, last = data.group_particle[group : group + 2]
-            out[first:last, ..., lane] = values[k]
+        out = np.zeros_like(self.solver.data.arrays[name].view)
+        out[self._particles, ..., self._lane[:, None]] = values
         return out
+
+    def _of_springs(self, lanes: np.ndarray) -> np.ndarray:
+        """An array of springs in lanes, see `spring_rows` -> (W, S)."""
+        return lanes[self._springs, self._lane[:, None]]
 
     def _of_groups(self, lanes: np.ndarray) -> np.ndarray:
         """An array (groups, ..., L) -> (W, ...)."""
-        data = self.solver.data
-        slots = [divmod(int(data.slot[w]), data.lanes) for w in self._worlds]
-        return np.stack([lanes[group, ..., lane] for group, lane in slots])
+        return lanes[self._group, ..., self._lane]
 
 
 def substep_vjp(

@@ -248,6 +248,50 @@ def test_memory_is_bounded() -> None:
     play(solver, {0: 0, 1: 1}, "replay", memory=1_000_000)
 
 
+def test_tapes_are_kept_while_they_fit_and_taped_again_from_there_on() -> None:
+    solver = cable_solver(1, 1, "float32")
+    found = {}
+    for memory in (2**28, 600_000):
+        set_state(solver, heap(3), 0 * heap(3))
+        run = DifferentiableRollout(solver, memory=memory)
+        run.forward([0], [0.2, 0.4])
+        kept = [segment.tape is not None for segment in run.recorder._segments]
+        found[all(kept)] = run.backward(np.ones((1, 2, SHORT.beads, 3)))
+        assert kept[0] and run.recorder.nbytes <= memory
+    assert set(found) == {True, False}
+    for name in ("positions", "velocities", "inverse_masses", "spring_stiffness", "radii", "fired"):
+        assert np.array_equal(getattr(found[True], name), getattr(found[False], name)), name
+
+
+def test_a_segment_that_takes_more_tape_than_it_was_thought_to_is_cut() -> None:
+    solver = cable_solver(1, 1, "float32")
+    found = []
+    for known in (True, False):
+        set_state(solver, heap(3), 0 * heap(3))
+        run = DifferentiableRollout(solver, storage="replay")
+        run.forward([0], [0.4, 0.41])
+        room, segments = run.recorder._room, len(run.recorder._segments)
+        assert room.use is not None
+        if not known:
+            room.use = 0.2 * room.use
+        found.append(run.backward(np.ones((1, 2, SHORT.beads, 3))))
+        assert (len(run.recorder._segments) > segments) == (not known)
+    for name in ("positions", "velocities", "inverse_masses", "spring_stiffness", "radii", "fired"):
+        assert np.array_equal(getattr(found[0], name), getattr(found[1], name)), name
+
+
+def test_parts_are_left_out_where_they_are_not_asked_for() -> None:
+    solver = cable_solver(1, 1, "float32")
+    run = DifferentiableRollout(solver)
+    set_state(solver, heap(3), 0 * heap(3))
+    by = np.ones_like(run.forward([0], [0.1]))
+    whole, rest = run.backward(by), run.backward(by, parts=False)
+    for name in ("inverse_masses", "radii", "spring_stiffness", "rest_lengths"):
+        assert getattr(whole, name).any() and np.isnan(getattr(rest, name)).all()
+    for name in ("positions", "velocities", "stiffness", "fired"):
+        assert np.array_equal(getattr(whole, name), getattr(rest, name))
+
+
 def test_what_cannot_be_differentiated_is_refused() -> None:
     solver = cable_solver(2, 1)
     with pytest.raises(InputError, match="storage"):

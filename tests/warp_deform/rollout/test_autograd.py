@@ -303,7 +303,7 @@ def test_what_has_no_derivative_is_refused_in_one_line() -> None:
             r"way_points of world 0 must have the shape \(3, 3\)",
             {"paths": {0: path}, "way_points": {0: x[0]}},
         ),
-        ("storage must be replay or full", {"storage": "disk"}),
+        ("storage must be auto, full or replay", {"storage": "disk"}),
         ("allow more memory", {"storage": "full", "memory": 10_000}),
     ):
         with pytest.raises(InputError, match=message) as error:
@@ -319,9 +319,10 @@ def test_what_has_no_derivative_is_refused_in_one_line() -> None:
 
 def test_the_example_of_the_docs_runs(tmp_path: Path) -> None:
     page = ROOT / "docs" / "gradients.md"
-    first, second = re.findall(r"```(?:python|py)\n(.*?)```", page.read_text(), re.DOTALL)
+    blocks = re.findall(r"```(?:python|py)\n(.*?)```", page.read_text(), re.DOTALL)
     program = tmp_path / "example.py"
-    program.write_text(first + second)
+    program.write_text("".join(blocks))
     names = runpy.run_path(str(program))
     assert names["knots"].grad.any() and names["friction"].grad.any()
     assert names["losses"][-1] < names["losses"][0]
+    assert names["factors"].grad[1] != 0 and names["lengths"].grad.any()

@@ -224,6 +224,10 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             put_scalar(adj.mass_flat, i, lane, get_mass(adj.mass_flat, i, lane) + g)
 
     @wp.func
+    def add_radius(i: int, lane: int, g: S, adj: Adjoint):
+        put_scalar(adj.radius_flat, i, lane, get_mass(adj.radius_flat, i, lane) + g)
+
+    @wp.func
     def sweep_box_particle(
         at: int,
         i: int,
@@ -274,7 +278,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         yielding = stands(particle.x[2], radius, down)
         if particle.w * yielding + bodies.w[b] > S(0.0):
             rub = shapes.friction[shape]
-            g, g_body, _box, g_mu, _radius, _recovery, _yielding, _p, _x, _q = wp.grad(
+            g, g_body, _box, g_mu, g_radius, _recovery, _yielding, _p, _x, _q = wp.grad(
                 contact_loss
             )(
                 particle,
@@ -291,6 +295,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             put(adj.x_flat, i, lane, g.x)
             put(adj.xp_flat, i, lane, get(adj.xp_flat, i, lane) + g.xp)
             add_mass(i, lane, particle.w, g.w, adj)
+            add_radius(i, lane, g_radius, adj)
             add_to_body(b, body.w, g_body, ba)
             by_mu = g_mu * rub
         return by_mu
@@ -307,4 +312,5 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         box_value=box_value,
         add_to_body=add_to_body,
         add_mass=add_mass,
+        add_radius=add_radius,
     )

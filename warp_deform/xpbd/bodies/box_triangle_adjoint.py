@@ -45,6 +45,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     BodyValue, BoxValue = particle_.BodyValue, particle_.BoxValue
     taped_body, box_value = particle_.taped_body, particle_.box_value
     add_to_body, add_mass = particle_.add_to_body, particle_.add_mass
+    add_radius = particle_.add_radius
     tape_ = tape(scalar, lanes)
     record_pose, position = tape_.record_pose, tape_.position
 
@@ -371,7 +372,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             after.c = get(adj.x_flat, ic, lane)
             after.x = ba.x[b]
             after.q = ba.q[b]
-            g, g_body, _box, g_mu, _radius, _recovery, _kind, _apart, _yielding, _after = wp.grad(
+            g, g_body, _box, g_mu, g_radius, _recovery, _kind, _apart, _yielding, _after = wp.grad(
                 contact_loss
             )(corners, body, box, mu * rub, radius, max_recovery, which, apart, yielding, after)
             put(adj.x_flat, ia, lane, g.a)
@@ -383,6 +384,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             add_mass(ia, lane, wa, g.wa, adj)
             add_mass(ib, lane, wb, g.wb, adj)
             add_mass(ic, lane, wc, g.wc, adj)
+            add_radius(ia, lane, g_radius, adj)
             add_to_body(b, body.w, g_body, ba)
             by_mu = g_mu * rub
         return by_mu

@@ -31,15 +31,18 @@ __all__ = ["sphere_contact", "sphere_contact_adjoint"]
 
 
 @functools.cache
-def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
+def sphere_contact(scalar: Any, lanes: int, taped: bool = False) -> SimpleNamespace:
     """`list_near` makes the list of a group, `project_contact` solves one of its pairs.
+
+    It returns whether the pair acted. `taped`, it then leaves its offset d and its step since the
+    substep began on the tape.
 
     A correction may stop an approach, but it separates a pair at `recovery` at most, counting what
     already separates it: an overlap that takes many substeps to undo does not gather speed.
     """
     t = structures(scalar, lanes)
-    S, V = t.S, t.V
-    Pairs, Particles, Near, Watch = t.Pairs, t.Particles, t.Near, t.Watch
+    S, V, V3 = t.S, t.V, t.V3
+    Pairs, Particles, Near, Watch, Tape = t.Pairs, t.Particles, t.Near, t.Watch, t.Tape
     coulomb_soft = friction(scalar, lanes).coulomb_soft
 
     @wp.func
@@ -91,7 +94,15 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 
     @wp.func
     def project_contact(
-        k: int, p0: int, mu: V, max_recovery: S, particles: Particles, pairs: Pairs, near: Near
+        k: int,
+        p0: int,
+        at: int,
+        mu: V,
+        max_recovery: S,
+        particles: Particles,
+        pairs: Pairs,
+        near: Near,
+        tape: Tape,
     ):
         pair = near.pair[k]
         ij = pairs.ij[pair]
@@ -102,8 +113,9 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         xj = particles.x[j]
         d = xi - xj
         l2 = dot(d, d)
+        zero = V(S(0.0))
+        depth = zero
         if any_less(l2, h * h):
-            zero = V(S(0.0))
             one = V(S(1.0))
             tiny = V(S(1.0e-9))
             l = wp.max(root(l2), tiny)
@@ -120,6 +132,16 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
             step = n * (depth * share) - slip * (f * share)
             particles.x[i] = xi + step * wi
             particles.x[j] = xj - step * wj
+            if wp.static(taped):
+                # what is not listed for a lane's own sake is apart there
+                listed = near.mask[k]
+                tape.x[at] = V3(
+                    select(listed, d.x, V(h + h)),
+                    select(listed, d.y, zero),
+                    select(listed, d.z, zero),
+                )
+                tape.x[at + 1] = moved
+        return any_less(zero - depth, S(0.0))
 
     @wp.func
     def touches(
@@ -150,47 +172,16 @@ def sphere_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 
 @functools.cache
 def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`record_contact` solves a pair and leaves its offset d, its step since the substep began and
-    its mask on the tape, or returns False where it does not touch. `sweep_contact` takes it back
-    and returns the derivative by friction.
+    """`sweep_contact` takes a pair back that had the offset d and had `moved` since the substep
+    began, and returns the derivative by friction.
 
     Branches: apart or touching; depth limited by the overlap or by `recovery` (then its derivative
     is that of the approach, or 0 while the pair separates as fast as it may).
     """
     t = structures(scalar, lanes)
     S, V, V3 = t.S, t.V, t.V3
-    Pairs, Particles, Near, Tape, Adjoint = t.Pairs, t.Particles, t.Near, t.Tape, t.Adjoint
-    project_contact = sphere_contact(scalar, lanes).project_contact
+    Pairs, Adjoint = t.Pairs, t.Adjoint
     coulomb_soft_gradients = friction_adjoint(scalar, lanes).coulomb_soft_gradients
-
-    @wp.func
-    def record_contact(
-        k: int,
-        p0: int,
-        at: int,
-        at_mask: int,
-        mu: V,
-        max_recovery: S,
-        particles: Particles,
-        pairs: Pairs,
-        near: Near,
-        tape: Tape,
-    ):
-        pair = near.pair[k]
-        ij = pairs.ij[pair]
-        h = pairs.distance[pair]
-        i = p0 + ij[0]
-        j = p0 + ij[1]
-        xi = particles.x[i]
-        xj = particles.x[j]
-        d = xi - xj
-        touching = any_less(dot(d, d), h * h)
-        if touching:
-            tape.x[at] = d
-            tape.x[at + 1] = (xi - particles.xp[i]) - (xj - particles.xp[j])
-            tape.v[at_mask] = near.mask[k]
-            project_contact(k, p0, mu, max_recovery, particles, pairs, near)
-        return touching
 
     @wp.func
     def sweep_contact(
@@ -198,7 +189,6 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         p0: int,
         d: V3,
         moved: V3,
-        mask: V,
         mu: V,
         max_recovery: S,
         pairs: Pairs,
@@ -218,7 +208,7 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         inverse = one / l
         n = d * inverse
         approach = dot(moved, n)
-        overlap = wp.max(V(h) - l, zero) * mask
+        overlap = wp.max(V(h) - l, zero)
         allowed = wp.max(V(max_recovery) - approach, zero)
         depth = wp.min(overlap, allowed)
         acts = less(zero, depth)
@@ -247,7 +237,7 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             of_b = by_n * (depth * share + held * approach)
             held_along = held - share * slowed
             rubs_slowed = rubs * slowed
-            overlaps = (one - slowed) * mask * parted
+            overlaps = (one - slowed) * parted
             slip_along = by_n * held_along
             slip_across = by_n * (rubs_slowed + turns * approach) - turns
             n_along = held_along - of_b - share * overlaps
@@ -267,14 +257,18 @@ def sphere_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             g_moved = g_moved - b * held
             adj.xp[i] = adj.xp[i] - g_moved
             adj.xp[j] = adj.xp[j] + g_moved
-            step = n * depth - slip * f
-            ei = dot(step, gi)
-            ej = dot(step, gj)
-            gw = (ej * wj_acts - ei * wi_acts) * (share * share)
-            given = share * acts
-            adj.mass[i] = adj.mass[i] + select(wi, gw + ei * given, zero)
-            adj.mass[j] = adj.mass[j] + select(wj, gw - ej * given, zero)
+            if adj.parts > 0:
+                step = n * depth - slip * f
+                ei = dot(step, gi)
+                ej = dot(step, gj)
+                gw = (ej * wj_acts - ei * wi_acts) * (share * share)
+                given = share * acts
+                adj.mass[i] = adj.mass[i] + select(wi, gw + ei * given, zero)
+                adj.mass[j] = adj.mass[j] + select(wj, gw - ej * given, zero)
+                by_overlap = (share * along - rubs * across) * (one - slowed)
+                adj.radius[i] = adj.radius[i] + by_overlap
+                adj.radius[j] = adj.radius[j] + by_overlap
             by_mu = zero - across * share * by_budget * depth
         return by_mu
 
-    return SimpleNamespace(record_contact=record_contact, sweep_contact=sweep_contact)
+    return SimpleNamespace(sweep_contact=sweep_contact)

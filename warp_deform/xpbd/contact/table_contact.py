@@ -15,7 +15,9 @@ __all__ = ["table_contact", "table_contact_adjoint"]
 
 
 @functools.cache
-def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
+def table_contact(
+    scalar: Any, lanes: int, with_sheets: bool = False, taped: bool = False
+) -> SimpleNamespace:
     """`predict` begins a substep for a particle, `finish` ends it.
 
     `finish` pushes the particle out of the table, applies Coulomb friction to its horizontal step,
@@ -24,10 +26,11 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     `stepped` is the whole step: the predicted one and what constraints have changed since. It is
     not taken as the difference of two positions, which far from the origin is as coarse as they
     are: the predicted position is rounded the same way twice, so what nothing touched keeps its
-    velocity.
+    velocity. `taped`, `finish` leaves it and the height on the tape (with fabrics: the position,
+    that at the start of the substep, and the old velocity).
     """
     t = structures(scalar, lanes)
-    S, V, V3, Particles = t.S, t.V, t.V3, t.Particles
+    S, V, V3, Particles, Tape = t.S, t.V, t.V3, t.Particles, t.Tape
     coulomb = friction(scalar, lanes).coulomb
 
     @wp.func
@@ -39,6 +42,8 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def finish(
         i: int,
+        at: int,
+        at_height: int,
         radius: S,
         inverse_dt: S,
         damped_dt: V,
@@ -48,13 +53,22 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         all_on: bool,
         on: V,
         particles: Particles,
+        tape: Tape,
     ):
         x = particles.x[i]
         o = particles.xp[i]
         zero = V(S(0.0))
         # as `stepped` says, and written out, for what is no longer inlined costs half as much again
-        d = (particles.v[i] + fall) * select(particles.w[i], damped_dt, zero)
+        old = particles.v[i]
+        d = (old + fall) * select(particles.w[i], damped_dt, zero)
         d = d + (x - (o + d))
+        if wp.static(taped and with_sheets):
+            tape.x[at] = x
+            tape.x[at + 1] = o
+            tape.x[at + 2] = old
+        elif wp.static(taped):
+            tape.x[at] = d
+            tape.v[at_height] = x.z
         if any_less(x.z, radius):
             depth = select(particles.w[i], wp.max(V(radius) - x.z, zero), zero)
             f = coulomb(d.x * d.x + d.y * d.y, depth * mu)
@@ -67,9 +81,8 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
         if any_less(fastest * fastest - moved2, S(0.0)):
             v = v * wp.min(V(S(1.0)), fastest / wp.max(root(moved2), V(S(1.0e-12))))
         if not all_on:
-            u = particles.v[i]
             x = V3(select(on, x.x, o.x), select(on, x.y, o.y), select(on, x.z, o.z))
-            v = V3(select(on, v.x, u.x), select(on, v.y, u.y), select(on, v.z, u.z))
+            v = V3(select(on, v.x, old.x), select(on, v.y, old.y), select(on, v.z, old.z))
             moved2 = moved2 * on
         particles.x[i] = x
         particles.v[i] = v
@@ -86,49 +99,17 @@ def table_contact(scalar: Any, lanes: int) -> SimpleNamespace:
 
 @functools.cache
 def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) -> SimpleNamespace:
-    """`record_finish` ends a substep and leaves a particle's step and height on the tape (with
-    fabrics: its position, that at the start of the substep, and its old velocity).
-
-    `sweep_finish` takes that back, and with it the prediction of the next substep (`again`), whose
-    velocity it finds. Returns the derivatives by friction and by the share of velocity that air
-    damping keeps. `sweep_predict` takes back a prediction alone.
+    """`sweep_finish` takes the end of a substep back, and with it the prediction of the next one
+    (`again`), whose velocity it finds. Returns the derivatives by friction and by the share of
+    velocity that air damping keeps. `sweep_predict` takes back a prediction alone.
 
     Branches: above or on the table (its correction acts on z only, friction across), the speed
     clamp, and lanes that are frozen. Sticking is the smooth end of friction, no branch.
     """
     t = structures(scalar, lanes)
-    S, V, V3 = t.S, t.V, t.V3
-    Particles, Tape, Adjoint = t.Particles, t.Tape, t.Adjoint
-    finish, stepped = table_contact(scalar, lanes).finish, table_contact(scalar, lanes).stepped
+    S, V, V3, Adjoint = t.S, t.V, t.V3, t.Adjoint
+    stepped = table_contact(scalar, lanes).stepped
     coulomb_gradients = friction_adjoint(scalar, lanes).coulomb_gradients
-
-    @wp.func
-    def record_finish(
-        i: int,
-        at: int,
-        at_height: int,
-        radius: S,
-        inverse_dt: S,
-        damped_dt: V,
-        fall: V3,
-        mu: V,
-        fastest: V,
-        all_on: bool,
-        on: V,
-        particles: Particles,
-        tape: Tape,
-    ):
-        if wp.static(with_sheets):
-            tape.x[at] = particles.x[i]
-            tape.x[at + 1] = particles.xp[i]
-            tape.x[at + 2] = particles.v[i]
-        else:
-            x = particles.x[i]
-            tape.x[at] = stepped(
-                x, particles.xp[i], particles.w[i], particles.v[i], damped_dt, fall
-            )
-            tape.v[at_height] = x.z
-        return finish(i, radius, inverse_dt, damped_dt, fall, mu, fastest, all_on, on, particles)
 
     @wp.func
     def sweep_finish(
@@ -209,6 +190,8 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
             gx = d.x * turn - g.x * share
             gy = d.y * turn - g.y * share
             gz = down * (g.z + g_budget * mu)
+            if adj.parts > 0:
+                adj.radius[i] = adj.radius[i] + gz
             by_mu = g_budget * depth
             g = V3(g.x + gx, g.y + gy, g.z - gz)
             go = V3(go.x - gx, go.y - gy, go.z)
@@ -227,7 +210,6 @@ def table_contact_adjoint(scalar: Any, lanes: int, with_sheets: bool = False) ->
         return dot(g, v + fall) * free
 
     return SimpleNamespace(
-        record_finish=record_finish,
         sweep_finish=sweep_finish,
         sweep_predict=sweep_predict,
         stepped=stepped,

@@ -8,7 +8,7 @@ import warp as wp
 
 from ..bodies.rigid_body import rigid_body
 from ..bodies.rigid_body_adjoint import rigid_body_adjoint
-from ..contact.table_contact import table_contact, table_contact_adjoint
+from ..contact.table_contact import table_contact
 from ..lanes.algebra import add, dot, less, mul, root, select, sub  # noqa: F401
 from ..lanes.group_state import group_state
 from ..lanes.tape import BODY_SCALARS
@@ -30,8 +30,7 @@ def finishes(
     S, V, R3, L = t.S, t.V, t.R3, t.L
     Span, Pace, Run, Settings, Topology = t.Span, t.Pace, t.Run, t.Settings, t.Topology
     Particles, Springs, Bodies, Tape = t.Particles, t.Springs, t.Bodies, t.Tape
-    finish = table_contact(scalar, lanes).finish
-    record_finish = table_contact_adjoint(scalar, lanes, with_sheets).record_finish
+    finish = table_contact(scalar, lanes, with_sheets, taped).finish
     damp_fabrics = viscosity(scalar, lanes).damp_fabrics
     record_damping = viscosity_adjoint(scalar, lanes).record_damping
     rest_fabrics = sleep(scalar, lanes, taped).rest_fabrics
@@ -65,41 +64,26 @@ def finishes(
         moved2 = zero
         for i in range(at.particles):
             radius = top.radius[at.radii + i]
-            ended2 = zero
-            if wp.static(taped):
-                ended2 = record_finish(
-                    at.p0 + i,
-                    tops[0],
-                    tops[1],
-                    radius,
-                    pace.inverse_dt,
-                    pace.damped_dt,
-                    pace.fall,
-                    pace.table_mu,
-                    fastest,
-                    all_on,
-                    run.on,
-                    particles,
-                    tape,
-                )
-                if wp.static(with_sheets):
-                    tops[0] += 3
-                else:
-                    tops[0] += 1
-                    tops[1] += 1
-            else:
-                ended2 = finish(
-                    at.p0 + i,
-                    radius,
-                    pace.inverse_dt,
-                    pace.damped_dt,
-                    pace.fall,
-                    pace.table_mu,
-                    fastest,
-                    all_on,
-                    run.on,
-                    particles,
-                )
+            ended2 = finish(
+                at.p0 + i,
+                tops[0],
+                tops[1],
+                radius,
+                pace.inverse_dt,
+                pace.damped_dt,
+                pace.fall,
+                pace.table_mu,
+                fastest,
+                all_on,
+                run.on,
+                particles,
+                tape,
+            )
+            if wp.static(taped and with_sheets):
+                tops[0] += 3
+            elif wp.static(taped):
+                tops[0] += 1
+                tops[1] += 1
             moved2 = wp.max(moved2, ended2)
         unrest2 = zero
         drowsy = one

@@ -40,8 +40,8 @@ def forward_kernel(
 
     `with_bodies` False leaves the code of rigid bodies out, which halves the compile time;
     `with_sheets` False that of triangles, `with_edges` False that of their edges, `with_lines`
-    False that of direct solves. `taped` leaves a tape for the backward sweep (see `tape`) and can
-    continue a launch, to the same bits.
+    False that of direct solves. `taped` leaves a tape for the backward sweep (see `tape`). With or
+    without one, a launch can continue another, to the same bits.
     """
     t = group_state(scalar, lanes)
     S, V = t.S, t.V
@@ -91,19 +91,17 @@ def forward_kernel(
         at = span_of(g, top, group, sheets)
         pace = pace_of(g, st, group)
         most = group.most_steps[g]
-        begins = bool(True)
-        if wp.static(taped):
-            begins = tape.resume == 0
+        begins = tape.resume == 0
         run = Run()
         if begins:
             run = begin(at, st, group, particles, bodies, grips, cells)
         # the table hides at once that a particle started under it
         watch_group(at, springs, shapes, group, particles, bodies, watch)
+        if not begins:
+            run = load_state(g, tape)
         tops = wp.vec4i()
         if wp.static(taped):
             tops = tape.first[g]
-            if not begins:
-                run = load_state(g, tape)
             if wp.static(not with_sheets):
                 for i in range(at.particles):
                     tape.x[tops[0]] = particles.v[at.p0 + i]
@@ -190,12 +188,12 @@ def forward_kernel(
         watch_group(at, springs, shapes, group, particles, bodies, watch)
         watch.steps[g] = run.steps
         watch.clamped[g] = run.clamped
-        ends = bool(True)
-        if wp.static(taped):
+        if tape.part > 0:
             save_state(g, run, tape)
+        if wp.static(taped):
             tape.steps[g] = tape.steps[g] + run.substep
             tape.until[g] = run.substep
-            ends = tape.last > 0
+        ends = tape.part == 0 or tape.last > 0
         end(at, run, ends, tops, particles, bodies, grips, cells, tape)
 
     return forward

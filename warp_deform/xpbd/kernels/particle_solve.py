@@ -9,16 +9,16 @@ import warp as wp
 from ...objects.attributes import SpringMode
 from ..contact.edge_contact import edge_contact
 from ..contact.edge_contact_adjoint import edge_contact_adjoint
-from ..contact.sphere_contact import sphere_contact, sphere_contact_adjoint
+from ..contact.sphere_contact import sphere_contact
 from ..contact.triangle_contact import triangle_contact
 from ..contact.triangle_contact_adjoint import triangle_contact_adjoint
 from ..lanes.algebra import any_less, mul, sub  # noqa: F401  (operators are found by name)
 from ..lanes.group_state import group_state
 from ..lanes.tape import TRIANGLE_SCALARS, TRIANGLE_WORDS
 from ..springs.beam import beam, beam_adjoint
-from ..springs.bending import bending, bending_adjoint
+from ..springs.bending import bending
 from ..springs.chain import chain, chain_adjoint
-from ..springs.distance import distance, distance_adjoint
+from ..springs.distance import distance
 from ..springs.tether import tether, tether_adjoint
 
 __all__ = ["particle_solve"]
@@ -33,16 +33,13 @@ def particle_solve(
     """
     t = group_state(scalar, lanes)
     S, V, L = t.S, t.V, t.L
-    project_distance = distance(scalar, lanes, with_sheets).project_distance
-    record_distance = distance_adjoint(scalar, lanes, with_sheets).record_distance
-    project_bend = bending(scalar, lanes).project_bend
-    record_bend = bending_adjoint(scalar, lanes).record_bend
+    project_distance = distance(scalar, lanes, with_sheets, taped).project_distance
+    project_bend = bending(scalar, lanes, taped).project_bend
     project_chain = chain(scalar, lanes).project_chain
     record_chain = chain_adjoint(scalar, lanes).record_chain
     project_beam = beam(scalar, lanes).project_beam
     record_beam = beam_adjoint(scalar, lanes).record_beam
-    project_contact = sphere_contact(scalar, lanes).project_contact
-    record_contact = sphere_contact_adjoint(scalar, lanes).record_contact
+    project_contact = sphere_contact(scalar, lanes, taped).project_contact
     project_tether = tether(scalar, lanes).project_tether
     record_tether = tether_adjoint(scalar, lanes).record_tether
     project_triangles = triangle_contact(scalar, lanes).project_triangles
@@ -86,22 +83,18 @@ def particle_solve(
                         tx += count
                     else:
                         project_beam(s, count, p0, inverse_dt2, particles, springs, lines)
-            if not direct:
+            if not direct and springs.mode[s] == wp.static(int(SpringMode.BEND)):
+                project_bend(s, p0, tx, inverse_dt2, particles, springs, tape)
                 if wp.static(taped):
-                    if springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                        record_bend(s, p0, tx, inverse_dt2, particles, springs, tape)
+                    tx += 1
+            elif not direct:
+                acted = project_distance(s, p0, tx, inverse_dt2, particles, springs, tape)
+                if wp.static(taped):
+                    if acted:
                         tx += 1
-                    else:
-                        acted = record_distance(s, p0, tx, inverse_dt2, particles, springs, tape)
-                        if acted:
-                            tx += 1
-                            if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
-                                tape.k[tk] = s
-                                tk += 1
-                elif springs.mode[s] == wp.static(int(SpringMode.BEND)):
-                    project_bend(s, p0, inverse_dt2, particles, springs)
-                else:
-                    project_distance(s, p0, inverse_dt2, particles, springs)
+                        if springs.mode[s] != wp.static(int(SpringMode.EQUAL)):
+                            tape.k[tk] = s
+                            tk += 1
         if wp.static(taped):
             tape.k[tk] = tk - mark
             tk += 1
@@ -136,7 +129,6 @@ def particle_solve(
         holding = run.holding
         on = run.on
         tx = int(tops[0])
-        tv = int(tops[1])
         tk = int(tops[2])
         ts = int(tops[3])
         mark = int(tk)
@@ -180,16 +172,14 @@ def particle_solve(
         if wp.static(taped):
             mark = int(tk)
         for c in range(at.near0, at.near0 + run.near_count):
+            acted = project_contact(
+                c, p0, tx, contact_mu, max_recovery, particles, pairs, near, tape
+            )
             if wp.static(taped):
-                if record_contact(
-                    c, p0, tx, tv, contact_mu, max_recovery, particles, pairs, near, tape
-                ):
+                if acted:
                     tape.k[tk] = near.pair[c]
                     tx += 2
-                    tv += 1
                     tk += 1
-            else:
-                project_contact(c, p0, contact_mu, max_recovery, particles, pairs, near)
         if wp.static(taped):
             tape.k[tk] = tk - mark
             tk += 1
@@ -255,6 +245,6 @@ def particle_solve(
                                 project_edges(
                                     at.g, lane, p0, at.radii, max_recovery, top, sheets, cells
                                 )
-        return wp.vec4i(tx, tv, tk, ts)
+        return wp.vec4i(tx, tops[1], tk, ts)
 
     return SimpleNamespace(solve_particles=solve_particles)

@@ -172,13 +172,11 @@ def sweeps(
         adj: Adjoint,
     ):
         tx = int(tops[0])
-        tv = int(tops[1])
         tk = int(tops[2])
         by_contact = by.contact
         tk -= 1
         for _ in range(tape.k[tk]):
             tk -= 1
-            tv -= 1
             tx -= 2
             fetch_ahead(tape.x, tx - now.ahead, wp.static(2 * BYTES))
             by_contact = by_contact + sweep_contact(
@@ -186,7 +184,6 @@ def sweeps(
                 at.p0,
                 tape.x[tx],
                 tape.x[tx + 1],
-                tape.v[tv],
                 pace.contact_mu,
                 pace.max_recovery,
                 pairs,
@@ -195,7 +192,7 @@ def sweeps(
                 adj,
             )
         by.contact = by_contact
-        return by, wp.vec4i(tx, tv, tk, tops[3])
+        return by, wp.vec4i(tx, tops[1], tk, tops[3])
 
     @wp.func
     def sweep_springs(
@@ -218,6 +215,7 @@ def sweeps(
             share = S(at.passes)
             passes = at.passes
         inverse_dt2 = pace.inverse_dt2 * share
+        own = adj.spring_first[at.g]
         for _ in range(passes):
             tk -= 1
             left = tape.k[tk]
@@ -234,6 +232,7 @@ def sweeps(
                         if count > 0 and mode == wp.static(int(SpringMode.CHAIN)):
                             by_inverse_dt2 = by_inverse_dt2 + share * sweep_chain(
                                 s,
+                                own + s,
                                 count,
                                 at.p0,
                                 tx,
@@ -247,12 +246,21 @@ def sweeps(
                             )
                         elif count > 0:
                             by_inverse_dt2 = by_inverse_dt2 + share * sweep_beam(
-                                s, count, at.p0, tx, inverse_dt2, springs, lines, tape, adj
+                                s,
+                                own + s,
+                                count,
+                                at.p0,
+                                tx,
+                                inverse_dt2,
+                                springs,
+                                lines,
+                                tape,
+                                adj,
                             )
                 if not direct and mode == wp.static(int(SpringMode.BEND)):
                     tx -= 1
                     by_inverse_dt2 = by_inverse_dt2 + share * sweep_bend(
-                        s, at.p0, tape.x[tx], inverse_dt2, springs, adj
+                        s, own + s, at.p0, tape.x[tx], inverse_dt2, springs, adj
                     )
                 elif not direct:
                     acted = mode == wp.static(int(SpringMode.EQUAL))
@@ -265,7 +273,15 @@ def sweeps(
                         tx -= 1
                         fetch_ahead(tape.x, tx - now.ahead, wp.static(BYTES))
                         by_inverse_dt2 = by_inverse_dt2 + share * sweep_distance(
-                            s, at.p0, tape.x[tx], inverse_dt2, springs, now.counts, now.on, adj
+                            s,
+                            own + s,
+                            at.p0,
+                            tape.x[tx],
+                            inverse_dt2,
+                            springs,
+                            now.counts,
+                            now.on,
+                            adj,
                         )
         by.inverse_dt2 = by_inverse_dt2
         return by, wp.vec4i(tx, tops[1], tk, tops[3])

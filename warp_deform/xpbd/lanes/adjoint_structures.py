@@ -24,6 +24,7 @@ def adjoint_structures(scalar: Any, lanes: int) -> SimpleNamespace:
     class Tape:
         """What a taped launch leaves for the backward sweep: four stacks per group (see `tape`)."""
 
+        part: int  # 1: the launch is a part of a rollout; also where no stack has room
         resume: int  # 1: the launch continues a rollout where `state` and `counters` left it
         last: int  # 1: the rollout ends with the launch
         x: wp.array(dtype=V3)
@@ -50,6 +51,12 @@ def adjoint_structures(scalar: Any, lanes: int) -> SimpleNamespace:
         xp: wp.array(dtype=V3)  # by position at the start of the substep
         w: wp.array(dtype=V)  # not a derivative: inverse masses as they were in the substep
         mass: wp.array(dtype=V)  # by free inverse mass
+        parts: int  # 1: `mass` and the next three are wanted, which takes longer
+        radius: wp.array(dtype=V)  # of particles
+        # by spring, at the number of a spring + the group's `spring_first`
+        spring_first: wp.array(dtype=int)
+        softness: wp.array(dtype=V)  # compliance, times `Pace.inverse_dt2` of a pass
+        rest: wp.array(dtype=V)  # rest length
         # scratch of `viscosity`: positions, velocities, derivatives, and these over the masses
         then_x: wp.array(dtype=V3)
         then_v: wp.array(dtype=V3)
@@ -71,6 +78,7 @@ def adjoint_structures(scalar: Any, lanes: int) -> SimpleNamespace:
         xp_flat: wp.array(dtype=S)
         w_flat: wp.array(dtype=S)
         mass_flat: wp.array(dtype=S)
+        radius_flat: wp.array(dtype=S)
 
     @wp.struct
     class BodyAdjoint:

@@ -116,7 +116,7 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
         words += wp.static(2 * L * (GRIP_WORDS + 4) + 8) + wp.static(BODY_WORDS) * (bodies + solid)
         return (
             tops[0] + 2 * springs + 6 * particles + 2 * near <= end[0]
-            and tops[1] + near + particles + 8 <= end[1]
+            and tops[1] + particles + 8 <= end[1]
             and tops[2] + words <= end[2]
             and tops[3]
             + wp.static(TRIANGLE_SCALARS) * listed

@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-__all__ = ["Mirrored"]
+__all__ = ["Mirrored", "aligned"]
+
+_LINE = 64
+"""Bytes of a line of the processor's cache; a lane vector that lies in two is read twice."""
+
+
+def aligned(count: int, dtype: Any, *, zero: bool = False) -> tuple[Any, np.ndarray]:
+    """A Warp array on the CPU that begins with a line of the cache, and its bytes.
+
+    NumPy allocates it, which asks for large pages for what is large. Without `zero` it holds
+    anything.
+    """
+    size = wp.types.type_size_in_bytes(dtype) * count
+    memory = (np.zeros if zero else np.empty)(size + _LINE, dtype=np.uint8)
+    start = -memory.ctypes.data % _LINE
+    memory = memory[start : start + size]
+    array = wp.array(ptr=memory.ctypes.data, dtype=dtype, shape=(count,), device="cpu")
+    array._bytes = memory  # they live as long as the array
+    return array, memory
 
 
 class Mirrored:
@@ -17,12 +34,9 @@ class Mirrored:
     def __init__(
         self, count: int, dtype: Any, device: Any, scalar: Any, shape: tuple[int, ...]
     ) -> None:
-        self._host = wp.zeros(max(count, 1), dtype=dtype, device="cpu")
+        self._host, memory = aligned(max(count, 1), dtype, zero=True)
         self.array = self._host if device.is_cpu else wp.zeros_like(self._host, device=device)
-        shape = (max(count, 1), *shape)
-        size = int(np.prod(shape)) * np.dtype(scalar).itemsize
-        buffer = (ctypes.c_byte * size).from_address(self._host.ptr)
-        self.view: np.ndarray = np.frombuffer(buffer, dtype=scalar).reshape(shape)
+        self.view: np.ndarray = memory.view(scalar).reshape(max(count, 1), *shape)
 
     def to_device(self) -> None:
         """Make the device see what was written to `view`."""

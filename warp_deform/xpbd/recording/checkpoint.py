@@ -20,10 +20,12 @@ _STATE = (
 )  # fmt: skip
 """What a launch changes and a later one needs; the lists of fabrics are trimmed to their length."""
 _INPUTS = (
-    "particles.w0", "particles.tether", "bodies.w0", "bodies.inertia", "bodies.inverse_inertia",
-    "shapes.friction", "shapes.center", "shapes.half", "shapes.rotation", "group.active",
-    "group.damping", "group.table_friction", "group.contact_friction", "group.stiffness",
-    "group.gravity", "group.calm_steps", "group.calm_after", "group.least_steps",
+    "springs.length", "springs.compliance", "springs.limit", "springs.floor", "topology.radius",
+    "pairs.distance", "particles.w0", "particles.tether", "bodies.w0", "bodies.inertia",
+    "bodies.inverse_inertia", "shapes.friction", "shapes.center", "shapes.half",
+    "shapes.rotation", "group.active", "group.damping", "group.table_friction",
+    "group.contact_friction", "group.stiffness", "group.gravity", "group.calm_steps",
+    "group.calm_after", "group.least_steps",
     "group.most_steps", "grips.knot_end", "grips.offset", "grips.turn", "grips.lower_start",
     "grips.lower_end", "grips.push", "grips.push_steps", "grips.push_acceleration", "grips.time",
     "grips.position", "grips.rotation",

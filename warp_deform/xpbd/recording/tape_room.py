@@ -19,12 +19,17 @@ from ..lanes.tape import (
     TRIANGLE_WORDS,
 )
 from ..packing.data import SolverData
-from ..packing.mirrored import Mirrored
+from ..packing.mirrored import Mirrored, aligned
 
 __all__ = ["Stacks", "TapeRoom", "new_stacks"]
 
 MOST = 2**31 - 1
 """Elements of one stack at most: whole numbers of 32 bits count them."""
+
+
+_LESS = 'allow more memory, use storage="replay", or record fewer worlds at once'
+_NOTES = {"first": 4, "end": 4, "top": 4, "steps": 0, "until": 0, "full": 0}
+"""Whole numbers of a tape by group: so many each, 0: a number and no vector."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,16 +39,22 @@ class Stacks:
     struct: Any
     room: np.ndarray
     arrays: dict[str, Any]
+    notes: dict[str, Mirrored]
     nbytes: int
+
+    def read(self, name: str) -> np.ndarray:
+        """One of the tape's whole numbers by group, as the last launch left it."""
+        self.notes[name].to_host()
+        return self.notes[name].view
 
     def used(self) -> np.ndarray:
         """Elements (groups, 4) that the last launch left on it."""
-        used: np.ndarray = self.arrays["top"].numpy() - self.arrays["first"].numpy()
+        used: np.ndarray = self.read("top") - self.read("first")
         return used
 
     def full(self) -> np.ndarray:
         """Which groups (groups,) had no room for another substep."""
-        full: np.ndarray = self.arrays["full"].numpy() > 0
+        full: np.ndarray = self.read("full") > 0
         return full
 
 
@@ -54,12 +65,25 @@ def new_stacks(data: SolverData, control: dict[str, Mirrored], room: np.ndarray)
     end = np.cumsum(room, axis=0)
     arrays: dict[str, Any] = {}
     for column, (name, dtype) in enumerate((("x", t.V3), ("v", t.V), ("k", wp.int32), ("s", t.S))):
-        arrays[name] = wp.empty(max(int(end[-1, column]), 1), dtype=dtype, device=device)
-    arrays["first"] = wp.array((end - room).astype(np.int32), dtype=wp.vec4i, device=device)
-    arrays["end"] = wp.array(end.astype(np.int32), dtype=wp.vec4i, device=device)
-    arrays["top"] = wp.zeros(data.group_count, dtype=wp.vec4i, device=device)
-    for name in ("steps", "until", "full"):
-        arrays[name] = wp.zeros(data.group_count, dtype=wp.int32, device=device)
+        count = max(int(end[-1, column]), 1)
+        if device.is_cpu:
+            arrays[name] = aligned(count, dtype)[0]
+        else:
+            arrays[name] = wp.empty(count, dtype=dtype, device=device)
+    notes = {
+        name: Mirrored(
+            data.group_count,
+            wp.vec4i if width else wp.int32,
+            device,
+            np.int32,
+            (width,) if width else (),
+        )
+        for name, width in _NOTES.items()
+    }
+    notes["first"].view[...], notes["end"].view[...] = end - room, end
+    for name, mirrored in notes.items():
+        mirrored.to_device()
+        arrays[name] = mirrored.array
     for name, mirrored in control.items():
         arrays[name] = mirrored.array
     flat = wp.array(
@@ -68,9 +92,10 @@ def new_stacks(data: SolverData, control: dict[str, Mirrored], room: np.ndarray)
         shape=(arrays["x"].capacity // np.dtype(data.number).itemsize,),
         device=device,
     )
+    struct.part = 1
     for name, array in (*arrays.items(), ("x_flat", flat)):
         setattr(struct, name, array)
-    return Stacks(struct, room, arrays, int((room @ _sizes(data)).sum()))
+    return Stacks(struct, room, arrays, notes, int((room @ _sizes(data)).sum()))
 
 
 class TapeRoom:
@@ -86,30 +111,37 @@ class TapeRoom:
         self._data, self._control = data, control
         self.sizes = _sizes(data)
         self.use: np.ndarray | None = None
-        self.spare = 2.0 * self._least() + self._solid()
+        self._least, self._solid = _least(data), _solid(data)
+        self.spare = 2.0 * self._least + self._solid
 
     def per_substep(self) -> float:
         """Bytes that a substep takes of all stacks together."""
-        return float(((self._least() if self.use is None else self.use) * self.sizes).sum())
+        return float(((self._least if self.use is None else self.use) * self.sizes).sum())
 
     def room(self, length: int) -> np.ndarray:
         """Room for `length` substeps."""
-        use = self._least() if self.use is None else 1.1 * self.use
+        use = self._least if self.use is None else 1.1 * self.use
         room: np.ndarray = np.ceil(use * length + self.spare).astype(int)
         return room
 
-    def check(self, room: np.ndarray, stored: int, memory: int) -> int:
-        """Bytes of a tape with the room and of what is `stored` beside it.
+    def nbytes(self, room: np.ndarray) -> int:
+        """Bytes of a tape with the room (groups, 4).
 
         Raises:
-            InputError: that is more than `memory`, or more than can be counted.
+            InputError: it has more elements than can be counted.
         """
-        nbytes = stored + int((room * self.sizes).sum())
-        if nbytes > memory or int(room.sum(axis=0).max()) > MOST:
-            raise InputError(
-                f"the tape would need {nbytes} bytes of {memory}: allow more memory, use "
-                'storage="replay", or record fewer worlds at once'
-            )
+        if int(room.sum(axis=0).max()) > MOST:
+            raise InputError(f"{int(room.sum())} elements do not fit on a tape: {_LESS}")
+        return int((room * self.sizes).sum())
+
+    def check(self, nbytes: int, memory: int) -> int:
+        """So many bytes, if that is no more than `memory`.
+
+        Raises:
+            InputError: it is.
+        """
+        if nbytes > memory:
+            raise InputError(f"the tape would need {nbytes} bytes of {memory}: {_LESS}")
         return nbytes
 
     def learn(self, stacks: Stacks, steps: int) -> None:
@@ -123,28 +155,6 @@ class TapeRoom:
         self.spare = np.maximum(self.spare, self._worst())
         if double:
             self.spare = 2 * self.spare
-
-    def _least(self) -> np.ndarray:
-        """What any substep needs; contacts come on top."""
-        data, rows = self._data, []
-        for k in data.group_topology:
-            top = data.topologies[k]
-            springs, particles = len(top.spring_ij) * top.passes, top.particle_count
-            words = springs + top.passes + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
-            bodies = top.body_count * data.lanes
-            words += BODY_WORDS * bodies
-            rows.append((2 * springs + 6 * particles, particles + 8, words, BODY_SCALARS * bodies))
-        return np.array(rows)
-
-    def _solid(self) -> np.ndarray:
-        """What contacts of all boxes with all particles and triangles would need."""
-        data, rows = self._data, []
-        for k in data.group_topology:
-            top = data.topologies[k]
-            solid = len(top.shape_body) * (top.particle_count + len(top.sheet_triangle))
-            solid *= data.lanes
-            rows.append((0, 0, BODY_WORDS * solid, BOX_TRIANGLE_SCALARS * solid))
-        return np.array(rows)
 
     def _worst(self) -> np.ndarray:
         """What a substep needs at worst with the lists as they are."""
@@ -160,9 +170,33 @@ class TapeRoom:
                 if len(counts) == data.group_count * data.lanes:
                     listed += counts.reshape(-1, data.lanes).sum(axis=1)
         words, scalars = near + TRIANGLE_WORDS * listed, TRIANGLE_SCALARS * listed
-        contacts = np.stack([2 * near, near, words, scalars], axis=1)
-        worst: np.ndarray = self._least() + self._solid() + 1.5 * contacts
+        contacts = np.stack([2 * near, 0 * near, words, scalars], axis=1)
+        worst: np.ndarray = self._least + self._solid + 1.5 * contacts
         return worst
+
+
+def _least(data: SolverData) -> np.ndarray:
+    """What any substep needs; contacts come on top."""
+    rows = []
+    for k in data.group_topology:
+        top = data.topologies[k]
+        springs, particles = len(top.spring_ij) * top.passes, top.particle_count
+        words = springs + top.passes + particles + 2 * data.lanes * (GRIP_WORDS + 4) + 8
+        bodies = top.body_count * data.lanes
+        words += BODY_WORDS * bodies
+        rows.append((2 * springs + 6 * particles, particles + 8, words, BODY_SCALARS * bodies))
+    return np.array(rows)
+
+
+def _solid(data: SolverData) -> np.ndarray:
+    """What contacts of all boxes with all particles and triangles would need."""
+    rows = []
+    for k in data.group_topology:
+        top = data.topologies[k]
+        solid = len(top.shape_body) * (top.particle_count + len(top.sheet_triangle))
+        solid *= data.lanes
+        rows.append((0, 0, BODY_WORDS * solid, BOX_TRIANGLE_SCALARS * solid))
+    return np.array(rows)
 
 
 def _sizes(data: SolverData) -> np.ndarray:

@@ -132,7 +132,8 @@ def beam(scalar: Any, lanes: int) -> SimpleNamespace:
 @functools.cache
 def beam_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     """`record_beam` solves a beam and leaves the offset d of each spring on the tape, `sweep_beam`
-    takes it back: the derivatives by the particles, inverse masses and `inverse_dt2` (returned).
+    takes it back: the derivatives by the particles, inverse masses, the springs' own (from `own`
+    on) and `inverse_dt2` (returned).
 
     As in `chain`: with g the derivatives by lambda, mu = A^-1 g are those by d, and those by A are
     -mu lambda^T.
@@ -169,6 +170,7 @@ def beam_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def sweep_beam(
         k: int,
+        own: int,
         count: int,
         p0: int,
         at: int,
@@ -211,6 +213,7 @@ def beam_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             turned = lines.bend[j]
             by_diagonal = zero - dot(turned, pull)
             by_inverse_dt2 = by_inverse_dt2 + by_diagonal * springs.compliance[s]
+            adj.softness[own + r] = adj.softness[own + r] + by_diagonal
             by_wj = by_diagonal
             by_we = by_diagonal * quarter
             if r + 1 < count:

@@ -18,17 +18,21 @@ __all__ = ["bending", "bending_adjoint"]
 
 
 @functools.cache
-def bending(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`project_bend(k, p0, inverse_dt2, particles, springs)`: solve bending spring `k`.
+def bending(scalar: Any, lanes: int, taped: bool = False) -> SimpleNamespace:
+    """`project_bend(k, p0, at, inverse_dt2, particles, springs, tape)`: solve bending spring `k`.
+
+    `taped`, it leaves its offset d on the tape.
 
     With the constraint |d| - h and its gradients 1 on the middle particle and -1/2 on the ends,
     ``lambda = (|d| - h) / (wj + (wi + wk) / 4 + a / dt^2)``.
     """
     t = structures(scalar, lanes)
-    S, V, Particles, Springs = t.S, t.V, t.Particles, t.Springs
+    S, V, Particles, Springs, Tape = t.S, t.V, t.Particles, t.Springs, t.Tape
 
     @wp.func
-    def project_bend(k: int, p0: int, inverse_dt2: V, particles: Particles, springs: Springs):
+    def project_bend(
+        k: int, p0: int, at: int, inverse_dt2: V, particles: Particles, springs: Springs, tape: Tape
+    ):
         ends = springs.ij[k]
         i = p0 + ends[0]
         j = p0 + springs.middle[k]
@@ -37,39 +41,35 @@ def bending(scalar: Any, lanes: int) -> SimpleNamespace:
         wj = particles.w[j]
         we = particles.w[e]
         half = S(0.5)
-        d = particles.x[j] - (particles.x[i] + particles.x[e]) * half
+        xi = particles.x[i]
+        xj = particles.x[j]
+        xe = particles.x[e]
+        d = xj - (xi + xe) * half
+        if wp.static(taped):
+            tape.x[at] = d
         tiny = V(S(1.0e-9))
         l = wp.max(root(dot(d, d)), tiny)
         w = wj + (wi + we) * S(0.25) + inverse_dt2 * springs.compliance[k] + tiny
         s = (l - V(springs.length[k])) / (l * w)
-        particles.x[i] = particles.x[i] + d * (s * wi * half)
-        particles.x[e] = particles.x[e] + d * (s * we * half)
-        particles.x[j] = particles.x[j] - d * (s * wj)
+        particles.x[i] = xi + d * (s * wi * half)
+        particles.x[e] = xe + d * (s * we * half)
+        particles.x[j] = xj - d * (s * wj)
 
     return SimpleNamespace(project_bend=project_bend)
 
 
 @functools.cache
 def bending_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
-    """`record_bend` solves a bending spring and leaves its offset d on the tape, `sweep_bend` takes
-    it back: the derivatives by the three particles, inverse masses and `inverse_dt2` (returned).
+    """`sweep_bend` takes a bending spring of offset d back: the derivatives by the three particles,
+    inverse masses, the spring's own (at `own`) and `inverse_dt2` (returned).
     """
     t = structures(scalar, lanes)
-    S, V, V3 = t.S, t.V, t.V3
-    Particles, Springs, Tape, Adjoint = t.Particles, t.Springs, t.Tape, t.Adjoint
-    project_bend = bending(scalar, lanes).project_bend
+    S, V, V3, Springs, Adjoint = t.S, t.V, t.V3, t.Springs, t.Adjoint
 
     @wp.func
-    def record_bend(
-        k: int, p0: int, at: int, inverse_dt2: V, particles: Particles, springs: Springs, tape: Tape
+    def sweep_bend(
+        k: int, own: int, p0: int, d: V3, inverse_dt2: V, springs: Springs, adj: Adjoint
     ):
-        ends = springs.ij[k]
-        middle = particles.x[p0 + springs.middle[k]]
-        tape.x[at] = middle - (particles.x[p0 + ends[0]] + particles.x[p0 + ends[1]]) * S(0.5)
-        project_bend(k, p0, inverse_dt2, particles, springs)
-
-    @wp.func
-    def sweep_bend(k: int, p0: int, d: V3, inverse_dt2: V, springs: Springs, adj: Adjoint):
         ends = springs.ij[k]
         i = p0 + ends[0]
         j = p0 + springs.middle[k]
@@ -98,10 +98,13 @@ def bending_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         adj.x[e] = ge - gd * half
         adj.x[j] = gj + gd
         gw = zero - gs * s / w
-        quarter = gw * S(0.25)
-        adj.mass[i] = adj.mass[i] + select(wi, quarter + s * di, zero)
-        adj.mass[e] = adj.mass[e] + select(we, quarter + s * de, zero)
-        adj.mass[j] = adj.mass[j] + select(wj, gw - s * dj, zero)
+        if adj.parts > 0:
+            quarter = gw * S(0.25)
+            adj.mass[i] = adj.mass[i] + select(wi, quarter + s * di, zero)
+            adj.mass[e] = adj.mass[e] + select(we, quarter + s * de, zero)
+            adj.mass[j] = adj.mass[j] + select(wj, gw - s * dj, zero)
+            adj.softness[own] = adj.softness[own] + gw
+            adj.rest[own] = adj.rest[own] - gs / (l * w)
         return gw * springs.compliance[k]
 
-    return SimpleNamespace(record_bend=record_bend, sweep_bend=sweep_bend)
+    return SimpleNamespace(sweep_bend=sweep_bend)

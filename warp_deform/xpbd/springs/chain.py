@@ -153,8 +153,8 @@ def chain(scalar: Any, lanes: int) -> SimpleNamespace:
 @functools.cache
 def chain_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     """`record_chain` solves a chain and leaves the offset d of each spring on the tape,
-    `sweep_chain` takes it back: the derivatives by the particles, inverse masses and `inverse_dt2`
-    (returned). Branch: elastic, or at its strain limit or floor.
+    `sweep_chain` takes it back: the derivatives by the particles, inverse masses, the springs' own
+    (from `own` on) and `inverse_dt2` (returned). Branch: elastic, or at its strain limit or floor.
 
     With lambda = A^-1 c and g the derivatives by lambda, mu = A^-1 g are those by c, and those by A
     are -mu lambda^T. The factors of A are made again from the offsets.
@@ -209,6 +209,7 @@ def chain_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     @wp.func
     def sweep_chain(
         k: int,
+        own: int,
         count: int,
         p0: int,
         at: int,
@@ -247,9 +248,13 @@ def chain_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             by_wj = by_diagonal + multiplier * dot(n, gj)
             kind = counts + wp.static(int(Kind.STRAIN_LIMIT))
             adj.fired[kind] = adj.fired[kind] + (one - lines.elastic[i]) * on
-            by_inverse_dt2 = by_inverse_dt2 + (
-                by_diagonal * springs.compliance[s] * lines.elastic[i]
-            )
+            elastic = lines.elastic[i]
+            by_inverse_dt2 = by_inverse_dt2 + by_diagonal * springs.compliance[s] * elastic
+            at_own = own + s - k
+            adj.softness[at_own] = adj.softness[at_own] + by_diagonal * elastic
+            # a limit and a floor are shares of the rest length, and move with it
+            share = lines.target[i] * (S(1.0) / springs.length[s])
+            adj.rest[at_own] = adj.rest[at_own] - turned * share
             adj.mass[i] = adj.mass[i] + select(wi, by_diagonal - multiplier * dot(n, gi), zero)
             if s + 1 < k + count:
                 after = lines.along[j]

@@ -29,10 +29,12 @@ __all__ = ["distance", "distance_adjoint"]
 
 
 @functools.cache
-def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamespace:
-    """`project_distance(k, p0, inverse_dt2, particles, springs)`: solve spring `k`.
+def distance(
+    scalar: Any, lanes: int, with_floors: bool = False, taped: bool = False
+) -> SimpleNamespace:
+    """`project_distance(k, p0, at, inverse_dt2, particles, springs, tape)`: solve spring `k`.
 
-    It returns whether the spring acted.
+    It returns whether the spring acted. `taped`, it leaves its offset d on the tape.
 
     For a two-sided spring (mode 0) of length l, rest length L and compliance a,
     ``lambda = (l - L) / (wi + wj + a / dt^2)`` moves both ends along the spring. AT_LEAST (mode 1)
@@ -41,10 +43,12 @@ def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamesp
     for l < floor as well, whatever the mode.
     """
     t = structures(scalar, lanes)
-    S, V, Particles, Springs = t.S, t.V, t.Particles, t.Springs
+    S, V, Particles, Springs, Tape = t.S, t.V, t.Particles, t.Springs, t.Tape
 
     @wp.func
-    def project_distance(k: int, p0: int, inverse_dt2: V, particles: Particles, springs: Springs):
+    def project_distance(
+        k: int, p0: int, at: int, inverse_dt2: V, particles: Particles, springs: Springs, tape: Tape
+    ):
         ij = springs.ij[k]
         i = p0 + ij[0]
         j = p0 + ij[1]
@@ -53,6 +57,8 @@ def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamesp
         xi = particles.x[i]
         xj = particles.x[j]
         d = xi - xj
+        if wp.static(taped):
+            tape.x[at] = d
         l2 = dot(d, d)
         acts = mode == 0 or (mode == 1 and any_less(l2, rest * rest))
         if mode == 2:
@@ -89,29 +95,28 @@ def distance(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamesp
 
 @functools.cache
 def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> SimpleNamespace:
-    """`record_distance` solves a spring and leaves its offset d on the tape, `sweep_distance`
-    takes it back: the derivatives by both ends, inverse masses and `inverse_dt2` (returned).
+    """`sweep_distance` takes a spring of offset d back: the derivatives by both ends, inverse
+    masses, the spring's own (at `own`) and `inverse_dt2` (returned).
 
     The correction is s d with s = (l - target) / (D l); whichever of the rest length, the strain
     limit and the floor decided s is the target, and D is the sum of inverse masses plus, for the
-    rest length, the compliance. So ds/dl = target / (D l^2) and ds/dD = -s / D.
+    rest length, the compliance. So ds/dl = target / (D l^2), ds/dD = -s / D and ds/dtarget =
+    -1 / (D l). A limit and a floor are shares of the rest length, and move with it.
     """
     t = structures(scalar, lanes)
-    S, V, V3 = t.S, t.V, t.V3
-    Particles, Springs, Tape, Adjoint = t.Particles, t.Springs, t.Tape, t.Adjoint
-    project_distance = distance(scalar, lanes, with_floors).project_distance
-
-    @wp.func
-    def record_distance(
-        k: int, p0: int, at: int, inverse_dt2: V, particles: Particles, springs: Springs, tape: Tape
-    ):
-        ij = springs.ij[k]
-        tape.x[at] = particles.x[p0 + ij[0]] - particles.x[p0 + ij[1]]
-        return project_distance(k, p0, inverse_dt2, particles, springs)
+    S, V, V3, Springs, Adjoint = t.S, t.V, t.V3, t.Springs, t.Adjoint
 
     @wp.func
     def sweep_distance(
-        k: int, p0: int, d: V3, inverse_dt2: V, springs: Springs, counts: int, on: V, adj: Adjoint
+        k: int,
+        own: int,
+        p0: int,
+        d: V3,
+        inverse_dt2: V,
+        springs: Springs,
+        counts: int,
+        on: V,
+        adj: Adjoint,
     ):
         ij = springs.ij[k]
         i = p0 + ij[0]
@@ -142,6 +147,7 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
         inverse = one / (below * safe)
         s = c * inverse
         target = V(rest)
+        elastic = one
         limit = springs.limit[k]
         if limit > S(0.0) and any_less(V(limit * limit) - l2, S(0.0)):
             # compared as in the forward pass; what is not tight keeps the bits it has alone
@@ -154,6 +160,7 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
             target = select(tight, V(limit), target)
             below = select(tight, w, below)
             soft = select(tight, zero, soft)
+            elastic = select(tight, zero, elastic)
             inverse = one / (below * safe)
         if wp.static(with_floors):
             floor = springs.floor[k]
@@ -167,6 +174,7 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
                 target = select(tight, V(floor), target)
                 below = select(tight, w, below)
                 soft = select(tight, zero, soft)
+                elastic = select(tight, zero, elastic)
                 inverse = one / (below * safe)
         gi = adj.x[i]
         gj = adj.x[j]
@@ -181,8 +189,11 @@ def distance_adjoint(scalar: Any, lanes: int, with_floors: bool = False) -> Simp
         adj.x[i] = gi + gd
         adj.x[j] = gj - gd
         gw = gs * (zero - acts * s * inverse * safe)
-        adj.mass[i] = adj.mass[i] + select(wi, gw - s * di, zero)
-        adj.mass[j] = adj.mass[j] + select(wj, gw + s * dj, zero)
+        if adj.parts > 0:
+            adj.mass[i] = adj.mass[i] + select(wi, gw - s * di, zero)
+            adj.mass[j] = adj.mass[j] + select(wj, gw + s * dj, zero)
+            adj.softness[own] = adj.softness[own] + gw * elastic
+            adj.rest[own] = adj.rest[own] - gs * (acts * inverse * target) * (S(1.0) / rest)
         return gw * soft
 
-    return SimpleNamespace(record_distance=record_distance, sweep_distance=sweep_distance)
+    return SimpleNamespace(sweep_distance=sweep_distance)
