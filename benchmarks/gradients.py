@@ -8,9 +8,8 @@ bytes) of tape and checkpoints at their peak likewise. `full` keeps every tape, 
 and one tape, and its backward runs every segment again; `auto` keeps tapes in a quarter of the
 memory. `parts` is a backward with derivatives by single springs and particles.
 
-What bounds it: `substep_bytes` are on the tape per substep and world, and `gigabytes_per_second` is
-what writing them would need if nothing else made the taped run dearer than the plain one;
-`plain_ns` and `backward_ns` are nanoseconds per constraint that acted.
+What bounds it: `substep_bytes` are on the tape per substep and world, and `plain_ns` and `backward_ns`
+are nanoseconds per constraint that acted.
 The worlds start as `warp-deform bench` starts them and run without a grip: beads crumpled (cable)
 or stacked (heap), a sheet crumpled above the table, a bag dropped, alone or with the two boxes of
 bag-items-2 in it (bag-cube), the L-block dropped while it slides and turns.
@@ -92,7 +91,6 @@ class Cost:
     whole_with_parts_ratio: float
     memory_mb: float
     substep_bytes: float
-    gigabytes_per_second: float
     plain_ns: float
     backward_ns: float
 
@@ -237,7 +235,6 @@ def measure(name: str, repeats: int) -> list[Cost]:
                 whole_with_parts_ratio=(forward + of_parts) / base,
                 memory_mb=run.recorder.nbytes / 1e6 / per,
                 substep_bytes=used / (per / solver.config.dt),
-                gigabytes_per_second=used / (forward - base) / 1e9,
                 plain_ns=1e9 * base / acted,
                 backward_ns=1e9 * backward / acted,
             )
