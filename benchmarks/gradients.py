@@ -8,7 +8,7 @@ bytes) of tape and checkpoints at their peak likewise. `full` keeps every tape, 
 and one tape, and its backward runs every segment again; `auto` keeps tapes in a quarter of the
 memory. `parts` is a backward with derivatives by single springs and particles.
 
-What bounds it: `substep_bytes` are on the tape per substep and world, and `plain_ns` and `backward_ns`
+What bounds it: `substep_bytes` are on the tape per substep and world; `plain_ns` and `backward_ns`
 are nanoseconds per constraint that acted.
 The worlds start as `warp-deform bench` starts them and run without a grip: beads crumpled (cable)
 or stacked (heap), a sheet crumpled above the table, a bag dropped, alone or with the two boxes of
