@@ -28,7 +28,8 @@ MORE = replace(FEW, states=40)
 """Stiffness moves a sheet so little in a substep that single differences are wrong by 2e-6."""
 OF_WORLD = {"damping", "table_friction", "contact_friction", "stiffness"}
 OF_PATH = {"way_points", "knot_times", "knot_rotations"}
-OF_PARTICLES = {"positions", "velocities", "inverse_masses"}
+OF_PARTICLES = {"positions", "velocities", "inverse_masses", "spring_stiffness", "rest_lengths"}
+OF_PARTICLES |= {"radii"}
 OF_BODIES = {"body_poses", "body_velocities", "body_inverse_masses"}
 PARAMETERS = {
     LINE: OF_PARTICLES | OF_PATH | OF_WORLD,

@@ -37,10 +37,11 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     nearest, project_edge = edges_.nearest, edges_.project_edge
     along_two = closest_point_adjoint(scalar, lanes).along_two
     tri_ = triangle_contact_adjoint(scalar, lanes)
+    lowered = tri_.lowered
     record_four, add_to, add_mass = tri_.record_four, tri_.add_to, tri_.add_mass
     position = tape(scalar, lanes).position
     support = table_support(scalar, lanes)
-    raised, carried, unraised = support.raised, support.carried, support.unraised
+    raised, carried = support.raised, support.carried
 
     @wp.func
     def record_edges(
@@ -184,10 +185,10 @@ def edge_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         ge = wp.cross(f, gm) + R3(y[1, 0], y[1, 1], y[1, 2])
         gf = wp.cross(gm, e) - R3(y[2, 0], y[2, 1], y[2, 2])
         g = gr + g_moved
-        ha = unraised(g * nu - across - ge, a, xa)
-        hb = unraised(g * u + ge, b, xb)
-        hc = unraised(across - g * nv - gf, c, xc)
-        hd = unraised(gf - g * v, d, xd)
+        ha = lowered(ia, lane, g * nu - across - ge, a, xa, adj)
+        hb = lowered(ib, lane, g * u + ge, b, xb, adj)
+        hc = lowered(ic, lane, across - g * nv - gf, c, xc, adj)
+        hd = lowered(id, lane, gf - g * v, d, xd, adj)
         add_to(adj.x_flat, adj.xp_flat, ia, lane, ha, g_moved * (-nu))
         add_to(adj.x_flat, adj.xp_flat, ib, lane, hb, g_moved * (-u))
         add_to(adj.x_flat, adj.xp_flat, ic, lane, hc, g_moved * nv)

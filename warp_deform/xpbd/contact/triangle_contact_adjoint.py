@@ -60,6 +60,13 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             put_scalar(adj.mass_flat, i, lane, get_mass(adj.mass_flat, i, lane) + g)
 
     @wp.func
+    def lowered(i: int, lane: int, g: R3, z: R3, x: R3, adj: Adjoint):
+        """`unraised`; what raised the particle was its radius."""
+        if z[2] > x[2]:
+            put_scalar(adj.radius_flat, i, lane, get_mass(adj.radius_flat, i, lane) + g[2])
+        return unraised(g, z, x)
+
+    @wp.func
     def record_triangles(
         g: int,
         lane: int,
@@ -236,10 +243,10 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         )
         hp, ha, hb, hc = sweep_barycentric(u, gu, d, a, b, c)
         g = g_moved + gd
-        hp = unraised(hp + g, p, xi)
-        ha = unraised(ha - g * u[0] - ge - gf, a, xa)
-        hb = unraised(hb - g * u[1] + ge, b, xb)
-        hc = unraised(hc - g * u[2] + gf, c, xc)
+        hp = lowered(i, lane, hp + g, p, xi, adj)
+        ha = lowered(ia, lane, ha - g * u[0] - ge - gf, a, xa, adj)
+        hb = lowered(ib, lane, hb - g * u[1] + ge, b, xb, adj)
+        hc = lowered(ic, lane, hc - g * u[2] + gf, c, xc, adj)
         add_to(adj.x_flat, adj.xp_flat, i, lane, hp, -g_moved)
         add_to(adj.x_flat, adj.xp_flat, ia, lane, ha, g_moved * u[0])
         add_to(adj.x_flat, adj.xp_flat, ib, lane, hb, g_moved * u[1])
@@ -252,4 +259,5 @@ def triangle_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         record_four=record_four,
         add_to=add_to,
         add_mass=add_mass,
+        lowered=lowered,
     )
