@@ -85,4 +85,4 @@ def test_bags_carried_across_keep_the_cube_and_others_lose_it() -> None:
 
     across_kept, near_kept = kept(look.try_each(chosen)), kept(look.try_each(others))
     assert len(chosen) > SLOTS
-    assert across_kept >= 0.8 * len(chosen) and near_kept <= across_kept - 3
+    assert across_kept >= 0.75 * len(chosen) and near_kept <= across_kept - 3
