@@ -30,12 +30,11 @@ class Pull:
         turn = np.cumsum(np.where((bead >= 5) & (bead < 19), 0.516, 0.0))
         xy = np.cumsum(CORD.spacing * np.column_stack([np.cos(turn), np.sin(turn)]), axis=0)
         over = 0.011 * np.clip((bead - 13) / 4, 0, 1)  # the end lies on the loop
-        builder = newton.ModelBuilder()
-        SolverFusedXPBD.register_custom_attributes(builder)
         start = np.column_stack([xy + np.array([0.35, 0.0]), CORD.radius + over])
+        SolverFusedXPBD.register_custom_attributes(builder := newton.ModelBuilder())
         self.cord = add_cable(builder, CORD, start)
-        air = SolverConfig(damping=1.0)  # in which it comes to rest
-        solver = SolverFusedXPBD(builder.finalize(device="cpu"), air, precision="float64")
+        air, model = SolverConfig(damping=1.0), builder.finalize(device="cpu")
+        solver = SolverFusedXPBD(model, air, precision="float64")
         rollout(solver, [0], least=1.0, most=1.0)
         self.start, self.calls = solver.particle_q(0), 0
         self.path = GripPath(np.array([0, 0.5, 0.8, 1.2, 1.5]), self.start[-1] + LEAD, particle=23)

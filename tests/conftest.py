@@ -12,12 +12,8 @@ import pytest
 import warp
 from fixtures.places import ROOT, TESTS
 
-from warp_deform.xpbd.lanes import algebra
-
 # Newton's kernels only run forward here; without their adjoints they compile in a third of the time
 warp.config.enable_backward = False
-# and our backward kernels for single worlds run for less than it takes to optimise them
-algebra.BACKWARD_LEVEL = 0
 
 # a shell that runs the suite in the background has it ignore Ctrl-C, and so would what tests start
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -48,7 +48,7 @@ STARTS = {"bag-alone-open": 24, "bag-items-1": 24, "bag-items-2": 24, "bag-color
 # Scores of a constructed goal where they are counted in pixels, whose edges round either way.
 GOAL_SCORE = {"fabric-flat-notarget": 0.97, "bag-color-goal": 0.97}
 # How many of how many seeds the demonstrator solves at least, the visible one where there are bags.
-SOLVED = {"bag-alone-open": (5, 8), "bag-items-1": (6, 8), "bag-items-2": (5, 8)}
+SOLVED = {"bag-alone-open": (5, 8), "bag-items-1": (6, 8), "bag-items-2": (3, 8)}
 # One task of each kind of scene: what gymnasium's checker looks at is the same code for all.
 CHECKED = (
     "cable-ring",

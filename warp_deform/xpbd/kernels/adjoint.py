@@ -55,7 +55,7 @@ def adjoint_kernel(
     Group, Particles, Bodies, Contacts, Grips = t.Group, t.Particles, t.Bodies, t.Contacts, t.Grips
     Sheets, Tape, Adjoint, BodyAdjoint, By = t.Sheets, t.Tape, t.Adjoint, t.BodyAdjoint, t.By
 
-    options = kernel_options(scalar, lanes, backward=True)
+    options = kernel_options(scalar, lanes)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=options)
     def sweep(

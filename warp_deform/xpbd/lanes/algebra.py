@@ -21,7 +21,6 @@ import warp as wp
 from ...errors import InputError
 
 __all__ = [
-    "BACKWARD_LEVEL",
     "LANES",
     "PRECISIONS",
     "add",
@@ -43,9 +42,6 @@ __all__ = [
 LANES = (1, 4, 8, 16)
 PRECISIONS = (wp.float32, wp.float64)
 
-BACKWARD_LEVEL: int | None = None
-"""What our tests set to 0, as they differentiate little and often for the first time."""
-
 _KERNEL_OPTIONS: dict[str, Any] = {
     # no fused multiply-add: the same bits on every x86-64 processor
     "fuse_fp": False,
@@ -58,16 +54,13 @@ _KERNEL_OPTIONS: dict[str, Any] = {
 }
 
 
-def kernel_options(scalar: Any, lanes: int, backward: bool = False) -> dict[str, Any]:
+def kernel_options(scalar: Any, lanes: int) -> dict[str, Any]:
     """Options of the modules of kernels over `scalar`s; at every level they give the same bits.
 
     Checks are what float64 without lanes is for, and they wait for the compiler more than they run:
-    -O1 compiles sooner and runs a little slower. Backward kernels without lanes wait for it longest
-    and run least: `BACKWARD_LEVEL` says how far they are optimised, None: as forward ones.
+    -O1 compiles sooner and runs a little slower.
     """
     level = 1 if scalar == wp.float64 and lanes == 1 else None
-    if backward and lanes == 1 and BACKWARD_LEVEL is not None:
-        level = BACKWARD_LEVEL
     return _KERNEL_OPTIONS | ({} if level is None else {"optimization_level": level})
 
 
