@@ -1,1 +1,1 @@
-"""Constraints within an object: links, bending, tethers, internal friction, with their adjoints."""
+"""Constraints within an object: links, bending, tethers, viscosity, sleep, with their adjoints."""
