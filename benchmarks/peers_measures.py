@@ -6,10 +6,16 @@ chaotic only its first tenths of a second have an error; what follows is compare
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
+from fixtures import bag_scenes
+from fixtures.cloth_scenes import edges_of
 
 from warp_deform.peers import PeerScene, SoftScene
 
@@ -93,30 +99,8 @@ def believable(row: dict[str, Any]) -> bool:
 
 
 def pierced(x: np.ndarray, faces: np.ndarray) -> float:
-    """Share of the edges that pierce a triangle with which they share no corner.
-
-    Source: Moeller, Trumbore, "Fast, Minimum Storage Ray/Triangle Intersection", 1997.
-    """
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    ends, corners = x[edges], x[faces]
-    near = np.ones((len(edges), len(faces)), bool)
-    for axis in range(3):
-        near &= ends[..., axis].min(1)[:, None] <= corners[..., axis].max(1)
-        near &= ends[..., axis].max(1)[:, None] >= corners[..., axis].min(1)
-    e, f = np.nonzero(near)
-    apart = ~(edges[e][:, :, None] == faces[f][:, None, :]).any(axis=(1, 2))
-    e, f = e[apart], f[apart]
-    start, way = x[edges[e, 0]], x[edges[e, 1]] - x[edges[e, 0]]
-    a, b, c = (x[faces[f, k]] for k in range(3))
-    u, v = b - a, c - a
-    p = np.cross(way, v)
-    det = (p * u).sum(1)
-    det = np.where(np.abs(det) > 1e-18, det, np.inf)
-    t = start - a
-    q = np.cross(t, u)
-    one, other, along = (t * p).sum(1) / det, (way * q).sum(1) / det, (v * q).sum(1) / det
-    inside = (one >= 0) & (other >= 0) & (one + other <= 1) & (along >= 0) & (along <= 1)
-    return len(np.unique(e[inside & np.isfinite(det)])) / len(edges)
+    """Share of the edges that pierce a triangle with which they share no corner."""
+    return bag_scenes.pierced(x, faces) / len(edges_of(faces))
 
 
 def _hull(points: np.ndarray) -> float:

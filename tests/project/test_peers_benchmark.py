@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixtures.bag_scenes import pierced as counted
-from fixtures.cloth_scenes import crumpled, edges_of
+from fixtures.cloth_scenes import crumpled, edges_of, piercing
 from fixtures.places import ROOT
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -78,7 +77,7 @@ def test_pierced_edges_are_those_that_the_tests_count():
         x = crumpled(100, seed)
         share = peers_measures.pierced(x, scene.triangles)
         count = len(edges_of(scene.triangles))
-        assert share == pytest.approx(counted(x, scene.triangles) / count) and share > 0
+        assert share == pytest.approx(piercing(x, scene.triangles) / count) and share > 0
 
 
 @pytest.mark.parametrize(
