@@ -14,28 +14,31 @@ from ..errors import InputError
 from ..planning.demonstrators import demonstrator as find_demonstrator
 from ..rendering.scene_view import ArmMeshes, SceneView
 from ..tasks.task import Action, Task
+from ..worlds.acting import Acting, ActionMode, reachable
 from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 from ..worlds.loop import EpisodeRun
-from ..worlds.spaces import action_space, check_action, information, observation, observation_space
+from ..worlds.observing import Observing, ObsMode
+from ..worlds.rewards import RewardMode, Rewards
+from ..worlds.spaces import information
 from ..worlds.worlds import Worlds
-from .reset_options import check_options, goal_for, next_seed
+from .reset_options import IGNORED, check_options, goal_for, next_seed
 
 __all__ = ["PickPlaceEnv", "WorldsView"]
 
 _FRAME = (360, 640)  # [pixels] rows, columns
 
 
-class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+class PickPlaceEnv(gymnasium.Env[Any, np.ndarray]):
     """Rearrange cables, fabrics, bags or boxes by picking and placing, in the episodes of a task.
 
         env = gymnasium.make("WarpDeform/CableRing-v2")
         observation, info = env.reset(seed=0)
         observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 
-    Reward is the change of the score. An episode terminates when the task is solved or over without
-    success by its rules (`Task.ended`), and is truncated after `max_actions`, or as soon as a guard
-    of the solver says that the state cannot be trusted. `spaces.observation` and
-    `spaces.information` say what observations and infos hold.
+    Reward is the change of the score, or as `reward_mode` says. An episode terminates when the task
+    is solved or over without success by its rules (`Task.ended`), and is truncated after
+    `max_actions`, or as soon as a guard of the solver says that the state cannot be trusted.
+    `Observing` and `spaces.information` say what observations and infos hold.
 
     A seed names an episode: the same bits in any environment, alone or in a vector. A reset without
     one draws the episode's seed from `np_random` (1,000,000 and up) and tells it in `info`.
@@ -44,17 +47,33 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         task: a name, see `warp-deform list`, or a `Task` of your own
         robot: "ur5" or "panda"
         render_mode: None, or "rgb_array" for `render` to draw table, objects and arm (360, 640, 3)
+        obs_mode: "images", "state", "state_dict", "rgb", "rgbd" or "rgb+state", see `Observing`
+        action_mode: "metric", or "normalized" for actions from -1 to 1
+        snap: a pick that would meet nothing is drawn to the nearest thing so far away at most [m];
+            infos then have `pick_shift`, how far it was [m]
+        reward_mode: "score", "dense", "normalized_dense", "sparse" or "none", see `Rewards`
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 2}
 
     def __init__(
-        self, task: str | Task, *, robot: str = "ur5", render_mode: str | None = None
+        self,
+        task: str | Task,
+        *,
+        robot: str = "ur5",
+        render_mode: str | None = None,
+        obs_mode: ObsMode = "images",
+        action_mode: ActionMode = "metric",
+        snap: float = 0.0,
+        reward_mode: RewardMode = "score",
     ) -> None:
         self.render_mode = check_render_mode(render_mode, self.metadata)
         self.worlds = Worlds(task, 1, robot=robot)
-        self.observation_space = observation_space(self.task)  # type: ignore[assignment]
-        self.action_space = action_space()
+        self.observing = Observing(self.worlds, obs_mode)
+        self.acting = Acting(self.worlds, action_mode, snap)
+        self.rewards = Rewards(self.worlds, reward_mode)
+        self.observation_space = self.observing.space
+        self.action_space = self.acting.space
         self._view = WorldsView(self.worlds)
         self._running = False
 
@@ -63,9 +82,19 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         """The task that is played."""
         return self.worlds.task
 
+    @property
+    def task_description(self) -> str:
+        """What is to be done, as a sentence for policies that read one."""
+        return self.task.instruction
+
+    @property
+    def _max_episode_steps(self) -> int:
+        """What others ask for by this name."""
+        return self.task.max_actions
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start the episode that `seed` names.
 
         Args:
@@ -78,18 +107,16 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         """
         super().reset(seed=seed)
         number = int(seed) if seed is not None else next_seed(self.np_random)
-        given = check_options(options, "goal").get("goal")
+        given = check_options(options, "goal", *IGNORED).get("goal")
         goals = {} if given is None else {0: goal_for(self.task, given, seed=number)}
         self._running = False
         self.worlds.reset({0: number}, goals=goals)
         self._run = EpisodeRun[Any](number, episode_rng(number, DEMONSTRATOR_STREAM))
-        self._score = self.worlds.score(0)
+        self.rewards.start([0])
         self._running = True
-        return observation(self.worlds, 0), information(self.worlds, 0, outcome=None)
+        return self.observing.of(0), information(self.worlds, 0, outcome=None)
 
-    def step(
-        self, action: ArrayLike
-    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Pick and place once, and wait for rest.
 
         Raises:
@@ -98,18 +125,21 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         """
         if not self._running:
             raise ResetNeeded("no episode runs: call reset() first")
-        report = self.worlds.step({0: check_action(action)})[0]
+        said = self.acting.of(action)
+        drawn = self.acting.drawn(0, said)
+        report = self.worlds.step({0: drawn})[0]
         info = information(self.worlds, 0, outcome=report.outcome)
-        reward = info["score"] - self._score
-        self._score = info["score"]
+        info |= self.acting.shift(said, drawn)
+        reward = float(self.rewards.take([0])[0])
         terminated, truncated = ending(self.worlds, 0, info)
         self._running = not (terminated or truncated)
-        return observation(self.worlds, 0), reward, terminated, truncated, info
+        return self.observing.of(0), reward, terminated, truncated, info
 
     def demonstrate(self, demonstrator: str = "scripted") -> Action | None:
         """What a demonstrator (scripted, visible, mpc or planner) would do; it sees the state.
 
-        None when it sees nothing to do or would reach beyond the action space.
+        None when it sees nothing to do or would reach beyond the action space. It is said as
+        `action_mode` has it.
 
         Raises:
             InputError: there is no such demonstrator.
@@ -118,7 +148,7 @@ class PickPlaceEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         if not self._running:
             raise ResetNeeded("no episode runs: call reset() first")
         action = find_demonstrator(demonstrator)(self.worlds, {0: self._run})[0]
-        return action if action is not None and self.action_space.contains(action) else None
+        return self.acting.said(action) if reachable(action) else None
 
     def render(self) -> np.ndarray | None:
         """The scene (360, 640, 3) uint8, black if it cannot be drawn; None without render mode."""

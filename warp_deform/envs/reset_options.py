@@ -15,9 +15,12 @@ from ..rendering.pixels import SHAPE
 from ..tasks.free_space import FreeSpace
 from ..tasks.task import Task
 
-__all__ = ["check_options", "goal_for", "next_seed"]
+__all__ = ["IGNORED", "check_options", "goal_for", "next_seed"]
 
 GoalOption = Goal | str | os.PathLike[str]
+
+IGNORED = ("lerobot_new_rollout",)
+"""Options by which others tell what changes nothing here."""
 
 _UNNAMED = (1_000_000, 1_000_000_000)
 """Range of the seeds of episodes that were started without one: clear of every published split."""
@@ -32,7 +35,8 @@ def check_options(options: Mapping[str, Any] | None, *known: str) -> Mapping[str
     """The options, {} for None; InputError if there is one that nothing here understands."""
     for name in options or {}:
         if name not in known:
-            raise InputError(f"reset has no option {name!r}; it has {', '.join(known)}")
+            ours = ", ".join(option for option in known if option not in IGNORED)
+            raise InputError(f"reset has no option {name!r}; it has {ours}")
     return options or {}
 
 

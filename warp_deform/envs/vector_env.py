@@ -16,20 +16,24 @@ from ..errors import InputError
 from ..planning.demonstrators import demonstrator as find_demonstrator
 from ..support.checked import real_array
 from ..tasks.task import Action, Task
+from ..worlds.acting import Acting, ActionMode, reachable
 from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 from ..worlds.loop import EpisodeRun
-from ..worlds.spaces import action_space, check_action, information, observation, observation_space
+from ..worlds.observing import Observing, ObsMode
+from ..worlds.rewards import RewardMode, Rewards
+from ..worlds.spaces import information
 from ..worlds.worlds import Worlds
+from .backends import Backend, as_backend, check_backend, stacked
 from .env import WorldsView, check_render_mode, ending
-from .reset_options import GoalOption, check_options, goal_for, next_seed
+from .named_calls import NamedCalls
+from .reset_options import IGNORED, GoalOption, check_options, goal_for, next_seed
 
 __all__ = ["PickPlaceVectorEnv"]
 
 Seeds = int | Sequence[int | None] | None
-Batch = dict[str, np.ndarray]
 
 
-class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
+class PickPlaceVectorEnv(NamedCalls, VectorEnv[Any, Any, Any]):
     """`num_envs` episodes of a task, simulated together: the fast way to gather experience.
 
         envs = gymnasium.make_vec("WarpDeform/CableRing-v2", num_envs=16)
@@ -47,8 +51,14 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
             in infos["final_info"]) or "Disabled" (reset ended ones with options={"reset_mask":
             mask})
         task: see `PickPlaceEnv`
+        backend: "numpy", or "torch" for observations, rewards and ends as tensors; actions may be
+            either in both
         robot: see `PickPlaceEnv`
         render_mode: see `PickPlaceEnv`
+        obs_mode: see `PickPlaceEnv`
+        action_mode: see `PickPlaceEnv`
+        snap: see `PickPlaceEnv`
+        reward_mode: see `PickPlaceEnv`
     """
 
     metadata: dict[str, Any] = {
@@ -65,6 +75,11 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         robot: str = "ur5",
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        backend: Backend = "numpy",
+        obs_mode: ObsMode = "images",
+        action_mode: ActionMode = "metric",
+        snap: float = 0.0,
+        reward_mode: RewardMode = "score",
     ) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, got {num_envs}")
@@ -73,14 +88,17 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
         self.worlds = Worlds(task, num_envs, robot=robot)
-        self.single_observation_space = observation_space(self.task)
-        self.single_action_space = action_space()
+        self.backend = check_backend(backend)
+        self.observing = Observing(self.worlds, obs_mode)
+        self.acting = Acting(self.worlds, action_mode, snap)
+        self.rewards = Rewards(self.worlds, reward_mode)
+        self.single_observation_space = self.observing.space
+        self.single_action_space = self.acting.space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.ended = np.zeros(num_envs, bool)
         """(num_envs,) bool: which episodes are over and wait for their reset."""
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
-        self._scores = np.zeros(num_envs)
         self._runs: dict[int, EpisodeRun[Any]] = {}
         self._view = WorldsView(self.worlds)
 
@@ -89,9 +107,18 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         """The task that is played."""
         return self.worlds.task
 
+    @property
+    def task_description(self) -> str:
+        """See `PickPlaceEnv`."""
+        return self.task.instruction
+
+    @property
+    def _max_episode_steps(self) -> int:
+        return self.task.max_actions
+
     def reset(
         self, *, seed: Seeds = None, options: dict[str, Any] | None = None
-    ) -> tuple[Batch, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in every environment.
 
         Args:
@@ -104,7 +131,7 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         Raises:
             InputError: a wrong number of seeds or goals, an unknown option, a goal of another task.
         """
-        given = check_options(options, "goal", "reset_mask")
+        given = check_options(options, "goal", "reset_mask", *IGNORED)
         seeds = self._seeds(seed)
         slots = self._masked(given.get("reset_mask"))
         goals = given.get("goal")
@@ -123,9 +150,7 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
             self._add_info(infos, information(self.worlds, i, outcome=None), i)
         return self._observations(), infos
 
-    def step(
-        self, actions: ArrayLike
-    ) -> tuple[Batch, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: ArrayLike) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Pick and place once in every environment, all at the same time.
 
         Args:
@@ -144,24 +169,25 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         rows = real_array(actions, (self.num_envs, 7), name="actions")
         waiting = [int(i) for i in np.flatnonzero(self.ended)]
         acting = {
-            i: check_action(action, name=f"action of environment {i}")
+            i: self.acting.of(action, name=f"action of environment {i}")
             for i, action in enumerate(rows)
             if i not in waiting
         }
-        reports = self.worlds.step(acting) if acting else {}
+        drawn = {i: self.acting.drawn(i, action) for i, action in acting.items()}
+        reports = self.worlds.step(drawn) if drawn else {}
         rewards = np.zeros(self.num_envs)
+        rewards[list(reports)] = self.rewards.take(list(reports))
         terminations, truncations = np.zeros((2, self.num_envs), bool)
         infos: dict[str, Any] = {}
         for i, report in reports.items():
             info = information(self.worlds, i, outcome=report.outcome)
-            rewards[i] = info["score"] - self._scores[i]
-            self._scores[i] = info["score"]
+            info |= self.acting.shift(acting[i], drawn[i])
             terminations[i], truncations[i] = ending(self.worlds, i, info)
             if (
                 terminations[i] or truncations[i]
             ) and self.autoreset_mode is AutoresetMode.SAME_STEP:
                 waiting.append(i)
-                last = {"final_obs": observation(self.worlds, i), "final_info": info}
+                last = {"final_obs": self.observing.of(i), "final_info": info}
                 self._add_info(infos, last, i)
             else:
                 self._add_info(infos, info, i)
@@ -169,7 +195,8 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         self._start(dict.fromkeys(waiting), {})
         for i in waiting:
             self._add_info(infos, information(self.worlds, i, outcome=None), i)
-        return self._observations(), rewards, terminations, truncations, infos
+        ends = (as_backend(part, self.backend) for part in (rewards, terminations, truncations))
+        return self._observations(), *ends, infos
 
     def demonstrate(self, demonstrator: str = "scripted") -> list[Action | None]:
         """What a demonstrator would do now in every environment, as in `PickPlaceEnv`.
@@ -184,11 +211,8 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
             raise ResetNeeded("no episodes run: call reset() first")
         running = {i: run for i, run in self._runs.items() if not self.ended[i]}
         chosen = find_demonstrator(demonstrator)(self.worlds, running)
-        space = self.single_action_space
         actions = [chosen.get(i) for i in range(self.num_envs)]
-        return [
-            action if action is not None and space.contains(action) else None for action in actions
-        ]
+        return [self.acting.said(action) if reachable(action) else None for action in actions]
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One frame (360, 640, 3) uint8 an environment; None without a render mode."""
@@ -207,8 +231,8 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
         self.worlds.reset(numbers, goals=made)
         for i, number in numbers.items():
             self._runs[i] = EpisodeRun(number, episode_rng(number, DEMONSTRATOR_STREAM))
-            self._scores[i] = self.worlds.score(i)
             self.ended[i] = False
+        self.rewards.start(list(numbers))
 
     def _draw(self, i: int) -> int:
         rng = self._rngs[i]
@@ -238,9 +262,9 @@ class PickPlaceVectorEnv(VectorEnv[Batch, np.ndarray, np.ndarray]):
             raise ResetNeeded("the first reset() is of all environments, without a mask")
         return [int(i) for i in np.flatnonzero(mask)]
 
-    def _observations(self) -> Batch:
-        seen = [observation(self.worlds, i) for i in range(self.num_envs)]
-        return {name: np.stack([one[name] for one in seen]) for name in seen[0]}
+    def _observations(self) -> Any:
+        seen = [self.observing.of(i) for i in range(self.num_envs)]
+        return as_backend(stacked(seen), self.backend)
 
 
 def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

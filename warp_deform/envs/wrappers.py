@@ -44,6 +44,7 @@ class PrivilegedStage(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorAr
         super().__init__(env)
         if not isinstance(env.unwrapped, PickPlaceEnv):
             raise InputError(f"PrivilegedStage wraps a PickPlaceEnv, not {env.unwrapped}")
+        _check_metric(env.unwrapped)
         self.action_space = _without_lift()
         self._stage: Stage | None = None
 
@@ -73,6 +74,7 @@ class VectorPrivilegedStage(VectorWrapper[Any, Any, Any, Any, Any]):
         super().__init__(env)
         if not isinstance(env.unwrapped, PickPlaceVectorEnv):
             raise InputError(f"VectorPrivilegedStage wraps a PickPlaceVectorEnv, not {env}")
+        _check_metric(env.unwrapped)
         self.single_action_space = _without_lift()
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         self._stages: list[Stage | None] = [None] * env.num_envs
@@ -113,6 +115,11 @@ def stage_at(worlds: Worlds, slot: int, pose: np.ndarray, previous: Stage | None
         if 0 <= row < SHAPE[0] and 0 <= column < SHAPE[1]:
             segment = int(snapshot.images.segmentation[row, column])
     return task.privileged_stage(segment, snapshot, previous)
+
+
+def _check_metric(env: PickPlaceEnv | PickPlaceVectorEnv) -> None:
+    if env.acting.mode != "metric":
+        raise InputError("the privileged rule takes actions in metres: make it without action_mode")
 
 
 def _without_lift() -> spaces.Box:

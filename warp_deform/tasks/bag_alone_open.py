@@ -32,6 +32,7 @@ class BagAloneOpen(BagTask):
     """
 
     name = "bag-alone-open"
+    instruction = "Open the bag."
     stages = (OPEN,)
     success_score = 0.70
     ground_truth_rows = BAG_ROWS

@@ -5,6 +5,7 @@ Source: Seita et al., ICRA 2021, appendix on bag-color-goal.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -50,6 +51,7 @@ class BagColorGoal(BagTask):
     """
 
     name = "bag-color-goal"
+    instruction = "Put the block into the bag that has it in the goal picture."
     goal_conditioned = True
     stages = (OPEN, INSERT)
     success_score = 0.95
@@ -200,13 +202,17 @@ class BagColorGoal(BagTask):
         opened = self.opening(snapshot) - 0.5 * self.map_distance(layout, snapshot)
         return 2.0 * self.score(layout, snapshot) + opened
 
-    def loss(
-        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    def losses(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
     ) -> Tensor:
         """Distance [m] of the block from the target bag's opening, and how far that is not open."""
-        centre = particle_q[list(self.bag_of(snapshot).ring), :2].mean(0)
-        away = ((body_q[0, :2] - centre).square().sum() + 1e-8).sqrt()
-        return self.opening_loss(layout, snapshot, particle_q) + away
+        centre = self.ring_of(snapshots, particle_q)[..., :2].mean(1)
+        away = ((body_q[:, 0, :2] - centre).square().sum(-1) + 1e-8).sqrt()
+        return self.opening_loss(layouts, snapshots, particle_q) + away
 
     def privileged_stage(self, segment: int, snapshot: Snapshot, previous: Stage | None) -> Stage:
         """A pick on the block is to insert it, any other to open the bag."""

@@ -5,6 +5,7 @@ Source: Seita et al., ICRA 2021, appendix on bag-items.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -23,6 +24,7 @@ from .demonstrators import pick_place
 from .free_space import FreeSpace, first_that_fits
 from .ground_truth import Row, pose_rows
 from .history import PastAction
+from .losses import lengths
 from .target_shapes import to_world
 from .task import Action, Layout, Snapshot, Stage
 
@@ -52,6 +54,7 @@ class BagItems1(BagTask):
     """
 
     name = "bag-items-1"
+    instruction = "Put the cube into the bag and carry the bag to the zone."
     stages = (OPEN, INSERT, CARRY)
     success_score = 0.5
     version = 3
@@ -233,17 +236,35 @@ class BagItems1(BagTask):
             return 2.0 * inside
         return 2.0 * inside + self.opening(snapshot) - 0.5 * self.map_distance(layout, snapshot)
 
-    def loss(
-        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    def losses(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
     ) -> Tensor:
         """Distance [m] of the items from the zone; of those that are outside first from the bag."""
-        outside = self._outside(snapshot)
-        if not outside:
-            goal = body_q.new_tensor(_frame(layout)[:2])
-            return _mean_length(body_q[:, :2] - goal)
-        centre = particle_q[list(self.bag_of(snapshot).ring), :2].mean(0)
-        opened = self.opening_loss(layout, snapshot, particle_q)
-        return opened + _mean_length(body_q[outside, :2] - centre)
+        outside = self._outside_mask(snapshots, body_q)
+        carried = lengths(body_q[..., :2] - _goals(layouts, body_q)[:, None]).mean(-1)
+        centre = self.ring_of(snapshots, particle_q)[..., :2].mean(1)
+        opened = self.opening_loss(layouts, snapshots, particle_q)
+        away = lengths(body_q[..., :2] - centre[:, None])
+        # where none is outside, what this comes to is not asked for
+        inserted = (away * outside).sum(-1) / outside.sum(-1).clamp(min=1)
+        return (opened + inserted).where(outside.any(-1), carried)
+
+    def remaining(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
+    ) -> Tensor:
+        """The loss above its least value; of a bag that lacks an item also its way to the zone."""
+        centre = self.ring_of(snapshots, particle_q)[..., :2].mean(1)
+        to_come = lengths(centre - _goals(layouts, body_q)) - self.least_loss
+        loss = self.losses(layouts, snapshots, particle_q, body_q)
+        return loss + to_come * self._outside_mask(snapshots, body_q).any(-1)
 
     def privileged_stage(self, segment: int, snapshot: Snapshot, previous: Stage | None) -> Stage:
         """A pick on an item is to insert it; the next pick on anything else carries, and so on."""
@@ -253,6 +274,11 @@ class BagItems1(BagTask):
         if previous is INSERT:
             return CARRY
         return previous or OPEN
+
+    def _outside_mask(self, snapshots: Sequence[Snapshot], like: Tensor) -> Tensor:
+        """Which items (W, n) bool are not in the bag."""
+        items, worlds = range(len(self.cubes)), [self._outside(s) for s in snapshots]
+        return like.new_tensor([[n in world for n in items] for world in worlds]).bool()
 
     def _outside(self, snapshot: Snapshot) -> list[int]:
         """Numbers of the items that are not in the bag."""
@@ -323,6 +349,7 @@ class BagItems2(BagItems1):
     """bag-items-1 with two boxes of different sizes, which may have to be turned."""
 
     name = "bag-items-2"
+    instruction = "Put both cubes into the bag and carry the bag to the zone."
     place_yaws = 24
     max_actions = 9
     ground_truth_rows = ((Row.POSE, 1), *BAG_ROWS, (Row.POSE, 2))
@@ -366,6 +393,6 @@ def _frame(layout: Layout) -> np.ndarray:
     return layout.frame
 
 
-def _mean_length(offsets: Tensor) -> Tensor:
-    """Mean length () of `offsets` (n, 2)."""
-    return (offsets.square().sum(-1) + 1e-8).sqrt().mean()
+def _goals(layouts: Sequence[Layout], like: Tensor) -> Tensor:
+    """Where the zones are (W, 2) [m]."""
+    return like.new_tensor(np.stack([_frame(layout)[:2] for layout in layouts]))

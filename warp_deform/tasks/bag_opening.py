@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import cv2
@@ -59,6 +60,7 @@ class BagTask(Task):
     solver = BAG_SOLVER
     primitive: ClassVar[PrimitiveConfig] = BAG_PRIMITIVE
     max_actions = 8
+    least_loss = -1.0  # of a bag that is open all round
     bag: ClassVar[BagConfig] = BagConfig()
     pushes: ClassVar[int] = 8
     """Number of the original's pushes of up to 10 N sideways and 8 N up at 480 Hz."""
@@ -184,19 +186,30 @@ class BagTask(Task):
 
     # -- gradients
 
-    def opening_loss(self, layout: Layout, snapshot: Snapshot, particle_q: Tensor) -> Tensor:
-        """How far the first bag's beads are from their targets, less how far it is open."""
+    def ring_of(self, snapshots: Sequence[Snapshot], particle_q: Tensor) -> Tensor:
+        """Beads (W, 32, 3) around the opening of the first bag, of particles (W, P, 3)."""
+        return particle_q[:, list(self.bag_of(snapshots[0]).ring)]
+
+    def opening_loss(
+        self, layouts: Sequence[Layout], snapshots: Sequence[Snapshot], particle_q: Tensor
+    ) -> Tensor:
+        """How far the first bag's beads are from their targets, less how far it is open (W,)."""
         radius = self.bag.opening_radius
-        beads = particle_q[list(self.bag_of(snapshot).ring)]
-        maps = ring_maps(len(beads), reversals=False)
-        away = mean_distance(beads[:, :2], self.ring_targets_of(layout), maps) / radius
+        beads = self.ring_of(snapshots, particle_q)
+        maps = ring_maps(beads.shape[1], reversals=False)
+        targets = np.stack([self.ring_targets_of(layout) for layout in layouts])
+        away = mean_distance(beads[..., :2], targets, maps) / radius
         return 0.5 * away - ring_area(beads) / (math.pi * radius**2)
 
-    def loss(
-        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    def losses(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
     ) -> Tensor:
         """Of opening the first bag."""
-        return self.opening_loss(layout, snapshot, particle_q)
+        return self.opening_loss(layouts, snapshots, particle_q)
 
     # -- opening
 

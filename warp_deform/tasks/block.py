@@ -6,6 +6,7 @@ Source: Seita et al., ICRA 2021, appendix on block-notarget.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -39,6 +40,7 @@ class BlockNotarget(Task):
     """
 
     name = "block-notarget"
+    instruction = "Move the block to where the goal picture shows it."
     goal_conditioned = True
     version = 2
     max_actions = 2
@@ -91,16 +93,22 @@ class BlockNotarget(Task):
         distance, turn = pose_error(self._pose(snapshot), layout.targets)
         return self.score(layout, snapshot) - distance - turn / 100
 
-    def loss(
-        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    def losses(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
     ) -> Tensor:
-        """Distance from the target [m], and 5 cm for each radian of turn from it."""
-        x, y, yaw = layout.targets
-        away = (body_q[0, :2] - body_q.new_tensor([x, y])).square().sum()
-        qx, qy, qz, qw = body_q[0, 3:]
+        """Distances from the targets [m], and 5 cm for each radian of turn from them."""
+        goals = np.stack([layout.targets for layout in layouts])
+        yaw = goals[:, 2]
+        away = (body_q[:, 0, :2] - body_q.new_tensor(goals[:, :2])).square().sum(-1)
+        qx, qy, qz, qw = body_q[:, 0, 3:].unbind(-1)
         across, along = 2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
         length = (across.square() + along.square()).sqrt()
-        turn = (along / length - np.cos(yaw)).square() + (across / length - np.sin(yaw)).square()
+        cos, sin = (body_q.new_tensor(part) for part in (np.cos(yaw), np.sin(yaw)))
+        turn = (along / length - cos).square() + (across / length - sin).square()
         return (away + 1e-8).sqrt() + 0.05 * (turn + 1e-8).sqrt()
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:

@@ -14,4 +14,5 @@ class CableLineNotarget(CableShapeNotarget):
     """cable-shape-notarget with one side: the goal is a straight line."""
 
     name = "cable-line-notarget"
+    instruction = "Lay the cable straight as in the goal picture."
     sides = (1,)

@@ -55,6 +55,7 @@ class CableMaskGoal(Task):
     """A bead chain, a parallel jaw, masks."""
 
     name = "cable-mask-goal"
+    instruction = "Bring the chain to where the goal mask shows it."
     goal_conditioned = True
     version = 2
     max_actions = 10

@@ -6,6 +6,7 @@ Source: Seita et al., ICRA 2021, appendix on cable-ring.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -53,6 +54,7 @@ class CableRing(Task):
     """
 
     name = "cable-ring"
+    instruction = "Open the ring of beads on the drawn circle."
     version = 2
     stages = (CABLE_STAGE,)
     solver = CABLE_SOLVER
@@ -116,12 +118,17 @@ class CableRing(Task):
         _, distances = self._mapped(layout, snapshot)
         return self.score(layout, snapshot) - 0.5 * float(distances.mean()) / self.cable.ring_radius
 
-    def loss(
-        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    def losses(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
     ) -> Tensor:
-        """Mean distance [m] of the beads from their targets under the best of 64 maps."""
+        """Mean distances [m] of the beads from their targets under the best of 64 maps."""
         maps = ring_maps(self.cable.beads, reversals=True)
-        return mean_distance(particle_q[:, :2], layout.targets, maps)
+        targets = np.stack([layout.targets for layout in layouts])
+        return mean_distance(particle_q[..., :2], targets, maps)
 
     def _mapped(self, layout: Layout, snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
         """Bead of every target (32,) under the best of 64 maps, and its distance (32,) [m]."""
@@ -180,6 +187,7 @@ class CableRingNotarget(CableRing):
     """cable-ring without marks: any opened ring will do, wherever it lies."""
 
     name = "cable-ring-notarget"
+    instruction = "Open the ring of beads to a circle."
     ground_truth_rows = ((Row.BEAD, 32),)
     visible = False
 

@@ -6,7 +6,7 @@ Source: Seita et al., ICRA 2021, appendix on cable-shape.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -44,6 +44,7 @@ class CableShape(Task):
     """
 
     name = "cable-shape"
+    instruction = "Lay the cable along the drawn sides."
     version = 2
     stages = (CABLE_STAGE,)
     solver = CABLE_SOLVER
@@ -122,13 +123,18 @@ class CableShape(Task):
         distances = np.linalg.norm(snapshot.particle_q[:, :2] - ways, axis=2).mean(axis=1)
         return self.score(layout, snapshot) - float(distances.min()) / self.cable.length
 
-    def loss(
-        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    def losses(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
     ) -> Tensor:
-        """Mean distance [m] of the beads from their targets, the cable the better way round."""
+        """Mean distances [m] of the beads from their targets, the cable the better way round."""
         forwards = np.arange(self.cable.beads)
         maps = np.stack([forwards, forwards[::-1]])
-        return mean_distance(particle_q[:, :2], layout.targets, maps)
+        targets = np.stack([layout.targets for layout in layouts])
+        return mean_distance(particle_q[..., :2], targets, maps)
 
     def _moves(
         self,
@@ -174,6 +180,7 @@ class CableShapeNotarget(CableShape):
     """cable-shape with the target in a goal image instead of on the table."""
 
     name = "cable-shape-notarget"
+    instruction = "Lay the cable as in the goal picture."
     goal_conditioned = True
     ground_truth_rows = ((Row.BEAD, 48),)
     visible = False

@@ -5,6 +5,7 @@ Source: Seita et al., ICRA 2021, appendix on fabric-flat.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -52,6 +53,7 @@ class FabricFlat(Task):
     """
 
     name = "fabric-flat"
+    instruction = "Spread the fabric on the drawn square."
     version = 2
     max_actions = 10
     stages = (Stage(lift=0.05, speed=FABRIC_SPEED),)
@@ -158,13 +160,18 @@ class FabricFlat(Task):
         mean = self._distances(layout, snapshot).mean(axis=1).min()
         return self.score(layout, snapshot) - float(mean)
 
-    def loss(
-        self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
+    def losses(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
     ) -> Tensor:
-        """Mean distance [m] of the vertices from a fabric that lies flat on the square."""
-        flat = cloth_sheet(self.fabric, tuple(layout.targets[0, :2]), yaw=layout.targets[0, 2])
+        """Mean distances [m] of the vertices from a fabric that lies flat on the square."""
+        squares = [layout.targets[0] for layout in layouts]
+        flat = [cloth_sheet(self.fabric, tuple(pose[:2]), yaw=pose[2]) for pose in squares]
         maps = grid_maps(self.fabric.rows, self.fabric.columns)
-        return mean_distance(particle_q[:, :2], flat[:, :2], maps)
+        return mean_distance(particle_q[..., :2], np.stack(flat)[..., :2], maps)
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(303,): x, y, -yaw / 15 of the square, then x, y, z of every vertex."""
@@ -215,6 +222,7 @@ class FabricFlatNotarget(FabricFlat):
     """fabric-flat with the square in a goal image, as a fabric that lies there."""
 
     name = "fabric-flat-notarget"
+    instruction = "Spread the fabric as in the goal picture."
     goal_conditioned = True
     ground_truth_rows = ((Row.POINT, 200),)
     visible = False

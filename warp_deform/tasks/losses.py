@@ -1,6 +1,7 @@
 """Smooth stand-ins for what is left to do, for gradients: distances under the best map, areas.
 
 They take tensors of any precision and keep the graph; what they compare with are plain arrays.
+Leading dimensions are worlds side by side: each gets the bits that it has alone.
 """
 
 from __future__ import annotations
@@ -12,31 +13,36 @@ import numpy as np
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["cover_distance", "grid_maps", "mean_distance", "ring_area"]
+__all__ = ["cover_distance", "grid_maps", "lengths", "mean_distance", "ring_area"]
+
+
+def lengths(offsets: Tensor) -> Tensor:
+    """Lengths (...) of `offsets` (..., d); a tenth of a millimetre rounds the tip of the norm."""
+    return (offsets.square().sum(-1) + 1e-8).sqrt()  # whose slope at nought is none
 
 
 def mean_distance(points: Tensor, targets: np.ndarray, maps: np.ndarray) -> Tensor:
-    """Mean distance () [m] of `points` (n, d) from `targets` (n, d) under the best of the maps.
+    """Mean distance (...) [m] of `points` (..., n, d) from `targets` under the best of the maps.
 
     Args:
+        targets: (..., n, d)
         maps: (m, n), entry j of a map is the point for target j
     """
     import torch
 
     goals = points.new_tensor(np.asarray(targets, dtype=float))
-    offsets = points[torch.as_tensor(np.ascontiguousarray(maps))] - goals
-    # a tenth of a millimetre rounds the tip of the norm, whose slope at nought is none
-    lengths = (offsets.square().sum(-1) + 1e-8).sqrt()
-    return lengths.mean(-1).min()
+    mapped = points[..., torch.as_tensor(np.ascontiguousarray(maps)), :]
+    offsets = mapped - goals[..., None, :, :]
+    return lengths(offsets).mean(-1).amin(-1)
 
 
 def ring_area(beads: Tensor) -> Tensor:
-    """Area () [m^2] that a closed chain (n, 2 or 3) encloses seen from above, in its own order.
+    """Area (...) [m^2] that a closed chain (..., n, 2 or 3) encloses from above, in its own order.
 
     Loops that run the other way round count against it. Source: the shoelace formula.
     """
-    x, y = beads[:, 0], beads[:, 1]
-    return 0.5 * (x * y.roll(-1) - y * x.roll(-1)).sum().abs()
+    x, y = beads[..., 0], beads[..., 1]
+    return 0.5 * (x * y.roll(-1, -1) - y * x.roll(-1, -1)).sum(-1).abs()
 
 
 def cover_distance(vertices: Tensor, points: Tensor, softness: float) -> Tensor:
@@ -48,8 +54,7 @@ def cover_distance(vertices: Tensor, points: Tensor, softness: float) -> Tensor:
     import torch
 
     offsets = vertices[None, :, :2] - points[:, None, :]
-    lengths = (offsets.square().sum(-1) + 1e-8).sqrt()
-    return (-softness * torch.logsumexp(-lengths / softness, dim=1)).mean()
+    return (-softness * torch.logsumexp(-lengths(offsets) / softness, dim=1)).mean()
 
 
 def grid_maps(rows: int, columns: int) -> np.ndarray:

@@ -7,7 +7,7 @@ start (`Layout`), reads what came out (`Snapshot`), scores it and proposes the n
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
@@ -156,11 +156,22 @@ class Task(abc.ABC):
     """Place yaws to choose among, evenly spread; 1 where the yaw does not matter."""
     version: ClassVar[int] = 1
     """Of its Gymnasium id: rises with any change of physics, observation or reward."""
+    instruction: ClassVar[str]
+    """What is to be done, as a sentence for policies that read one; by default the name's words."""
+    least_loss: ClassVar[float] = 0.0
+    """What `loss` comes to when everything is done."""
     looks_aloft: ClassVar[bool] = False
     """Whether its rules ask where things were while what was held hung highest, see `Aloft`."""
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
+        # who defines one of the two anew means it for both
+        if "loss" in vars(cls) and "losses" not in vars(cls):
+            cls.losses = Task.losses  # type: ignore[method-assign]
+        if "losses" in vars(cls) and "loss" not in vars(cls):
+            cls.loss = Task.loss  # type: ignore[method-assign]
+        if "instruction" not in vars(cls) and "name" in vars(cls):
+            cls.instruction = cls.name.replace("-", " ").capitalize() + "."
         if "ground_truth_rows" in vars(cls) and "ground_truth_size" not in vars(cls):
             cls.ground_truth_size = 3 * row_count(cls.ground_truth_rows)
 
@@ -262,18 +273,63 @@ class Task(abc.ABC):
         """How good a state is to go on from; `mpc` takes the action whose outcome has the most."""
         return self.score(layout, snapshot)
 
+    @classmethod
+    def has_loss(cls) -> bool:
+        """Whether the task defines `loss` or `losses`."""
+        return cls.loss is not Task.loss or cls.losses is not Task.losses
+
     def loss(
         self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor
     ) -> Tensor:
         """A smooth measure () of what is left to do after an action from `snapshot`.
 
-        Only for tasks that define it are there gradients to plan by.
+        Only for tasks that define it, or `losses`, are there gradients to plan by, and dense
+        rewards.
 
         Args:
             particle_q: positions of the particles that the action leaves (P, 3) [m]
             body_q: poses of the bodies that it leaves (B, 7)
         """
-        raise TypeError(f"{self.name} has no loss to differentiate")
+        if type(self).losses is Task.losses:
+            raise TypeError(f"{self.name} has no loss to differentiate")
+        return self.losses([layout], [snapshot], particle_q[None], body_q[None])[0]
+
+    def losses(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
+    ) -> Tensor:
+        """`loss` of many worlds (W,) at once, each to the bits that it has alone.
+
+        A task defines one of the two, the other follows; this one costs less for many worlds.
+
+        Args:
+            layouts: of each world, as are `snapshots`
+            particle_q: (W, P, 3) [m]
+            body_q: (W, B, 7)
+        """
+        if type(self).loss is Task.loss:
+            raise TypeError(f"{self.name} has no loss to differentiate")
+        worlds = zip(layouts, snapshots, particle_q, body_q, strict=True)
+        import torch
+
+        return torch.stack([self.loss(*world) for world in worlds])
+
+    def remaining(
+        self,
+        layouts: Sequence[Layout],
+        snapshots: Sequence[Snapshot],
+        particle_q: Tensor,
+        body_q: Tensor,
+    ) -> Tensor:
+        """What rewards count down (W,): the losses above their least value, so about 0 when done.
+
+        Args:
+            snapshots: of the same states as `particle_q` (W, P, 3) and `body_q` (W, B, 7)
+        """
+        return self.losses(layouts, snapshots, particle_q, body_q) - self.least_loss
 
     @abc.abstractmethod
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:

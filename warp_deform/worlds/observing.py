@@ -1,0 +1,121 @@
+"""Ways to show a running episode: pictures, numbers, or both, as an agent's library expects them.
+
+Pictures by the names that LeRobot reads: `pixels` holds cameras (H, W, 3) uint8, `agent_pos` is
+what a robot knows of itself, `environment_state` what a camera does not tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
+
+import numpy as np
+from gymnasium import spaces
+
+from ..episodes import MAX_HEIGHT
+from ..errors import InputError
+from ..rendering.pixels import SHAPE
+from ..tasks.free_space import FreeSpace
+from .spaces import observation, observation_space
+from .worlds import Worlds
+
+__all__ = ["ObsMode", "Observing"]
+
+ObsMode = Literal["images", "state", "state_dict", "rgb", "rgbd", "rgb+state"]
+
+
+class Observing:
+    """The observations of one mode; `of` makes a slot's, new arrays that the caller may change.
+
+    - "images": `color`, `height`, with a goal also `goal_color`, `goal_height`;
+    - "state": the numbers of "state_dict" in its order, (D,) float32;
+    - "state_dict": `tip` x, y, z [m], yaw [rad], `particle_q` (P, 3) [m], `body_q` (B, 7), `goal`
+      (what the task aims at, `Layout.targets`), `time` (share of the actions that are used up);
+    - "rgb": `pixels` {`top`, with a goal also `goal`: (320, 160, 3) uint8}, `agent_pos` (the tip);
+    - "rgbd": the same and `depth`, height above the table (320, 160) float32 [m];
+    - "rgb+state": that of "rgb" and `environment_state`, which is that of "state".
+
+    What a task has none of, particles or bodies, is left out. All is zero where a state is not
+    finite; its `physics_ok` is False then.
+
+    Raises:
+        InputError: there is no such mode.
+    """
+
+    def __init__(self, worlds: Worlds, mode: str) -> None:
+        if mode not in get_args(ObsMode):
+            raise InputError(f"obs_mode is one of {', '.join(get_args(ObsMode))}, not {mode!r}")
+        self._worlds, self.mode = worlds, mode
+        self._goal = worlds.task.sample(np.random.default_rng(0), FreeSpace()).targets.shape
+        self.space: spaces.Space[Any] = self._space()
+
+    def of(self, slot: int) -> Any:
+        """What an agent sees of a slot."""
+        if self.mode == "images":
+            return observation(self._worlds, slot)
+        if self.mode == "state":
+            return self._flat(slot)
+        if self.mode == "state_dict":
+            return self._state(slot)
+        pictures = observation(self._worlds, slot)
+        pixels = {"top": pictures["color"]}
+        if "goal_color" in pictures:
+            pixels["goal"] = pictures["goal_color"]
+        seen: dict[str, Any] = {"pixels": pixels, "agent_pos": self._state(slot)["tip"]}
+        if self.mode == "rgbd":
+            seen["depth"] = pictures["height"]
+        if self.mode == "rgb+state":
+            seen["environment_state"] = self._flat(slot)
+        return seen
+
+    def _state(self, slot: int) -> dict[str, np.ndarray]:
+        episode, task = self._worlds.episodes[slot], self._worlds.task
+        snapshot = episode.snapshot
+        numbers = {
+            "tip": episode.tip,
+            "particle_q": snapshot.particle_q,
+            "body_q": snapshot.body_q,
+            "goal": episode.layout.targets,
+            "time": np.array([len(episode.history) / task.max_actions]),
+        }
+        state = {name: np.array(array, np.float32) for name, array in numbers.items() if array.size}
+        if all(np.isfinite(array).all() for array in state.values()):
+            return state
+        return {name: np.zeros_like(array) for name, array in state.items()}
+
+    def _flat(self, slot: int) -> np.ndarray:
+        return np.concatenate([array.ravel() for array in self._state(slot).values()])
+
+    def _space(self) -> spaces.Space[Any]:
+        if self.mode == "images":
+            return observation_space(self._worlds.task)
+        world = self._worlds.solver.data.topologies[0]
+        shapes: Mapping[str, tuple[int, ...]] = {
+            "tip": (4,),
+            "particle_q": (world.particle_count, 3),
+            "body_q": (world.body_count, 7),
+            "goal": self._goal,
+            "time": (1,),
+        }
+        boxes: dict[str, spaces.Space[Any]] = {
+            name: _numbers(shape) for name, shape in shapes.items() if np.prod(shape)
+        }
+        if self.mode == "state_dict":
+            return spaces.Dict(boxes)
+        size = sum(int(np.prod(shape)) for name, shape in shapes.items() if name in boxes)
+        if self.mode == "state":
+            return _numbers((size,))
+        picture = spaces.Box(0, 255, (*SHAPE, 3), np.uint8)
+        pixels: dict[str, spaces.Space[Any]] = {"top": picture}
+        if self._worlds.task.goal_conditioned:
+            pixels["goal"] = picture
+        seen: dict[str, Any] = {"pixels": spaces.Dict(pixels), "agent_pos": _numbers((4,))}
+        if self.mode == "rgbd":
+            seen["depth"] = spaces.Box(0.0, MAX_HEIGHT, SHAPE, np.float32)
+        if self.mode == "rgb+state":
+            seen["environment_state"] = _numbers((size,))
+        return spaces.Dict(seen)
+
+
+def _numbers(shape: tuple[int, ...]) -> spaces.Box:
+    return spaces.Box(-np.inf, np.inf, shape, np.float32)
