@@ -8,6 +8,7 @@ from __future__ import annotations
 from ..support.lazy_exports import lazy_exports
 
 _HOME = {
+    "ControlLoop": ".control",
     "DifferentiableRollout": ".differentiable",
     "Frames": ".rollouts",
     "Gradients": ".differentiable",

@@ -19,7 +19,7 @@ from ..rollout.differentiable import DifferentiableRollout
 from ..rollout.rollouts import GripPath
 from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
-from .stepping import damp_every
+from ..xpbd.springs.viscosity import damp_every
 
 __all__ = ["TapedStep", "recording", "refuse_lost_derivatives", "unrecorded"]
 

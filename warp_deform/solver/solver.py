@@ -15,8 +15,9 @@ from ..objects.attributes import NAMESPACE, register_attributes
 from ..xpbd.config import SolverConfig
 from ..xpbd.fused_xpbd import FOREVER, FusedXPBD
 from ..xpbd.guards import WatchValues
+from ..xpbd.springs.viscosity import damp_every
 from .newton_tape import TapedStep, recording, refuse_lost_derivatives, unrecorded
-from .stepping import damp_every, grip_from_control, substeps
+from .stepping import grip_from_control, substeps
 
 __all__: list[str] = []  # `warp_deform.solver` is the import path of what is here
 

@@ -9,9 +9,8 @@ import numpy as np
 from ..errors import InputError
 from ..support.checked import POSITIVE, check_number
 from ..xpbd.packing.data import SolverData
-from ..xpbd.springs.viscosity import DAMP_EVERY
 
-__all__ = ["damp_every", "grip_from_control", "substeps"]
+__all__ = ["grip_from_control", "substeps"]
 
 FINEST = 1 / 16
 """Shortest substep of a step, as a share of the configured one: in float32, positions are too
@@ -42,14 +41,6 @@ def substeps(dt: Any, usual: float) -> tuple[int, float]:
     if count * usual < dt:
         count += 1
     return count, dt / count
-
-
-def damp_every(steps: int) -> int:
-    """Substeps between two visits of viscosity in a step of so many, which has its share of them.
-
-    As many as in a rollout where that divides them.
-    """
-    return next(every for every in range(DAMP_EVERY, 0, -1) if steps % every == 0)
 
 
 def grip_from_control(data: SolverData, control: Any, duration: float) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import InputError
+from ..xpbd.continuing.world_run import WorldRun
 from ..xpbd.packing.data import SolverData
 from .episode import RunningEpisode
 
@@ -17,8 +18,8 @@ __all__ = ["WorldState"]
 class WorldState:
     """What `Worlds.state` saves: all that the next action's outcome depends on, bit for bit.
 
-    Arrays have the solver's precision. Nothing else lasts between two launches: contacts are found
-    anew and nothing is held.
+    Arrays have the solver's precision. Nothing else lasts between two actions: contacts are found
+    anew and nothing is held. Under control (see `TipControl`) `run` is what lasts.
 
     Attributes:
         particle_q: positions of the particles (P, 3) [m]
@@ -30,6 +31,7 @@ class WorldState:
         body_v: their velocities (B, 3) [m/s]
         body_omega: their angular velocities (B, 3) [rad/s]
         episode: seed, layout, goal, actions, tip, posture and the like
+        run: what is held, listed and counted in the midst of control; None: there was none
     """
 
     particle_q: np.ndarray
@@ -41,9 +43,12 @@ class WorldState:
     body_v: np.ndarray
     body_omega: np.ndarray
     episode: RunningEpisode
+    run: WorldRun | None = None
 
     @staticmethod
-    def of(data: SolverData, world: int, episode: RunningEpisode) -> WorldState:
+    def of(
+        data: SolverData, world: int, episode: RunningEpisode, run: WorldRun | None = None
+    ) -> WorldState:
         """Copy the state of one world."""
         x, quat, v, omega = (array.copy() for array in _bodies(data, world))
         return WorldState(
@@ -56,6 +61,7 @@ class WorldState:
             body_v=v,
             body_omega=omega,
             episode=_copy(episode),
+            run=run,
         )
 
     def put(self, data: SolverData, world: int) -> RunningEpisode:

@@ -6,7 +6,7 @@ episode's bits depend on its seed and its actions only, not on its neighbours or
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import newton
@@ -22,6 +22,7 @@ from ..rendering.pixels import BOUNDS
 from ..rendering.topdown import TopDown
 from ..robots import robot as find_robot
 from ..robots.primitive import Motion, Outcome, solve_joints
+from ..rollout.control import ControlLoop
 from ..rollout.rollouts import rollout
 from ..solver.solver import SolverFusedXPBD
 from ..support.checked import real_array
@@ -96,6 +97,7 @@ class Worlds:
         )
         self.episodes: dict[int, RunningEpisode] = {}
         self._topdown = TopDown()
+        self._loop: ControlLoop | None = None
         self._space = FreeSpace(reach=self._reach())
 
     def _reach(self) -> tuple[float, float]:
@@ -118,6 +120,7 @@ class Worlds:
         """
         for slot in seeds:
             self._check_slot(slot)
+        self._end_control(seeds)
         goals = goals or {}
         rngs = {slot: episode_rng(seed, LAYOUT_STREAM) for slot, seed in seeds.items()}
         discarded = dict.fromkeys(seeds, 0)
@@ -274,6 +277,8 @@ class Worlds:
         action = real_array(action, (7,), name=f"action of slot {slot}", finite=True)
         if slot not in self.episodes:
             raise InputError(f"slot {slot} has no episode: reset it first")
+        if self.solver.continued[slot]:
+            raise InputError(f"slot {slot} is under control: end it before a pick and place")
         self.episodes[slot].over |= self.episodes[slot].ended
         return Execution(action)
 
@@ -284,6 +289,24 @@ class Worlds:
         """
         executions = {slot: self._checked(slot, action) for slot, action in actions.items()}
         return lead_down(self, executions)
+
+    def control_loop(self, rate: float = 20.0) -> ControlLoop:
+        """The loop that leads tips of slots at `rate` [Hz]; `TipControl` drives it.
+
+        Raises:
+            InputError: the rate has no whole number of substeps, or slots are under control at
+                another one.
+        """
+        if self._loop is None or self._loop.rate != rate:
+            if self._loop is not None and len(self._loop.worlds):
+                raise InputError(f"slots are under control at {self._loop.rate:g} Hz: end it first")
+            self._loop = ControlLoop(self.solver, rate=rate)
+        return self._loop
+
+    def _end_control(self, slots: Iterable[int]) -> None:
+        busy = [slot for slot in slots if self.solver.continued[slot]]
+        if self._loop is not None and busy:
+            self._loop.end(busy)
 
     def reachable(
         self, executions: Mapping[int, Execution], motions: Mapping[int, Motion]
@@ -321,12 +344,15 @@ class Worlds:
 
     def state(self, slot: int) -> WorldState:
         """All that the slot's episode goes on from; the slot must have been reset."""
-        return WorldState.of(self.solver.data, slot, self.episodes[slot])
+        led = self._loop is not None and self.solver.continued[slot]
+        run = self._loop.save(slot) if self._loop is not None and led else None
+        return WorldState.of(self.solver.data, slot, self.episodes[slot], run)
 
     def restore(self, slot: int, state: WorldState) -> None:
         """Go on from `state` in a slot, bit for bit as where it was saved.
 
         It may come from another slot, or from other worlds of the same task, robot and precision.
+        The slot is then under control if it was so where the state was saved, and holds the same.
 
         Raises:
             InputError: it does not fit.
@@ -334,10 +360,13 @@ class Worlds:
         self._check_slot(slot)
         if state.episode.posture.shape != self.robot.home_q.shape:
             raise InputError("the state was saved with another robot")
+        self._end_control([slot])
         # before the state, for it wakes what sleeps
         self._set_physics(slot, state.episode.layout)
         episode = self.episodes[slot] = state.put(self.solver.data, slot)
         self._shape_boxes(slot, episode.layout, episode.objects)
+        if state.run is not None:
+            (self._loop or self.control_loop()).restore(slot, state.run)
         self.look(slot)
 
     def score(self, slot: int) -> float:

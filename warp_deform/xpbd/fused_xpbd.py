@@ -78,6 +78,8 @@ class FusedXPBD:
         self.threads = _thread_count(threads, self.data)
         self.bundles = bundles
         self.bundle: Path | None = None
+        self.continued = np.zeros(self.data.world_count, bool)
+        """Which worlds are in the midst of a launch that goes on, see `ContinuedLaunch`."""
         self._kernel = forward_kernel(
             scalars[precision],
             lanes,
@@ -141,7 +143,16 @@ class FusedXPBD:
             self.data.per_world("group.calm_after", w)[:] = calm_after
 
     def activate(self, worlds: np.ndarray | None = None) -> None:
-        """Only these worlds take part in the next launches (None: all); others keep their state."""
+        """Only these worlds take part in the next launches (None: all); others keep their state.
+
+        Raises:
+            InputError: one is in the midst of a launch that goes on.
+        """
+        busy = np.flatnonzero(self.continued)
+        if len(busy):
+            busy = busy if worlds is None else np.intersect1d(worlds, busy)
+        if len(busy):
+            raise InputError(f"world {busy[0]} is under control: end its control first")
         view = self.data.views["group.active"]
         view[:] = 0.0
         for w in range(self.data.world_count) if worlds is None else worlds:

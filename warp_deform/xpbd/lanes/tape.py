@@ -28,13 +28,14 @@ __all__ = [
     "TRIANGLE_SCALARS",
     "TRIANGLE_WORDS",
     "Kind",
+    "RunColumn",
     "tape",
 ]
 
 STATE = 14
 """Lane vectors of the kernel's own state per group."""
 COUNTERS = 3
-"""Whole numbers of the kernel's own state per group."""
+"""Whole numbers of the kernel's own state per group: substeps, near pairs, longest push."""
 GRIP_WORDS = 8
 """Whole numbers on the tape for a lane that holds something."""
 TRIANGLE_WORDS = 2
@@ -50,6 +51,18 @@ BOX_PARTICLE_SCALARS = 13
 """Of that contact: position and old position of the particle, pose of the body."""
 BOX_TRIANGLE_SCALARS = 16
 """The same with the positions of the triangle's corners."""
+
+
+class RunColumn(IntEnum):
+    """Places of a `Run`'s lane vectors in the kernel's own state, as `save_state` leaves them."""
+
+    ON = 0
+    STEPS = 1
+    QUIET = 2
+    HOLDING = 3
+    CALM = 4
+    STALE = 5
+    CLAMPED = 8
 
 
 class Kind(IntEnum):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import newton
@@ -13,6 +14,7 @@ from ...support.quaternion import quat_rotate
 from ..bodies.box_box import POINTS
 from ..springs.tether import NO_TETHER
 from .groups import NUMPY, PackedWorlds
+from .mirrored import Mirrored
 from .sheet_data import add_sheets
 from .topology import pieces, tethers
 
@@ -246,26 +248,34 @@ class SolverData(PackedWorlds):
             for mirrored in self.arrays.values():
                 mirrored.to_host()
 
-    def struct(self, name: str) -> Any:
-        """One of the kernel's structs (see `KERNEL_ARGUMENTS`), filled with the arrays."""
+    def struct(self, name: str, own: Mapping[str, Mirrored] | None = None) -> Any:
+        """One of the kernel's structs (see `KERNEL_ARGUMENTS`), filled with the arrays.
+
+        Args:
+            own: arrays to take in place of those of the same names
+        """
         value = getattr(self.types, name.capitalize())()
-        for key, mirrored in self.arrays.items():
+        for key, mirrored in {**self.arrays, **(own or {})}.items():
             owner, field = key.split(".")
             if owner == name:
                 setattr(value, field, mirrored.array)
         return value
 
-    def structs(self) -> list[Any]:
-        """All structs of the kernel, in the order of `KERNEL_ARGUMENTS`."""
-        out = [self.struct(name) for name in KERNEL_ARGUMENTS]
+    def structs(self, own: Mapping[str, Mirrored] | None = None) -> list[Any]:
+        """All structs of the kernel, in the order of `KERNEL_ARGUMENTS`; `own` as for `struct`."""
+        out = [self.struct(name, own) for name in KERNEL_ARGUMENTS]
         alias_lanes(out, self.scalar)
         return out
 
     def lane(self, name: str, world: int) -> np.ndarray:
         """Writable view of one world's particles in an array of V3 -> (P, 3) or V -> (P,)."""
+        return self.lane_of(self.arrays[name], world)
+
+    def lane_of(self, array: Mirrored, world: int) -> np.ndarray:
+        """The same of an array that is not the solver's own."""
         group, lane = divmod(int(self.slot[world]), self.lanes)
         rows = slice(self.group_particle[group], self.group_particle[group + 1])
-        return self.arrays[name].view[rows][..., lane]
+        return array.view[rows][..., lane]
 
     def body_rows(self, world: int) -> slice:
         """Rows of one world's bodies in the arrays of bodies."""

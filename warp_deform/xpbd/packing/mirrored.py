@@ -38,6 +38,12 @@ class Mirrored:
         self.array = self._host if device.is_cpu else wp.zeros_like(self._host, device=device)
         self.view: np.ndarray = memory.view(scalar).reshape(max(count, 1), *shape)
 
+    def like(self, count: int | None = None) -> Mirrored:
+        """Another one of the same elements, all 0; None: of as many."""
+        elements = len(self.view) if count is None else count
+        shape, number = self.view.shape[1:], self.view.dtype.type
+        return Mirrored(elements, self.array.dtype, self.array.device, number, shape)
+
     def to_device(self) -> None:
         """Make the device see what was written to `view`."""
         if self.array is not self._host:
