@@ -4,6 +4,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+SUDO ?= $(if $(filter 0,$(shell id -u)),,sudo -n)
 STAMP := $(VENV)/.installed
 DEMO := demo
 
@@ -11,7 +12,7 @@ DEMO := demo
 # torch and Newton again, for longer than most tests take.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help venv demo test check lint format bench docs clean
+.PHONY: help venv demo test check lint format bench docs chromium three clean
 
 help:
 	@echo "make demo    demonstrations of cable-shape and bag-items-1 and their videos, under demo/"
@@ -21,6 +22,8 @@ help:
 	@echo "make format  let ruff rewrite what it can"
 	@echo "make bench   time the simulator"
 	@echo "make docs    the documentation site, in build/site; a broken link fails"
+	@echo "make chromium   Debian's Chromium, in which tests open the page"
+	@echo "make three   bundle three.js anew, and compare it with the one that is checked in (needs node)"
 	@echo "make clean   remove demo/ and caches (the environment stays: remove $(VENV) by hand)"
 
 venv: $(STAMP)
@@ -62,6 +65,20 @@ bench: $(STAMP)
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "open build/site/index.html; to search it, serve it: python3 -m http.server -d build/site"
+
+# Tests of the page without it are skipped and say so.
+chromium:
+	command -v chromium || { $(SUDO) apt-get update -qq && \
+		$(SUDO) apt-get install -y -qq --no-install-recommends chromium; }
+
+# What the page draws with: its entry file and its licence stand beside it.
+THREE := warp_deform/page/static
+three:
+	mkdir -p build/three && cp $(THREE)/three_entry.js build/three
+	cd build/three && npm install --no-audit --no-fund --no-save three@0.187.0 esbuild@0.28.2 && \
+		npx esbuild three_entry.js --bundle --minify --format=esm --outfile=three.js
+	cmp build/three/three.js $(THREE)/three.js
+	cmp build/three/node_modules/three/LICENSE $(THREE)/three.LICENSE
 
 clean:
 	rm -rf demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -31,6 +31,7 @@ FLOORS = {
     "warp_deform": [
         "__main__",
         "command envs",
+        "page",
         "gradcheck collecting",
         "planning",
         "worlds bench",
@@ -68,7 +69,7 @@ FLOORS = {
 """Rooms from top to bottom; those of one floor do not know each other."""
 OPTIONAL = {
     "pybullet", "pybullet_data", "ray", "tensorboard", "h5py", "panda_py",
-    "franky", "frankapy", "pyk4a", "pyrealsense2",
+    "franky", "frankapy", "pyk4a", "pyrealsense2", "websockets", "playwright",
 }  # fmt: skip
 COMPUTED_IMPORTS = {
     "warp_deform/command/main.py",

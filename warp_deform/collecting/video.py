@@ -13,7 +13,7 @@ from ..errors import InputError, WarpDeformError
 from ..rendering.caption import Caption
 from ..rendering.scene_view import ArmMeshes, SceneView
 from ..rendering.video import VideoWriter
-from ..worlds.episode import StepReport
+from ..worlds.arm_path import ArmPath
 from ..worlds.loop import worlds_for
 from ..worlds.worlds import Worlds
 from .recording import recorded_task
@@ -159,7 +159,7 @@ def _shots(worlds: Worlds, take: Take, speed: float) -> Iterator[_Shot]:
         start = worlds.episodes[0].snapshot
         report = worlds.step({0: action}, record=interval)[0]
         _check(worlds, take, t + 1)
-        arm = _ArmPath(report, waiting)
+        arm = ArmPath(report, waiting)
         waiting = arm.at(arm.seconds)
         if t == 0 or report.frames is None:
             yield from [_Shot(start.particle_q, start.body_q, arm.at(0.0), t)] * still
@@ -174,27 +174,6 @@ def _shots(worlds: Worlds, take: Take, speed: float) -> Iterator[_Shot]:
         for time in np.arange(frames.times[-1] + interval, arm.seconds, interval):
             yield _Shot(end.particle_q, end.body_q, arm.at(time), t)
     yield from [_Shot(end.particle_q, end.body_q, arm.at(arm.seconds), t + 1)] * still
-
-
-class _ArmPath:
-    """Joint positions during one action: along its motions, from where the last one ended."""
-
-    def __init__(self, report: StepReport, waiting: np.ndarray) -> None:
-        times, joints = [np.zeros(1)], [waiting[None]]
-        begin = 0.0
-        for motion, q in zip(report.motions, report.joints, strict=True):
-            if q is None:  # out of reach: the arm stays where it is
-                break
-            times.append(begin + motion.times)
-            joints.append(q)
-            begin += motion.seconds
-        first = 1 if len(times) > 1 else 0  # the motions begin where the arm waits
-        self._times, self._joints = np.concatenate(times[first:]), np.concatenate(joints[first:])
-        self.seconds = begin
-
-    def at(self, time: float) -> np.ndarray:
-        """Joint positions (dof,) [rad] at a time from the beginning of the action [s]."""
-        return np.array([np.interp(time, self._times, q) for q in self._joints.T])
 
 
 def _check(worlds: Worlds, take: Take, t: int) -> None:

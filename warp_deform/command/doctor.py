@@ -52,6 +52,7 @@ _OPTIONAL = (
     _Optional("ray", "ray", "ray", "collecting on a cluster"),
     _Optional("tensorboard", "tensorboard", "train", "training curves while they grow"),
     _Optional("h5py", "h5py", "export", "export to robomimic"),
+    _Optional("websockets", "websockets", "page", "the page of `warp-deform play`"),
     _Optional("panda_py", "panda-python", "panda", "Franka Emika Panda"),
     _Optional("franky", "franky-control", "fr3", "Franka Research 3"),
     _Optional("pyrealsense2", "pyrealsense2", "realsense", "RealSense cameras"),

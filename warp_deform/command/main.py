@@ -75,6 +75,7 @@ VERBS: dict[str, Verb] = {
         "warp_deform.command.verbs:inspect",
         "show statistics of a dataset and draw its episodes",
     ),
+    "play": Verb("learning.command.page:play", "pick and place by mouse, in a page in the browser"),
     "convert": Verb(
         "learning.command.convert:convert", "convert datasets to and from other formats"
     ),

@@ -1,0 +1,81 @@
+"""The verbs that open a page in the browser: `warp-deform play` and `warp-deform view`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from warp_deform.command.main import CommandOptions, Outcome
+from warp_deform.errors import InputError
+from warp_deform.quiet import quiet_warp
+from warp_deform.robots import RobotName
+from warp_deform.support.flag_range import SEED, FlagRange
+from warp_deform.tasks.registry import task as find_task
+
+__all__ = ["PageOptions", "PlayOptions", "play"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PageOptions(CommandOptions):
+    """Where the page is served."""
+
+    port: Annotated[int, arg(metavar="P"), FlagRange(0, 65535)] = 0
+    """Port of the loopback interface; 0 takes any that is free."""
+    browser: bool = False
+    """Open the page in this machine's browser."""
+
+    def opener(self) -> Callable[[str], object] | None:
+        """What opens an address, where that was asked for.
+
+        Raises:
+            InputError: this machine has no browser that Python knows of.
+        """
+        if not self.browser:
+            return None
+        import webbrowser
+
+        try:
+            return webbrowser.get().open
+        except webbrowser.Error as error:
+            raise InputError(
+                "no browser was found; leave --browser out and open the address by hand"
+            ) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayOptions(PageOptions):
+    """Pick and place by mouse, in a page in the browser."""
+
+    task: Annotated[Positional[str], arg(metavar="TASK")]
+    """Name of the task; `warp-deform list` shows all of them."""
+    record: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for the episodes that are kept at the page; a later session goes on in it."""
+    seed: Annotated[int | None, SEED] = None
+    """Seed of the first episode; by default the first, from 0 on, of which none is kept."""
+    robot: RobotName = "ur5"
+    """Which arm moves."""
+
+
+def play(options: PlayOptions) -> Outcome:
+    """Serve the page until Ctrl-C."""
+    find_task(options.task)
+    from warp_deform.page.play import PlaySession
+    from warp_deform.page.server import check_websockets, listen, serve_until_interrupted
+
+    check_websockets()
+    opener, bound = options.opener(), listen(options.port)
+    with bound:
+        quiet_warp()
+        session = PlaySession(
+            options.task, robot=options.robot, seed=options.seed, record=options.record
+        )
+        serve_until_interrupted(session, bound, browser=opener)
+    kept = session.kept.count if session.kept else 0
+    where = f"; {options.record} holds {kept} demonstrations" if options.record else ""
+    return Outcome(
+        data={"task": options.task, "episodes": kept}, text=f"played {options.task}{where}"
+    )

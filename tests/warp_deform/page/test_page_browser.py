@@ -1,0 +1,161 @@
+"""The page as a person has it, in headless Chromium.
+
+The session runs in this process, so the tests know where every bead is, and what an action leads
+to: the same seed gives the same bits.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from fixtures.page_browser import NO_WEBGL, Tab, chromium_path, driver
+from fixtures.page_server import serve_page
+
+from warp_deform.collecting.replay import verify
+from warp_deform.page.play import PlaySession
+from warp_deform.planning.demonstrators import demonstrator
+from warp_deform.worlds.worlds import Worlds
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    chromium_path()  # nothing is built where there is none
+    session = PlaySession("cable-ring", record=tmp_path_factory.mktemp("kept"))
+    with serve_page(session) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def launch():
+    with driver() as launch:
+        yield launch
+
+
+@pytest.fixture(scope="module")
+def browser(launch):
+    browser = launch()
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def tab(server, browser):
+    server.session.reset(0)
+    tab = Tab(browser, server.access.address)
+    tab.wait(actions=0, connection="open")
+    tab.page.select_option("#speed", "4")
+    yield tab
+    assert tab.errors == []
+    assert all(url.startswith((server.access.address, "data:", "blob:", "ws")) for url in tab.asked)
+    tab.page.close()
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return Worlds("cable-ring", 1)
+
+
+def best(session):
+    return demonstrator("scripted")(session.worlds, {0: session.run})[0]
+
+
+def test_a_person_picks_and_places_in_both_views(server, tab, alone):
+    session, page = server.session, tab.page
+    alone.reset({0: 0})
+    assert tab.data("webgl") == "true"
+    assert float(tab.data("score")) == alone.score(0)
+    shot = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert len(np.unique(shot[:, :900].reshape(-1, 3), axis=0)) > 100
+
+    page.mouse.click(*tab.on_scene((0.3, -0.7, 0.0)))  # beside the table
+    action = best(session)
+    q = alone.episodes[0].snapshot.particle_q
+    bead = np.linalg.norm(q[:, :2] - action[:2], axis=1).argmin()
+    drawn = int(tab.data("drawn"))
+    page.mouse.click(*tab.on_scene(q[bead]))
+    page.mouse.click(*tab.on_scene((*action[3:5], 0.0)))
+    tab.wait(actions=1, playing=False)
+    done = session.run.actions[0]
+    assert np.abs(done[:5] - action[:5]).max() < 2e-3
+    alone.step({0: done})
+    assert tab.data("hash") == alone.hash(0)
+    assert float(tab.data("score")) == alone.score(0)
+    assert int(tab.data("drawn")) > drawn + 4
+
+    second = best(session)
+    page.keyboard.press("q")  # 15 degrees
+    page.mouse.move(*tab.on_picture(second[:2]))
+    page.mouse.down()
+    page.mouse.move(*tab.on_picture(second[3:5]), steps=3)
+    page.mouse.up()
+    tab.wait(actions=2, playing=False)
+    done = session.run.actions[1]
+    assert np.abs(done[[0, 1, 3, 4]] - second[[0, 1, 3, 4]]).max() < 2 * 0.003125
+    assert done[5] == pytest.approx(np.pi / 12) and done[6] == second[6]
+    alone.step({0: done})
+    assert tab.data("hash") == alone.hash(0)
+
+    page.click("#undo")
+    tab.wait(actions=1)
+    assert tab.data("hash") != alone.hash(0)
+
+
+def test_playback_pauses_scrubs_and_changes_no_state(server, tab):
+    session, page = server.session, tab.page
+    page.select_option("#speed", "0.1")
+    page.click("#step")
+    tab.wait(playing=True)
+    page.click("#pause")
+    tab.wait(playing=False)
+    stands = tab.data("time")
+    assert 0 < float(stands) < float(tab.data("end"))
+    state, places = session.worlds.hash(0), []
+    for share in ("0", "0.5", "1"):
+        page.locator("#time").fill(share)
+        places.append(tab.data("q"))
+    assert len(set(places)) == 3
+    tab.wait(actions=1)
+    assert tab.data("hash") == state == session.worlds.hash(0)
+
+
+def test_what_is_kept_can_be_replayed_and_the_second_tab_sees_it(server, browser, tab):
+    page, session = tab.page, server.session
+    other = Tab(browser, server.access.address)
+    other.wait(actions=0)
+    page.click("#whole")
+    other.wait(over="solved", playing=False)
+    tab.wait(over="solved", playing=False)
+    assert other.data("hash") == tab.data("hash")
+    page.reload()
+    tab.wait(over="solved", actions=len(session.run.actions))
+    page.click("#keep")
+    other.wait(seed=1, actions=0)
+    tab.wait(seed=1, actions=0)
+    other.page.close()
+    assert verify(session.kept.folder, workers=1)["mismatches"] == 0
+
+
+def test_without_webgl_the_picture_from_above_plays(server, launch):
+    server.session.reset(0)
+    browser = launch(**NO_WEBGL)
+    tab = Tab(browser, server.access.address)
+    tab.wait(actions=0, webgl=False)
+    action = best(server.session)
+    for xy in (action[:2], action[3:5]):
+        tab.page.mouse.click(*tab.on_picture(xy))
+    tab.wait(playing=True)
+    seen = set()
+    while tab.data("playing") == "true":
+        seen.add(tab.data("q"))
+    tab.wait(actions=1, playing=False)
+    assert len(seen) > 2
+    drawn = []
+    for share in ("0.4", "0.7"):
+        tab.page.locator("#time").fill(share)
+        drawn.append(tab.page.locator("#top").screenshot())
+    assert drawn[0] != drawn[1]
+    assert tab.data("hash") == server.session.worlds.hash(0)
+    assert float(tab.data("score")) == server.session.worlds.score(0)
+    assert tab.errors == []
+    browser.close()

@@ -1,0 +1,321 @@
+"""The session of `warp-deform play`: one task, acted on by whoever is at the page."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..collecting.recording import observe
+from ..episodes import Step
+from ..errors import InputError, WarpDeformError
+from ..rendering.pixels import BOUNDS
+from ..robots.primitive import Outcome, find_grasp
+from ..support.flag_range import SEED
+from ..tasks.metrics import wrap_angle
+from ..tasks.task import Action
+from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
+from ..worlds.loop import EpisodeRun
+from ..worlds.spaces import check_action
+from ..worlds.state import WorldState
+from ..worlds.worlds import Worlds
+from .drawing import (
+    FRAMES_A_SECOND,
+    arm_arrays,
+    clip,
+    drawable_arrays,
+    grid_head,
+    link_matrices,
+    pictures,
+)
+from .keeping import HUMAN, KeptEpisodes
+from .measures import measures, score_meaning
+from .players import Player, demonstrators
+from .server import Post
+from .wire import Job, Verbs, pack
+
+__all__ = ["PlaySession"]
+
+
+class PlaySession:
+    """One running episode, its past, and where it is kept; see `server.Session`.
+
+    Args:
+        seed: of the first episode; None: the first from 0 on of which none is kept
+        record: folder for what is kept
+        players: who may act beside the person and the demonstrators
+
+    Attributes:
+        run: what is recorded of the running episode
+        acted: who chose each of its actions
+    """
+
+    verbs: Verbs = {
+        "act": {"pick": list, "place": list, "turn": float, "lift": float},
+        "probe": {"xy": list, "turn": float},
+        "demonstrate": {"who": str, "whole": bool},
+        "undo": {},
+        "reset": {"seed": int},
+        "next": {},
+        "keep": {},
+    }
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        robot: str = "ur5",
+        seed: int | None = None,
+        record: Path | None = None,
+        players: Sequence[Player] = (),
+    ) -> None:
+        self.stop = threading.Event()
+        self.worlds = Worlds(task, 1, robot=robot)
+        self.kept = KeptEpisodes(record, self.worlds.task.name) if record else None
+        self.players = demonstrators(players)
+        self._version = 0
+        self._arm, self._parts = arm_arrays(self.worlds.robot)
+        self._links(self.worlds.robot.home_q)  # loads torch before anybody waits for it
+        self.reset(self._free(0) if seed is None else seed)
+
+    # What the episode is
+
+    def _free(self, first: int) -> int:
+        return self.kept.free_seed(first) if self.kept else first
+
+    def reset(self, seed: int) -> None:
+        """Start the episode of a seed.
+
+        Raises:
+            WarpDeformError: it has no valid start; the episode before goes on.
+        """
+        if not SEED.low <= seed <= SEED.high:
+            raise InputError(f"a seed is {SEED.low:.10g} to {SEED.high:.10g}, not {str(seed)[:20]}")
+        before = self.worlds.state(0) if self.worlds.episodes else None
+        try:
+            self.worlds.reset({0: seed})
+        except WarpDeformError:
+            if before is not None:
+                self.worlds.restore(0, before)
+            raise
+        self.start = self.worlds.state(0)
+        self.run: EpisodeRun[Step] = EpisodeRun(seed, episode_rng(seed, DEMONSTRATOR_STREAM))
+        self.run.rows.append(observe(self.worlds, 0))
+        self.past: list[WorldState] = []
+        self.acted: list[str] = []
+        for player in self.players.values():
+            player.begin()
+        self._version += 1
+
+    @property
+    def over(self) -> str:
+        """Why nothing more is to be done, empty while something is."""
+        worlds, episode = self.worlds, self.worlds.episodes[0]
+        if not episode.physics_ok:
+            return "the physics broke"
+        if worlds.solved(0):
+            return "solved"
+        if episode.ended:
+            return "over without success"
+        if len(episode.history) >= worlds.task.max_actions:
+            return f"not solved in {worlds.task.max_actions} actions"
+        return ""
+
+    def head(self) -> dict[str, Any]:
+        """What the page tells of the present state, as JSON."""
+        worlds, episode = self.worlds, self.worlds.episodes[0]
+        ok = episode.physics_ok
+        return {
+            "version": self._version,
+            "seed": episode.seed,
+            "score": float(worlds.score(0)),
+            "measures": measures(episode) if ok else {},
+            "solved": worlds.solved(0),
+            "over": self.over,
+            "physics": "" if ok else "; ".join(map(str, episode.problems)),
+            "actions": len(self.run.actions),
+            "most": worlds.task.max_actions,
+            "outcomes": list(self.run.outcomes),
+            "acted": list(self.acted),
+            "seconds": float(episode.sim_seconds),
+            "hash": worlds.hash(0),
+            "kept": self.kept.count if self.kept else 0,
+        }
+
+    # What the page is told
+
+    def greet(self) -> list[bytes]:
+        """See `Session.greet`."""
+        worlds, task = self.worlds, self.worlds.task
+        about = {
+            "task": task.name,
+            "meaning": score_meaning(task),
+            "robot": worlds.robot.name,
+            "goal": task.goal_conditioned,
+            "lifts": [stage.lift for stage in task.stages],
+            "jaw": task.jaw is not None,
+            "grid": grid_head(task.grid),
+            "bounds": BOUNDS[:2],
+            "frames": FRAMES_A_SECOND,
+            "parts": self._parts,
+            "players": [{"name": p.name, "looks": p.looks} for p in self.players.values()],
+            "records": self.kept is not None,
+        }
+        return [pack("hello", self._arm, **about), self.scene()]
+
+    def scene(self) -> bytes:
+        """The message that shows the present state whole."""
+        episode = self.worlds.episodes[0]
+        snapshot = episode.snapshot
+        q, body = snapshot.particle_q, snapshot.body_q
+        if not (np.isfinite(q).all() and np.isfinite(body).all()):
+            q, body = (
+                self.past[-1].episode.snapshot.particle_q,
+                self.past[-1].episode.snapshot.body_q,
+            )
+        arrays = {
+            **drawable_arrays(episode.drawables),
+            "q": q.astype(np.float32),
+            "body": body.astype(np.float32),
+            "links": self._links(episode.posture),
+            **self._pictures(),
+        }
+        return pack("scene", arrays, **self.head())
+
+    def _pictures(self) -> dict[str, np.ndarray]:
+        episode = self.worlds.episodes[0]
+        goal = episode.goal.color if episode.goal is not None else None
+        if not episode.physics_ok:
+            return pictures(goal=goal)
+        images = episode.snapshot.images
+        return pictures(images.color, images.height, goal)
+
+    def _links(self, q: np.ndarray) -> np.ndarray:
+        return link_matrices(self.worlds.robot, np.reshape(q, (1, -1)))
+
+    # What it does
+
+    def do(self, job: Job, post: Post) -> None:
+        """See `Session.do`."""
+        if job.do == "probe":
+            post(self._probe(job), everyone=False)
+            return
+        if job.at not in (-1, self._version):
+            raise InputError("another tab was quicker; look at what is there now")
+        getattr(self, f"_do_{job.do}")(job, post)
+
+    def _probe(self, job: Job) -> bytes:
+        """What the tip would take where the pointer is."""
+        worlds, snapshot = self.worlds, self.worlds.episodes[0].snapshot
+        at = np.array([*job.numbers("xy", 2), job.number("turn")])
+        grasp = None
+        if worlds.episodes[0].physics_ok and worlds.task.jaw is None:
+            q, body = snapshot.particle_q, snapshot.body_q
+            grasp = find_grasp(at, snapshot.objects, q, body, worlds.task.primitive)
+        particle = -1 if grasp is None or grasp.particle is None else grasp.particle
+        taken_body = -1 if grasp is None or grasp.body is None else grasp.body
+        return pack("grasp", version=self._version, particle=particle, body=taken_body)
+
+    def action(self, job: Job) -> Action:
+        """The action (7,) that a page's pick, place, turn and lift stand for.
+
+        The pick's yaw is the task's, as for policies; the place's is turned from it.
+
+        Raises:
+            InputError: it is outside of the action space.
+        """
+        task, episode = self.worlds.task, self.worlds.episodes[0]
+        pick, place = job.numbers("pick", 2), job.numbers("place", 2)
+        turn, lift = job.number("turn"), job.number("lift")
+        checked = check_action([*pick, 0.0, *place, wrap_angle(turn), lift])
+        yaw = float(task.pick_yaw(episode.snapshot.images.color, checked[:2]))
+        if yaw != 0.0:
+            checked[2], checked[5] = yaw, wrap_angle(yaw + turn)
+        return checked
+
+    def _refuse_when_over(self) -> None:
+        if self.over:
+            raise InputError(f"the episode is over ({self.over}): undo, or start another")
+
+    def _do_act(self, job: Job, post: Post) -> None:
+        self._refuse_when_over()
+        post(self.step(self.action(job), HUMAN))
+
+    def step(self, action: Action, who: str) -> bytes:
+        """Carry out an action and return the message that shows it.
+
+        Raises:
+            InputError: a person asked for what the arm cannot reach; nothing has changed.
+        """
+        worlds, episode = self.worlds, self.worlds.episodes[0]
+        before, waiting = worlds.state(0), episode.posture.copy()
+        report = worlds.step({0: action}, record=1.0 / FRAMES_A_SECOND)[0]
+        if report.outcome is Outcome.UNREACHABLE and who == HUMAN:
+            worlds.restore(0, before)
+            raise InputError("the arm cannot reach there with its tip down; nothing has moved")
+        self.past.append(before)
+        self.run.actions.append(np.array(action, dtype=float))
+        self.run.outcomes.append(report.outcome.value)
+        self.acted.append(who)
+        if worlds.episodes[0].physics_ok:
+            self.run.rows.append(observe(worlds, 0))
+        self._version += 1
+        moved = clip(worlds.robot, report, waiting)
+        if moved is None:
+            return self.scene()
+        arrays, seconds = moved
+        return pack(
+            "clip",
+            {**arrays, **self._pictures()},
+            **self.head(),
+            end=seconds,
+            action=[float(each) for each in action],
+        )
+
+    def _do_demonstrate(self, job: Job, post: Post) -> None:
+        player = self.players.get(job.values["who"])
+        if player is None:
+            raise InputError(f"there is nobody called {job.values['who'][:40]!r}")
+        self._refuse_when_over()
+        while not self.over and not self.stop.is_set():
+            post(pack("work", who=player.name))
+            try:
+                action = player.choose(self.worlds, self.run)
+                if action is None:
+                    raise InputError(f"{player.name} sees nothing to do")
+                post(self.step(check_action(action, name=player.name), player.name))
+            finally:
+                post(pack("work", who=""))
+            if not job.values["whole"]:
+                return
+
+    def _do_undo(self, job: Job, post: Post) -> None:
+        if not self.past:
+            raise InputError("there is nothing to undo")
+        self.worlds.restore(0, self.past.pop())
+        for taken_back in (self.run.actions, self.run.outcomes, self.acted):
+            taken_back.pop()
+        del self.run.rows[len(self.run.actions) + 1 :]
+        for player in self.players.values():
+            player.begin()
+        self._version += 1
+        post(self.scene())
+
+    def _do_reset(self, job: Job, post: Post) -> None:
+        self.reset(job.values["seed"])
+        post(self.scene())
+
+    def _do_next(self, job: Job, post: Post) -> None:
+        self.reset(self._free(self.run.seed + 1))
+        post(self.scene())
+
+    def _do_keep(self, job: Job, post: Post) -> None:
+        if self.kept is None:
+            raise InputError("nothing is recorded; start it with --record DIR")
+        path = self.kept.keep(self.worlds, self.run, self.acted)
+        self.reset(self._free(self.run.seed + 1))
+        post(self.scene())
+        post(pack("note", text=f"kept as {path.parent.name}/{path.name}", good=True))

@@ -1,0 +1,203 @@
+// The page of `warp-deform play`: what comes from the server goes to the views, and back.
+import {connect} from "./connection.js";
+import {$, introduce, note, offerLifts, paint, tell} from "./panel.js";
+import {Playback} from "./playback.js";
+import {Hand} from "./pointer.js";
+import {openScene} from "./scene.js";
+import {TopDown, decode} from "./topdown.js";
+
+const scene = openScene($("scene")), top = new TopDown($("top"));
+let hello = null, shown = null, latest = null, lift = 0, probing = false, waiting = false;
+// the state that clips lead to is told when they have been seen
+const playback = new Playback(showFrame, clip => settle(clip));
+const send = connect(hear, changed);
+
+const hand = new Hand({
+  scene, top,
+  ready: () => Boolean(hello) && !waiting && playback.finished,
+  // a press while things move goes to their end, and picks nothing that the person has not seen lie
+  begin: () => {
+    if (!hello || waiting) return false;
+    const still = playback.finished;
+    if (!still) playback.finish();
+    return still;
+  },
+  inside: ([x, y]) => { const [[x0, x1], [y0, y1]] = hello.bounds; return x >= x0 && x <= x1 && y >= y0 && y <= y1; },
+  say: plan => {
+    top.planned = plan;
+    top.grasp = null;
+    if (scene) { scene.plan(plan); if (plan) scene.highlight(null); }
+    refresh();
+  },
+  act: (pick, place) => ask({do: "act", pick, place, turn: hand.turn, lift}),
+  look: xy => {
+    if (!xy || !hand.inside(xy)) { light(null); return; }
+    if (!probing) probing = send({do: "probe", xy, turn: hand.turn});
+  },
+});
+hand.turned = angle => { $("turn").value = Math.round(angle * 180 / Math.PI); $("turn-says").textContent = `${$("turn").value}°`; };
+
+function light(grasp) {
+  top.grasp = grasp;
+  if (scene) scene.highlight(grasp);
+  refresh();
+}
+
+/** Ask for something that changes the state, as it is now. */
+function ask(message) {
+  if (waiting || !latest) return false;
+  waiting = send({...message, at: latest.version});
+  mark();
+  return waiting;
+}
+
+function hear(message) {
+  ({hello: greeted, scene: staged, clip: moved, note: noted, grasp: probed, work: worked})[message.kind](message);
+  mark();
+}
+
+function greeted(message) {
+  hello = message;
+  lift = hello.lifts[0];
+  introduce(hello);
+  setLift(lift);
+  top.furnish(hello);
+  if (scene) scene.furnish(hello);
+}
+
+function staged(message) {
+  waiting = false;
+  latest = shown = message;
+  playback.keep(message.seed, message.actions);
+  top.build(message);
+  const state = {q: message.q, body: message.body, links: message.links};
+  top.put(state);
+  if (scene) { scene.build(message); scene.put(state); scene.highlight(null); }
+  hand.drop();
+  settle(message);
+}
+
+function moved(message) {
+  waiting = false;
+  latest = message;
+  message.frames = message.q.shape[0];
+  message.fps = hello.frames;
+  hand.drop();
+  light(null);
+  playback.add(message);
+}
+
+function noted(message) {
+  waiting = false;
+  note(message.text, message.good);
+}
+
+function probed(message) {
+  probing = false;
+  if (message.version === latest.version && !playback.playing) light(message);
+}
+
+function worked(message) {
+  $("work").hidden = $("stop").hidden = !message.who;
+  $("work").textContent = `${message.who} is choosing`;
+}
+
+/** Tell of a state whose motion has been seen. */
+async function settle(state) {
+  shown = state;
+  tell(state, hello);
+  mark();
+  $("goal-box").hidden = !state.goal;
+  if (state.goal) paint("goal", state.goal);
+  if (state.height) paint("height", state.height);
+  if (!state.color) return;
+  const picture = await decode(state.color);
+  if (shown === state && !playback.playing) { top.still(picture); refresh(); }
+}
+
+function showFrame(clip, frame) {
+  const part = (array, rest) => array.subarray(frame * rest, (frame + 1) * rest);
+  const size = array => array.shape.slice(1).reduce((a, b) => a * b, 1);
+  const state = {q: part(clip.q, size(clip.q)), body: part(clip.body, size(clip.body)), links: part(clip.links, size(clip.links))};
+  top.still(null);
+  top.put(state);
+  if (scene) scene.put(state);
+  refresh();
+}
+
+let stale = true;
+function refresh() { stale = true; }
+
+function changed(state) {
+  waiting = probing = false;
+  const says = {
+    open: "",
+    lost: "not connected; trying again",
+    gone: "this address is no longer valid: open the one that warp-deform printed when it started anew",
+  };
+  note(says[state], false, true);
+  document.body.dataset.connection = state;
+}
+
+/** What tests wait for; a strict policy forbids evaluating scripts in the page. */
+function mark() {
+  Object.assign(document.body.dataset, {
+    actions: shown ? shown.actions : "", score: shown ? shown.score : "", seed: shown ? shown.seed : "",
+    hash: shown ? shown.hash : "", over: shown ? shown.over : "", playing: playback.playing, waiting,
+    clips: playback.clips.length, end: playback.length, time: playback.time.toFixed(3),
+    drawn: scene ? scene.drawn : 0, webgl: Boolean(scene), slow: Boolean(scene?.slow),
+    q: top.q ? top.q.reduce((sum, x, k) => sum + x * (k % 7 + 1), 0).toFixed(6) : "",
+  });
+}
+
+let before = 0;
+function loop(now) {
+  requestAnimationFrame(loop);
+  playback.speed = Number($("speed").value);
+  playback.tick((now - before) / 1000);
+  before = now;
+  if (scene) scene.draw();
+  if (stale) { stale = false; top.draw(); }
+  $("time").disabled = $("pause").disabled = !playback.clip;
+  $("pause").textContent = playback.playing ? "Pause" : "Play";
+  if (document.activeElement !== $("time")) $("time").value = playback.length ? playback.time / playback.length : 1;
+  $("time-says").textContent = playback.clip ? `${playback.time.toFixed(1)} s` : "";
+  $("hint").textContent = hint();
+  mark();
+}
+
+function hint() {
+  if (!hello) return "connecting";
+  if (playback.playing) return "";
+  if (shown?.over) return `${shown.over}: undo, or go on to the next`;
+  if (hand.pick) return "click where it goes; Q and E turn, Esc lets go";
+  return scene ? "click or drag what to pick; drag beside it to look around, scroll to come nearer" : "click what to pick, or drag it";
+}
+
+function setLift(value) { lift = value; offerLifts(hello.lifts, lift, setLift); }
+
+$("undo").onclick = () => ask({do: "undo"});
+$("again").onclick = () => ask({do: "reset", seed: latest.seed});
+$("next").onclick = () => ask({do: "next"});
+$("keep").onclick = () => ask({do: "keep"});
+$("seeds").onsubmit = event => { event.preventDefault(); ask({do: "reset", seed: Math.round(Number($("seed").value))}); };
+$("step").onclick = () => ask({do: "demonstrate", who: $("who").value, whole: false});
+$("whole").onclick = () => ask({do: "demonstrate", who: $("who").value, whole: true});
+$("stop").onclick = () => send({do: "stop"});
+$("pause").onclick = () => playback.toggle();
+$("time").oninput = () => playback.scrub(Number($("time").value));
+$("time").onchange = () => { if (playback.finished) settle(playback.clip); $("time").blur(); };
+$("turn").oninput = () => hand.setTurn($("turn").value * Math.PI / 180);
+document.addEventListener("visibilitychange", () => { if (document.hidden && playback.playing) playback.finish(); });
+document.addEventListener("keydown", event => {
+  if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT)$/.test(event.target.tagName) && event.target.type !== "range") return;
+  const turn = event.shiftKey ? Math.PI / 36 : Math.PI / 12;
+  const keys = {
+    q: () => hand.setTurn(hand.turn + turn), e: () => hand.setTurn(hand.turn - turn), escape: () => hand.drop(),
+    u: () => $("undo").click(), n: () => $("next").click(), k: () => $("keep").click(), p: () => playback.toggle(),
+  };
+  const key = event.key.toLowerCase();
+  if (key in keys) keys[key]();
+  else if (/^[1-9]$/.test(key) && hello?.lifts[key - 1] !== undefined) setLift(hello.lifts[key - 1]);
+});
+requestAnimationFrame(loop);
