@@ -191,6 +191,11 @@ class Robot:
             )
         return self._follow(way_points, np.cumsum(counts) - counts, seed)
 
+    @property
+    def reach_by_height(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Heights (n,) [m] of the tip, and the smallest and largest radius in reach there."""
+        return self._reach_table
+
     def reach(self, z: float) -> tuple[float, float]:
         """Return the smallest and largest radius [m] from the base axis of a tip-down tip at z [m].
 

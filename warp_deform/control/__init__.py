@@ -1,0 +1,18 @@
+"""Continuous control at 20 Hz: modes of action, limits, episodes, tasks, and search for plans."""
+
+from __future__ import annotations
+
+from ..support.lazy_exports import lazy_exports
+
+_HOME = {
+    "CONTROL_MODES": ".modes",
+    "CONTROL_TASKS": ".registry",
+    "ControlConfig": ".modes",
+    "ControlWorlds": ".control_worlds",
+    "METHODS": ".optimize",
+    "optimize": ".optimize",
+}
+
+__all__ = list(_HOME)
+
+__getattr__ = lazy_exports(__name__, _HOME)
