@@ -7,7 +7,7 @@ what a robot knows of itself, `environment_state` what a camera does not tell.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from gymnasium import spaces
@@ -19,9 +19,54 @@ from ..tasks.free_space import FreeSpace
 from .spaces import observation, observation_space
 from .worlds import Worlds
 
-__all__ = ["ObsMode", "Observing"]
+__all__ = ["Numbers", "ObsMode", "Observing", "PickPlaceNumbers"]
 
 ObsMode = Literal["images", "state", "state_dict", "rgb", "rgbd", "rgb+state"]
+
+
+class Numbers(Protocol):
+    """What "state_dict" holds of a slot."""
+
+    shapes: Mapping[str, tuple[int, ...]]
+    """Of every entry, in the order of "state"; what has no numbers is left out."""
+    agent: tuple[str, ...]
+    """Entries that a robot knows of itself: `agent_pos`."""
+
+    def of(self, slot: int) -> Mapping[str, np.ndarray]:
+        """The entries of a slot, as they are."""
+
+
+class PickPlaceNumbers:
+    """Where tip, particles and bodies are between two actions."""
+
+    agent: tuple[str, ...] = ("tip",)
+
+    def __init__(self, worlds: Worlds) -> None:
+        self._worlds = worlds
+        world = worlds.solver.data.topologies[0]
+        self.shapes: Mapping[str, tuple[int, ...]] = {
+            "tip": (4,),
+            "particle_q": (world.particle_count, 3),
+            "body_q": (world.body_count, 7),
+            "goal": goal_shape(worlds),
+            "time": (1,),
+        }
+
+    def of(self, slot: int) -> Mapping[str, np.ndarray]:
+        """The entries of a slot."""
+        episode = self._worlds.episodes[slot]
+        return {
+            "tip": episode.tip,
+            "particle_q": episode.snapshot.particle_q,
+            "body_q": episode.snapshot.body_q,
+            "goal": episode.layout.targets,
+            "time": np.array([len(episode.history) / self._worlds.task.max_actions]),
+        }
+
+
+def goal_shape(worlds: Worlds) -> tuple[int, ...]:
+    """Shape of what the task aims at."""
+    return worlds.task.sample(np.random.default_rng(0), FreeSpace()).targets.shape
 
 
 class Observing:
@@ -35,18 +80,19 @@ class Observing:
     - "rgbd": the same and `depth`, height above the table (320, 160) float32 [m];
     - "rgb+state": that of "rgb" and `environment_state`, which is that of "state".
 
-    What a task has none of, particles or bodies, is left out. All is zero where a state is not
-    finite; its `physics_ok` is False then.
+    Where `numbers` says so, "state_dict" and `agent_pos` hold other entries. What a task has none
+    of, particles or bodies, is left out. All is zero where a state is not finite; its `physics_ok`
+    is False then.
 
     Raises:
         InputError: there is no such mode.
     """
 
-    def __init__(self, worlds: Worlds, mode: str) -> None:
+    def __init__(self, worlds: Worlds, mode: str, numbers: Numbers | None = None) -> None:
         if mode not in get_args(ObsMode):
             raise InputError(f"obs_mode is one of {', '.join(get_args(ObsMode))}, not {mode!r}")
         self._worlds, self.mode = worlds, mode
-        self._goal = worlds.task.sample(np.random.default_rng(0), FreeSpace()).targets.shape
+        self._numbers = numbers or PickPlaceNumbers(worlds)
         self.space: spaces.Space[Any] = self._space()
 
     def of(self, slot: int) -> Any:
@@ -61,7 +107,7 @@ class Observing:
         pixels = {"top": pictures["color"]}
         if "goal_color" in pictures:
             pixels["goal"] = pictures["goal_color"]
-        seen: dict[str, Any] = {"pixels": pixels, "agent_pos": self._state(slot)["tip"]}
+        seen: dict[str, Any] = {"pixels": pixels, "agent_pos": self._agent(slot)}
         if self.mode == "rgbd":
             seen["depth"] = pictures["height"]
         if self.mode == "rgb+state":
@@ -69,19 +115,15 @@ class Observing:
         return seen
 
     def _state(self, slot: int) -> dict[str, np.ndarray]:
-        episode, task = self._worlds.episodes[slot], self._worlds.task
-        snapshot = episode.snapshot
-        numbers = {
-            "tip": episode.tip,
-            "particle_q": snapshot.particle_q,
-            "body_q": snapshot.body_q,
-            "goal": episode.layout.targets,
-            "time": np.array([len(episode.history) / task.max_actions]),
-        }
+        numbers = self._numbers.of(slot)
         state = {name: np.array(array, np.float32) for name, array in numbers.items() if array.size}
         if all(np.isfinite(array).all() for array in state.values()):
             return state
         return {name: np.zeros_like(array) for name, array in state.items()}
+
+    def _agent(self, slot: int) -> np.ndarray:
+        state = self._state(slot)
+        return np.concatenate([state[name] for name in self._numbers.agent])
 
     def _flat(self, slot: int) -> np.ndarray:
         return np.concatenate([array.ravel() for array in self._state(slot).values()])
@@ -89,14 +131,7 @@ class Observing:
     def _space(self) -> spaces.Space[Any]:
         if self.mode == "images":
             return observation_space(self._worlds.task)
-        world = self._worlds.solver.data.topologies[0]
-        shapes: Mapping[str, tuple[int, ...]] = {
-            "tip": (4,),
-            "particle_q": (world.particle_count, 3),
-            "body_q": (world.body_count, 7),
-            "goal": self._goal,
-            "time": (1,),
-        }
+        shapes = self._numbers.shapes
         boxes: dict[str, spaces.Space[Any]] = {
             name: _numbers(shape) for name, shape in shapes.items() if np.prod(shape)
         }
@@ -105,11 +140,12 @@ class Observing:
         size = sum(int(np.prod(shape)) for name, shape in shapes.items() if name in boxes)
         if self.mode == "state":
             return _numbers((size,))
+        agent = sum(int(np.prod(shapes[name])) for name in self._numbers.agent)
         picture = spaces.Box(0, 255, (*SHAPE, 3), np.uint8)
         pixels: dict[str, spaces.Space[Any]] = {"top": picture}
         if self._worlds.task.goal_conditioned:
             pixels["goal"] = picture
-        seen: dict[str, Any] = {"pixels": spaces.Dict(pixels), "agent_pos": _numbers((4,))}
+        seen: dict[str, Any] = {"pixels": spaces.Dict(pixels), "agent_pos": _numbers((agent,))}
         if self.mode == "rgbd":
             seen["depth"] = spaces.Box(0.0, MAX_HEIGHT, SHAPE, np.float32)
         if self.mode == "rgb+state":

@@ -1,0 +1,49 @@
+"""What a task says about its control at a fixed rate, beyond what every `Task` says."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from ..tasks.task import Layout, Task
+from .modes import ControlConfig
+
+__all__ = ["ControlTask", "horizon_of"]
+
+_SECONDS = 10.0
+"""Length of an episode of a task that says nothing else [s]."""
+
+
+class ControlTask(Task):
+    """A task that is made for control: it says how long it lasts, what is held, and how fast.
+
+    Tasks of the benchmark need none of this: they have the defaults.
+    """
+
+    control: ClassVar[ControlConfig] = ControlConfig()
+    """Rate and speeds."""
+    horizon: ClassVar[int]
+    """Control steps of an episode."""
+    ends_when_solved: ClassVar[bool] = False
+    """Whether an episode ends when it is solved, or only when its steps are used up."""
+    held_particle: ClassVar[int | None] = None
+    """What the tip holds from the start, by any `start`; None: as `start` says."""
+
+    def plan_to_goal(self, rng: np.random.Generator) -> np.ndarray | None:
+        """Actions (T, 3), each of a length below 1, whose outcome is the goal; None: the layout's.
+
+        A plan that a guard ends is drawn again.
+        """
+        return None
+
+    def layout_for(self, layout: Layout, particle_q: np.ndarray) -> Layout:
+        """The layout whose goal is the state that a plan has led to, particles (P, 3) [m]."""
+        raise TypeError(f"{self.name} has no goal that a plan leads to")
+
+
+def horizon_of(task: Task, config: ControlConfig) -> int:
+    """Control steps of an episode of `task`."""
+    if isinstance(task, ControlTask):
+        return task.horizon
+    return round(_SECONDS * config.rate)

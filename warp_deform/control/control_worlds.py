@@ -1,0 +1,330 @@
+"""Episodes that are controlled at a fixed rate: what a step does, pays and ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ..episodes import Goal
+from ..errors import InputError, WarpDeformError
+from ..objects.box import Box
+from ..planning.demonstrators import demonstrator as find_demonstrator
+from ..robots.primitive import Grasp
+from ..support.checked import NOT_NEGATIVE, check_number
+from ..support.quaternion import quat_from_yaw, quat_rotate
+from ..tasks.task import Task
+from ..worlds.acting import snapped
+from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
+from ..worlds.loop import EpisodeRun
+from ..worlds.rewards import Rewards
+from ..worlds.tip_control import TipControl
+from ..worlds.worlds import Worlds
+from .control_task import ControlTask, horizon_of
+from .held_history import HeldHistory
+from .limits import TipLimits
+from .modes import CONTROL_MODES, ControlConfig, TipTargets
+from .registry import control_task
+
+__all__ = ["SOLVED_STEPS", "ControlStep", "ControlWorlds"]
+
+SOLVED_STEPS = 5
+"""An episode has ended when it was solved for so many steps running."""
+_NOTHING = (None, None)
+"""What a tip holds, a particle or a body, when it holds neither."""
+_FREE_FLOOR = 0.001
+"""Lowest height of a tip that holds nothing [m]: its radius."""
+_DRAWS = 20
+"""Plans to a goal that are drawn before a seed is given up."""
+Start = Literal["free", "held"]
+Release = Literal["rest", "moving"]
+
+
+@dataclass(frozen=True)
+class ControlStep:
+    """What a control step did to one world."""
+
+    reward: float
+    terminated: bool
+    truncated: bool
+    success: bool
+
+
+class ControlWorlds:
+    """`count` episodes of a task whose tips are led at a fixed rate.
+
+        worlds = ControlWorlds("cable-ring", 8)
+        worlds.reset({slot: slot for slot in range(8)})
+        done = worlds.step({slot: np.zeros(4) for slot in range(8)})
+
+    An episode has the same bits alone and in any company. It ends when it was solved for 5 steps
+    running, or when a guard fires; it is cut off after `horizon` steps.
+
+    Args:
+        task: a name, of `warp_deform.control.registry.CONTROL_TASKS` or of the benchmark, or a task
+        mode: see `CONTROL_MODES`
+        reward_mode: see `Rewards`
+        start: "free", with the tip at its waiting place; "held", where the scripted demonstrator
+            has taken what it would move first
+        release: "rest", what is let go has no speed; "moving", it keeps the tip's
+        config: rate and speeds; None: the task's
+        horizon: control steps of an episode; None: the task's
+        action_penalty: of |action - last action|^2, off the rewards "dense" and "normalized_dense"
+
+    Raises:
+        InputError: there is no such task, mode, start or release, or the task has a jaw.
+    """
+
+    def __init__(
+        self,
+        task: str | Task,
+        count: int = 1,
+        *,
+        robot: str = "ur5",
+        mode: str = "tip_delta_position",
+        reward_mode: str = "dense",
+        start: str = "free",
+        release: str = "rest",
+        config: ControlConfig | None = None,
+        horizon: int | None = None,
+        action_penalty: float = 0.01,
+        lanes: int | None = None,
+    ) -> None:
+        found = control_task(task)
+        for name, value, known in (
+            ("start", start, get_args(Start)), ("release", release, get_args(Release)),
+        ):  # fmt: skip
+            if value not in known:
+                raise InputError(f"{name} is one of {', '.join(known)}, not {value!r}")
+        if horizon is not None and (type(horizon) is not int or horizon < 1):
+            raise InputError(f"horizon is a number of control steps, 1 or more, not {horizon!r}")
+        self.action_penalty = check_number(action_penalty, "action_penalty", NOT_NEGATIVE)
+        own = found.control if isinstance(found, ControlTask) else ControlConfig()
+        self.config = config or own
+        self.horizon = horizon or horizon_of(found, self.config)
+        if mode not in CONTROL_MODES:
+            raise InputError(f"control_mode is one of {', '.join(CONTROL_MODES)}, not {mode!r}")
+        self.worlds = Worlds(found, count, robot=robot, lanes=lanes)
+        self.limits = TipLimits(self.worlds.robot)
+        self.targets = TipTargets(mode, self.config, self.limits, count)
+        self.control = TipControl(self.worlds, rate=self.config.rate)
+        self.rewards = Rewards(self.worlds, reward_mode)
+        self.start, self.release = start, release
+        self.steps = np.zeros(count, int)
+        """Control steps of every episode so far (W,)."""
+        self._solved = np.zeros(count, int)
+        self._last = np.zeros((count, self.targets.width))
+        self._held = [HeldHistory() for _ in range(count)]
+        self._grips: list[tuple[int | None, int | None]] = [_NOTHING] * count
+
+    @property
+    def task(self) -> Task:
+        """The task that is played."""
+        return self.worlds.task
+
+    def holding(self, slot: int) -> bool:
+        """Whether the tip of a slot holds something."""
+        return bool(self.control.loop.holding([slot])[0])
+
+    # -- starting
+
+    def reset(self, seeds: Mapping[int, int], *, goals: Mapping[int, Goal] | None = None) -> None:
+        """Start the episodes that the seeds name.
+
+        Raises:
+            WarpDeformError: a seed gave no valid start, nothing to hold, or no goal.
+        """
+        self.worlds.reset(seeds, goals=goals)
+        slots = list(seeds)
+        if isinstance(self.task, ControlTask):
+            self._goals_by_plans(self.task, slots)
+        grasps: Mapping[int, Grasp] = {}
+        if self.start == "held" and self._held_particle is None:
+            grasps = self._scripted_grasps(slots)
+        self._begin(slots, grasps)
+        for slot in slots:
+            self._held[slot] = HeldHistory()
+            if self.holding(slot):
+                self._note_taken(slot)
+        self.steps[slots] = self._solved[slots] = 0
+        self._last[slots] = 0.0
+        self.rewards.start(slots)
+
+    @property
+    def _held_particle(self) -> int | None:
+        return self.task.held_particle if isinstance(self.task, ControlTask) else None
+
+    def _begin(self, slots: Sequence[int], grasps: Mapping[int, Grasp]) -> None:
+        """Take slots under control, with what they hold from the start."""
+        self.control.begin(slots)
+        particle = self._held_particle
+        for slot in slots:
+            episode = self.worlds.episodes[slot]
+            self._grips[slot] = _NOTHING
+            if particle is not None:
+                self._grips[slot] = (particle, None)
+                place = self.worlds.solver.particle_q(slot)[particle].astype(float)
+                episode.tip = np.append(place, 0.0)
+                self.control.loop.hold(slot, particle=particle)
+            elif slot in grasps:
+                grasp, tip = grasps[slot], episode.tip
+                self._grips[slot] = (grasp.particle, grasp.body)
+                self.control.loop.hold(
+                    slot, particle=grasp.particle, body=grasp.body, tip=tip[:3],
+                    rotation=quat_from_yaw(float(tip[3])),
+                )  # fmt: skip
+            self._set_floor(slot)
+            self.targets.place([slot], np.array([episode.tip]))
+
+    def _scripted_grasps(self, slots: Sequence[int]) -> dict[int, Grasp]:
+        """Let the tips descend on what the scripted demonstrator would move first."""
+        runs = {}
+        for slot in slots:
+            seed = self.worlds.episodes[slot].seed
+            runs[slot] = EpisodeRun[Any](seed, episode_rng(seed, DEMONSTRATOR_STREAM))
+        chosen = find_demonstrator("scripted")(self.worlds, runs)
+        picks = {
+            slot: snapped(action, self.task, self.worlds.episodes[slot].snapshot, np.inf)
+            for slot, action in chosen.items()
+            if action is not None
+        }
+        carries = self.worlds.lead(picks) if picks else {}
+        for slot in slots:
+            if slot not in carries:
+                seed = self.worlds.episodes[slot].seed
+                raise WarpDeformError(
+                    f"{self.task.name}, seed {seed}: nothing could be taken hold of"
+                )
+        for slot in slots:
+            # above the thing that it has met, with the pick's yaw
+            self.worlds.episodes[slot].tip = np.array(
+                [*picks[slot][:2], carries[slot].grasp.height, picks[slot][2]]
+            )
+        return {slot: carries[slot].grasp for slot in slots}
+
+    def _goals_by_plans(self, task: ControlTask, slots: Sequence[int]) -> None:
+        """Let plans draw the goals of a task that has them, then put everything back."""
+        rngs = {
+            slot: episode_rng(self.worlds.episodes[slot].seed, DEMONSTRATOR_STREAM)
+            for slot in slots
+        }
+        before = {slot: self.worlds.state(slot) for slot in slots}
+        waiting = list(slots)
+        for _ in range(_DRAWS):
+            plans = {slot: task.plan_to_goal(rngs[slot]) for slot in waiting}
+            led = {slot: plan for slot, plan in plans.items() if plan is not None}
+            if not led:
+                return
+            ends = self._led(led)
+            for slot in led:
+                self.worlds.restore(slot, before[slot])
+                episode = self.worlds.episodes[slot]
+                if slot in ends:
+                    episode.layout = task.layout_for(episode.layout, ends[slot])
+            waiting = [slot for slot in waiting if slot not in ends]
+            if not waiting:
+                return
+        seeds = ", ".join(str(self.worlds.episodes[slot].seed) for slot in waiting)
+        raise WarpDeformError(f"{task.name}: no goal in {_DRAWS} draws for seed {seeds}")
+
+    def _led(self, plans: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+        """Particles (P, 3) [m] at the ends of plans, of those that no guard has ended."""
+        slots = list(plans)
+        self._begin(slots, {})
+        targets = TipTargets("tip_delta_position", self.config, self.limits, self.worlds.count)
+        targets.asked[:], targets.floors[:] = self.targets.asked, self.targets.floors
+        fired: dict[int, Any] = {}
+        for step in range(len(plans[slots[0]])):
+            actions = np.array([np.append(plans[slot][step], 1.0) for slot in slots])
+            knots = targets.follow(slots, actions)
+            fired |= self.control.loop.advance(knots[..., :3], worlds=slots)
+        ends = {slot: self.worlds.solver.particle_q(slot) for slot in slots if slot not in fired}
+        self.control.loop.end(slots)
+        return ends
+
+    # -- going on
+
+    def step(self, actions: Mapping[int, np.ndarray]) -> dict[int, ControlStep]:
+        """Run one control step in every named slot.
+
+        Args:
+            actions: as the mode says, each number from -1 to 1; see `check_action`
+        """
+        slots = list(actions)
+        rows = np.array([actions[slot] for slot in slots], dtype=float)
+        for slot, row in zip(slots, rows, strict=True):
+            self._take_or_let_go(slot, bool(row[-1] > 0))
+        knots = self.targets.follow(slots, rows)
+        turns = quat_from_yaw(knots[..., 3])
+        fired = self.control.loop.advance(knots[..., :3], turns, worlds=slots)
+        for slot, tip in zip(slots, knots[:, -1], strict=True):
+            episode = self.worlds.episodes[slot]
+            episode.tip = np.array(tip)
+            episode.sim_seconds += self.control.loop.seconds
+            # these are of all control so far
+            episode.problems = fired.get(slot, ()) or episode.problems
+            self.worlds.look(slot)
+            self._held[slot].follow(episode, self.task)
+        self.steps[slots] += 1
+        return self._judged(slots, rows)
+
+    def _judged(self, slots: list[int], rows: np.ndarray) -> dict[int, ControlStep]:
+        rewards = self.rewards.take(slots)
+        if self.rewards.mode in ("dense", "normalized_dense"):
+            first = self.steps[slots] == 1
+            change = np.where(first[:, None], 0.0, rows - self._last[slots])
+            rewards = rewards - self.action_penalty * (change**2).sum(axis=1)
+        self._last[slots] = rows
+        ends = not isinstance(self.task, ControlTask) or self.task.ends_when_solved
+        done = {}
+        for slot, reward in zip(slots, rewards, strict=True):
+            success = bool(self.worlds.solved(slot))
+            self._solved[slot] = self._solved[slot] + 1 if success else 0
+            trusted = self.worlds.episodes[slot].physics_ok
+            over = not trusted or (ends and self._solved[slot] >= SOLVED_STEPS)
+            cut = not over and self.steps[slot] >= self.horizon
+            done[slot] = ControlStep(
+                float(reward) if trusted else 0.0, bool(over), bool(cut), success
+            )
+        return done
+
+    def _take_or_let_go(self, slot: int, hold: bool) -> None:
+        holds = self.holding(slot)
+        if hold and not holds:
+            grasp = self.control.hold(slot)
+            if grasp is not None:
+                self._grips[slot] = (grasp.particle, grasp.body)
+                self._note_taken(slot)
+                self._set_floor(slot)
+        elif holds and not hold:
+            self.control.let_go(slot, release=self.release)
+            self._grips[slot] = _NOTHING
+            self._held[slot].let_go(self.worlds.episodes[slot], self.task)
+            self._set_floor(slot)
+
+    def _note_taken(self, slot: int) -> None:
+        episode = self.worlds.episodes[slot]
+        particle, body = self._grips[slot]
+        self._held[slot].take(episode, particle=particle, body=body)
+
+    def _set_floor(self, slot: int) -> None:
+        """How low the tip may go now: where what it holds lies on the table."""
+        particle, body = self._grips[slot]
+        episode, solver = self.worlds.episodes[slot], self.worlds.solver
+        floor = _FREE_FLOOR
+        if particle is not None:
+            radius = float(solver.data.topologies[0].particle_radius[particle])
+            floor = float(episode.tip[2] - solver.particle_q(slot)[particle, 2]) + radius
+        elif body is not None:
+            box = next(o for o in episode.objects if isinstance(o, Box) and o.body == body)
+            floor = float(episode.tip[2]) - _lowest(box, solver.body_q(slot)[body].astype(float))
+        self.targets.floors[slot] = floor
+
+
+def _lowest(box: Box, pose: np.ndarray) -> float:
+    """Height of the lowest corner of a body with this pose (7,) [m]."""
+    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    corners = [np.array(p.offset) + signs * np.array(p.size) / 2 for p in box.config.parts]
+    return float((pose[:3] + quat_rotate(pose[3:], np.concatenate(corners)))[:, 2].min())

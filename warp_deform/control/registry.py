@@ -1,0 +1,27 @@
+"""The tasks that are made for control, by name; tasks of the benchmark are found beside them."""
+
+from __future__ import annotations
+
+from ..errors import InputError
+from ..tasks.registry import task_of
+from ..tasks.task import Task
+from .control_task import ControlTask
+from .whip import Whip, WhipTarget
+
+__all__ = ["CONTROL_TASKS", "control_task"]
+
+CONTROL_TASKS: dict[str, type[ControlTask]] = {cls.name: cls for cls in (Whip, WhipTarget)}
+
+
+def control_task(task: str | Task) -> Task:
+    """A task that a tip can be led in, by its name or as it is.
+
+    Raises:
+        InputError: there is no such task, or it is played with a jaw.
+    """
+    if isinstance(task, str) and task in CONTROL_TASKS:
+        return CONTROL_TASKS[task]()
+    found = task_of(task)
+    if found.jaw is not None:
+        raise InputError(f"{found.name} is played with a jaw; control leads a suction tip")
+    return found
