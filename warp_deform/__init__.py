@@ -17,6 +17,8 @@ from .support.version import __version__
 from .tasks.registration import register_environments, register_task
 
 _HOME = {
+    "ControlEnv": ".envs.control_env",
+    "ControlVectorEnv": ".envs.control_vector_env",
     "Episode": ".episodes",
     "EpisodeReader": ".episodes",
     "EpisodeWriter": ".episodes",

@@ -33,6 +33,7 @@ FLOORS = {
         "command envs",
         "page",
         "gradcheck collecting",
+        "control",
         "planning",
         "worlds bench",
         "tasks",

@@ -9,8 +9,6 @@ _HOME = {
     "CONTROL_TASKS": ".registry",
     "ControlConfig": ".modes",
     "ControlWorlds": ".control_worlds",
-    "METHODS": ".optimize",
-    "optimize": ".optimize",
 }
 
 __all__ = list(_HOME)

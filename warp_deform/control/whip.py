@@ -9,10 +9,10 @@ Sources. `whip`: Whip-Rope of DaXBench (Chen et al., ICLR 2023), whose score, ex
 mean over particles of the root mean square of their distance along x, y, z, is taken as it is.
 `whip-target`: the free end's target of DIDP (arXiv 2505.17434), with shares within 10, 5, 2, 1 cm.
 
-Differences. DaXBench simulates a rope of 0.38 m by the material point method, its goal is the end of
-one teleoperated swing, and it has 70 steps of 7 ms at up to 2.9 m/s an axis. DIDP drives two joints
-of an arm for 0.5 s, with another rope. Numbers of theirs and of ours never belong into one row of a
-table without that sentence.
+Differences. DaXBench simulates a rope of 0.38 m by the material point method, its goal is the end
+of one teleoperated swing, and it has 70 steps of 7 ms at up to 2.9 m/s an axis. DIDP drives two
+joints of an arm for 0.5 s, with another rope. Numbers of theirs and of ours never belong into one
+row of a table without that sentence.
 
 Numbers to beat: `whip` 0.83 (DaXBench's APG; CEM-MPC has 0.34); `whip-target` 93.9, 84.3, 62.3 and
 20.8 % within 10, 5, 2 and 1 cm (DIDP).

@@ -10,7 +10,12 @@ from .external import offered, offered_version
 from .registry import FURTHER_TASKS, TASKS, add_task, registered
 from .task import Task
 
-__all__ = ["env_id", "register_environments", "register_task"]
+__all__ = ["control_id", "env_id", "register_environments", "register_task"]
+
+CONTROL_VERSION = 1
+"""Of the ids of control: rises with any change of its physics, observation or reward."""
+CONTROL_ALONE = ("whip", "whip-target")
+"""Tasks that are only for control; they stand in `warp_deform.control.registry`."""
 
 Registered = TypeVar("Registered", bound="type[Task]")
 
@@ -37,6 +42,8 @@ def register_environments() -> None:
     """
     for task in (*TASKS, *FURTHER_TASKS, *offered()):
         _register(task)
+    for task in CONTROL_ALONE:
+        _register_control(f"WarpDeform/{_words(task)}-v{CONTROL_VERSION}", task)
 
 
 def register_task(task: Registered) -> Registered:
@@ -65,9 +72,17 @@ def register_task(task: Registered) -> Registered:
     return task
 
 
+def control_id(task: str) -> str:
+    """Gymnasium id of the control of `task`: of `cable-ring` `WarpDeform/CableRing-Control-v1`."""
+    return f"WarpDeform/{_words(task)}-Control-v{CONTROL_VERSION}"
+
+
 def _register(task: str) -> None:
     from gymnasium.envs.registration import register, registry
 
+    known = TASKS | FURTHER_TASKS
+    if task not in known or known[task].jaw is None:
+        _register_control(control_id(task), task)
     same = f"WarpDeform/{_words(task)}-v"
     for other in [each for each in registry if each.startswith(same) and each != env_id(task)]:
         del registry[other]  # of the class whose place this one takes
@@ -76,5 +91,17 @@ def _register(task: str) -> None:
             env_id(task),
             entry_point="warp_deform.envs.env:PickPlaceEnv",
             vector_entry_point="warp_deform.envs.vector_env:PickPlaceVectorEnv",
+            kwargs={"task": task},
+        )
+
+
+def _register_control(name: str, task: str) -> None:
+    from gymnasium.envs.registration import register, registry
+
+    if name not in registry:
+        register(
+            name,
+            entry_point="warp_deform.envs.control_env:ControlEnv",
+            vector_entry_point="warp_deform.envs.control_vector_env:ControlVectorEnv",
             kwargs={"task": task},
         )

@@ -27,10 +27,13 @@ ObsMode = Literal["images", "state", "state_dict", "rgb", "rgbd", "rgb+state"]
 class Numbers(Protocol):
     """What "state_dict" holds of a slot."""
 
-    shapes: Mapping[str, tuple[int, ...]]
-    """Of every entry, in the order of "state"; what has no numbers is left out."""
-    agent: tuple[str, ...]
-    """Entries that a robot knows of itself: `agent_pos`."""
+    @property
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        """Of every entry, in the order of "state"; what has no numbers is left out."""
+
+    @property
+    def agent(self) -> tuple[str, ...]:
+        """Entries that a robot knows of itself: `agent_pos`."""
 
     def of(self, slot: int) -> Mapping[str, np.ndarray]:
         """The entries of a slot, as they are."""
