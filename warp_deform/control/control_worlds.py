@@ -28,7 +28,7 @@ from .limits import TipLimits
 from .modes import CONTROL_MODES, ControlConfig, TipTargets
 from .registry import control_task
 
-__all__ = ["SOLVED_STEPS", "ControlStep", "ControlWorlds"]
+__all__ = ["SOLVED_STEPS", "ControlStep"]  # `warp_deform.control` has `ControlWorlds`
 
 SOLVED_STEPS = 5
 """An episode has ended when it was solved for so many steps running."""

@@ -18,7 +18,7 @@ from ..rendering.pixels import BOUNDS
 from ..support.checked import POSITIVE, check_fields
 from .limits import TipLimits
 
-__all__ = ["CONTROL_MODES", "ControlConfig", "ControlMode", "TipTargets"]
+__all__ = ["ControlMode", "TipTargets"]  # `warp_deform.control` has the others
 
 ControlMode = Literal["tip_delta_position", "tip_delta_pose", "tip_velocity", "tip_position"]
 CONTROL_MODES: dict[str, tuple[str, ...]] = {

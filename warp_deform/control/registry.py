@@ -8,7 +8,7 @@ from ..tasks.task import Task
 from .control_task import ControlTask
 from .whip import Whip, WhipTarget
 
-__all__ = ["CONTROL_TASKS", "control_task"]
+__all__ = ["control_task"]  # `warp_deform.control` has `CONTROL_TASKS`
 
 CONTROL_TASKS: dict[str, type[ControlTask]] = {cls.name: cls for cls in (Whip, WhipTarget)}
 

@@ -170,7 +170,7 @@ class Task(abc.ABC):
             cls.losses = Task.losses  # type: ignore[method-assign]
         if "losses" in vars(cls) and "loss" not in vars(cls):
             cls.loss = Task.loss  # type: ignore[method-assign]
-        if "instruction" not in vars(cls) and "name" in vars(cls):
+        if "instruction" not in vars(cls) and isinstance(vars(cls).get("name"), str):
             cls.instruction = cls.name.replace("-", " ").capitalize() + "."
         if "ground_truth_rows" in vars(cls) and "ground_truth_size" not in vars(cls):
             cls.ground_truth_size = 3 * row_count(cls.ground_truth_rows)

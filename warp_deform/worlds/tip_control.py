@@ -13,7 +13,7 @@ from ..support.checked import real_array
 from ..support.quaternion import quat_from_yaw
 from .worlds import Worlds
 
-__all__ = ["GRASP_WITHIN", "TipControl", "nearest_grasp"]
+__all__ = ["GRASP_WITHIN", "nearest_grasp"]  # `warp_deform.worlds` has `TipControl`
 
 GRASP_WITHIN = 0.015
 """Distance [m] within which a tip takes hold of the nearest thing."""
