@@ -350,7 +350,8 @@ def test_a_registered_task_has_the_id_of_its_version(tmp_path: Path) -> None:
     assert gymnasium.make("WarpDeform/BoxAway-v1").spec is not None
     first.version = 2
     warp_deform.register_task(first)
-    assert [each for each in gymnasium.registry if "BoxAway" in each] == ["WarpDeform/BoxAway-v2"]
+    ids = [each for each in gymnasium.registry if "BoxAway" in each]
+    assert ids == ["WarpDeform/BoxAway-Control-v1", "WarpDeform/BoxAway-v2"]
     env = gymnasium.make("WarpDeform/BoxAway-v2")
     assert env.unwrapped.task.version == 2  # type: ignore[attr-defined]
     with pytest.raises(gymnasium.error.DeprecatedEnv):
