@@ -83,7 +83,7 @@ class Evaluating(EvalSettings):
 class SweepConfig(TrainMethod):
     """A grid. The fields are the keys of the file; those without a default have to be there.
 
-    bf16: of agents over pictures
+    precision: of agents over pictures
     Agents are combined with the tasks that they fit: those that see a goal, with tasks that have
     one.
     """
@@ -137,7 +137,8 @@ class SweepConfig(TrainMethod):
 
     def _cell(self, demos: int, task: str, agent: AgentName, seed: int) -> TrainConfig:
         method = {each.name: getattr(self, each.name) for each in fields(TrainMethod)}
-        method["bf16"] = self.bf16 and issubclass(AGENTS[agent], Transporter)
+        if not issubclass(AGENTS[agent], Transporter):
+            method["precision"] = "auto"
         return TrainConfig(
             task=task,
             agent=agent,

@@ -45,6 +45,8 @@ def trained(report: Mapping[str, Any], *, out: Path) -> str:
             f"{each['n_success']} of {each['n_episodes']} validation episodes solved, mean score "
             f"{each['mean_score']:.3f}"
         )
+    if report["chosen"] is not None:
+        lines["chosen"] = f"step {report['chosen']}, by validation"
     for step, loss in report["held_out"].items():
         lines[f"step {step}"] = f"loss {loss:.3f} nat on demonstrations that were held out"
     if report["loss"] is not None:

@@ -14,8 +14,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from warp_deform.collecting.workers import Workers
 from warp_deform.episodes import EpisodeReader, combine_hashes, versions
 from warp_deform.errors import InputError
@@ -26,7 +24,7 @@ from ..policy.policy import ImagePolicy, StatePolicy, load_policy
 from ..runs.folder import Fields, RunFolder, check_fields, read_json, read_record, write_json
 from .play import PlayedEpisode, play_policy
 from .protocol import Protocol, goals_for, goals_of
-from .summary import Evaluation, measure, summarise
+from .summary import Evaluation, summarise
 
 __all__ = ["evaluate_snapshot", "is_evaluated", "stopped_early", "trained_steps"]
 
@@ -88,7 +86,8 @@ def is_evaluated(run: RunFolder, step: int, protocol: Protocol) -> bool:
 def stopped_early(run: RunFolder) -> bool:
     """Whether a run's validation ends its training: a snapshot solved every episode.
 
-    Or, where the run has a `patience`, none did better for so long. By what is kept in the folder,
+    Or, where the run has a `patience`, none for so long solved more than all before or had a better
+    mean score. By what is kept in the folder,
     for the versions that trained; nothing is played.
 
     Raises:
@@ -108,8 +107,11 @@ def stopped_early(run: RunFolder) -> bool:
             )
             if summary["n_success"] == episodes:
                 return True
-            values.append(summary[measure(results.task)])
-    waited = len(values) - 1 - int(np.argmax(values or [0]))
+            values.append((summary["n_success"], summary["mean_score"]))
+    waited, most = 0, (-1, -math.inf)
+    for solved, score in values:
+        waited = 0 if solved > most[0] or score > most[1] else waited + 1
+        most = max(solved, most[0]), max(score, most[1])
     return patience is not None and waited >= patience
 
 

@@ -18,6 +18,8 @@ class KerasAdam(torch.optim.Adam):
     Torch adds it afterwards, so the same numbers need epsilon / sqrt(1 - beta2^t) at step t: 3.2e-6
     at the first step instead of 1e-7. Where gradients are small, that is a step 30 times smaller.
 
+    A step is one pass over each tensor (torch's `fused`), in place of ten; only rounding differs.
+
     Networks with separate Adams of equal settings, as in the original, and one Adam over all their
     parameters do the same: every parameter has its own moments.
 
@@ -38,7 +40,7 @@ class KerasAdam(torch.optim.Adam):
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-7,
     ) -> None:
-        super().__init__(parameters, lr=lr, betas=betas, eps=eps)
+        super().__init__(parameters, lr=lr, betas=betas, eps=eps, fused=True)
         for group in self.param_groups:
             group["eps_hat"], group["steps"] = eps, 0
 

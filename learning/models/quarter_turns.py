@@ -96,18 +96,25 @@ class QuarterTurnConvolution(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, out, H, W) of a map (B, C, H, W)."""
-        bias = self.bias
-        if self.gives == "regular":
-            bias = bias[:, None].expand(-1, TURNS).flatten()
+        bias = self.whole_bias(self.bias)
         return functional.conv2d(x, self.kernel(), bias, padding=self.size // 2)
 
     def kernel(self) -> Tensor:
         """The whole kernel (out, C, size, size), with the turned copies of what is learnt."""
+        return self.whole_kernel(self.weight)
+
+    def whole_kernel(self, weight: Tensor) -> Tensor:
+        """As `kernel`, of weights shaped as the learnt ones, or of their numbers."""
         if self.gives == "plain":
-            return self.weight.expand(-1, -1, TURNS, -1, -1).flatten(1, 2)
-        learnt = self.weight.flatten(1)
-        whole: Tensor = _Turned.apply(learnt, self.places, self.origins)
+            return weight.expand(-1, -1, TURNS, -1, -1).flatten(1, 2)
+        whole: Tensor = _Turned.apply(weight.flatten(1), self.places, self.origins)
         return whole.reshape(self.channels[1], self.channels[0], self.size, self.size)
+
+    def whole_bias(self, bias: Tensor) -> Tensor:
+        """Bias (out,) of one shaped as the learnt one."""
+        if self.gives == "plain":
+            return bias
+        return bias[:, None].expand(-1, TURNS).flatten()
 
     def _turned(self, weight: Tensor, turn: int) -> Tensor:
         """Learnt weights (n, ...) as the map of a field reads them that is `turn` turns on."""

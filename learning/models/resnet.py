@@ -31,13 +31,13 @@ from warp_deform.errors import InputError
 from .images import NETWORK_CHANNELS
 from .quarter_turns import TURNS, Field, QuarterTurnConvolution
 
-__all__ = ["STRIDE", "NetworkConfig", "ResNet43", "receptive_span"]
+__all__ = ["GROWING", "STRIDE", "NetworkConfig", "ResNet43", "receptive_span", "shrunk"]
 
 STRIDE = 8
 """Height and width of an input are multiples of this [pixels]: the smallest map has 1/8 of them."""
 _CHANNELS = (64, 128, 256, 512)
 _HEAD_CHANNELS = 16
-_GROWING = 3
+GROWING = 3
 """Stages at the end that double the map; as many at the beginning halve it or keep it whole."""
 
 
@@ -97,7 +97,11 @@ class ResNet43(nn.Module):
         super().__init__()
         c1, c2, c3, c4 = config.channels
         turns, seen = config.equivariant, NETWORK_CHANNELS * pictures * config.subpixels**2
-        self.bfloat16 = config.bfloat16
+        self.bfloat16, self.pictures_channels, self.out_channels = (
+            config.bfloat16,
+            seen,
+            out_channels,
+        )
         self.stem: nn.Module = (
             QuarterTurnConvolution(
                 seen, c1, 3, reads="plain", pictures=pictures, subpixels=config.subpixels
@@ -152,11 +156,11 @@ class ResNet43(nn.Module):
                 x = x + self.mark(mark)
             x = functional.relu(x, inplace=True)
             finer: list[Tensor] = []
-            for stage in self.stages[:-_GROWING]:
+            for stage in self.stages[:-GROWING]:
                 x = stage(x)
                 finer.append(x)
-            for k, stage in enumerate(self.stages[-_GROWING:]):
-                lateral = self.laterals[k](finer[_GROWING - 1 - k]) if self.laterals else None
+            for k, stage in enumerate(self.stages[-GROWING:]):
+                lateral = self.laterals[k](finer[GROWING - 1 - k]) if self.laterals else None
                 x = stage(x, lateral)
         return x.float()
 
@@ -190,6 +194,16 @@ class _Stage(nn.Module):
         self.identity = _Block(
             out_channels, middle, out_channels, turns=turns, reads=field, gives=field
         )
+
+    def convolutions(self) -> list[nn.Module]:
+        """As `ResNet43.convolutions`, of this stage; in the order in which they are registered."""
+        blocks = (self.project, self.identity)
+        return [
+            each
+            for block in blocks
+            for each in (block.reduce, block.spatial, block.expand, block.shortcut)
+            if each is not None
+        ]
 
     def forward(self, x: Tensor, lateral: Tensor | None = None) -> Tensor:
         y: Tensor = self.identity(self.project(x, lateral))
@@ -232,13 +246,7 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor, lateral: Tensor | None = None) -> Tensor:
         """`lateral` (B, middle, H, W) joins the bottleneck before its 3x3 convolution."""
-        if self.stride > 1 and self.turns:
-            x = functional.avg_pool2d(x, self.stride)  # every second pixel turns into another one
-        elif self.stride > 1:
-            # In place of convolutions with a stride: for fewer than 16 channels stored last, their
-            # weight gradient writes out of bounds (uxlfoundation/oneDNN issue 6035, torch 2.13).
-            x = x[:, :, :: self.stride, :: self.stride]
-            x = x.contiguous(memory_format=torch.channels_last)
+        x = shrunk(x, self.stride, turns=self.turns)
         y = self.reduce(x)
         if self.shortcut is not None:
             x = self.shortcut(x)
@@ -267,6 +275,17 @@ def _convolution(
         nn.Conv2d, in_channels, out_channels, size, padding=size // 2
     )
     return convolution
+
+
+def shrunk(x: Tensor, stride: int, *, turns: bool) -> Tensor:
+    """Every `stride`-th pixel of maps whose channels lie last; means where the features turn."""
+    if stride == 1:
+        return x
+    if turns:
+        return functional.avg_pool2d(x, stride)  # every second pixel turns into another one
+    # In place of convolutions with a stride: for fewer than 16 channels stored last, their
+    # weight gradient writes out of bounds (uxlfoundation/oneDNN issue 6035, torch 2.13).
+    return x[:, :, ::stride, ::stride].contiguous(memory_format=torch.channels_last)
 
 
 def _twice(x: Tensor) -> Tensor:

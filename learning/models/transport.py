@@ -28,7 +28,7 @@ from .crops import crop_reach, rotated_crops
 from .images import normalise
 from .resnet import STRIDE, NetworkConfig, ResNet43, receptive_span
 
-__all__ = ["Transport"]
+__all__ = ["Transport", "frame", "pick_mark"]
 
 _FEATURES = 3
 _PICTURES = 2
@@ -92,7 +92,7 @@ class Transport(nn.Module):
         self.crop, self.crop_before_query = crop, crop_before_query
         self.gain, self.focus, self.goal_bias = gain, focus, goal_bias
         self.mark_pick, self.pad_features, self.exact = mark_pick, pad_features, exact
-        self.config = config
+        self.config, self.pictures = config, pictures
         marks = len(_MARK_REACHES) if mark_pick else 0
         network = partial(
             ResNet43,
@@ -111,20 +111,20 @@ class Transport(nn.Module):
         pick = pick.cpu()
         centres = pick + self.crop // 2
         crops = partial(rotated_crops, centres=centres, size=self.crop, n_rotations=n_rotations)
-        seen = normalise(image if self.pad_features else _frame(image, self.crop))
-        mark = _mark(seen, pick if self.pad_features else centres) if self.mark_pick else None
+        seen = normalise(image if self.pad_features else frame(image, self.crop))
+        mark = pick_mark(seen, pick if self.pad_features else centres) if self.mark_pick else None
         factor = torch.ones_like(seen[:, :1])
         if self.goal is not None:
             seen, wanted = seen.chunk(2, dim=1)
             factor = self.goal(wanted, mark) + self.goal_bias
         key = self.key(seen, mark) * factor
         if self.pad_features:
-            key = _frame(key, self.crop)
+            key = frame(key, self.crop)
         if self.crop_before_query:
-            pieces = crops(normalise(_frame(image, self.crop)))
+            pieces = crops(normalise(frame(image, self.crop)))
             kernels = self.query(pieces.flatten(0, 1)).unflatten(0, pieces.shape[:2])
         elif self.pad_features:
-            kernels = crops(_frame(self.query(seen) * factor, self.crop))
+            kernels = crops(frame(self.query(seen) * factor, self.crop))
         else:
             window = _Window(
                 seen,
@@ -138,12 +138,16 @@ class Transport(nn.Module):
                 origin=window.origin,
                 shape=seen.shape[-2:],
             )
+        return self.correlated(key, kernels)
+
+    def correlated(self, key: Tensor, kernels: Tensor) -> Tensor:
+        """Place logits of framed features (B, 3, H + S, W + S) and crops (B, R, 3, S, S)."""
         weights = _around_pick(self.crop, focus=self.focus, even=self.config.equivariant)
         correlate = correlate_direct if self.exact else correlate_fft
         return self.gain * correlate(key, kernels * weights.to(kernels))
 
 
-def _mark(x: Tensor, pick: Tensor) -> Tensor:
+def pick_mark(x: Tensor, pick: Tensor) -> Tensor:
     """How near the pixels of maps (B, C, H, W) are to picks (B, 2): (B, 3, H, W), 1 at the pick."""
     rows, columns = (torch.arange(side, device=x.device) for side in x.shape[-2:])
     down, right = (pick.to(x.device)[:, axis, None] for axis in range(2))
@@ -151,7 +155,7 @@ def _mark(x: Tensor, pick: Tensor) -> Tensor:
     return torch.stack([torch.exp(-distance / reach) for reach in _MARK_REACHES], dim=1)
 
 
-def _frame(x: Tensor, crop: int) -> Tensor:
+def frame(x: Tensor, crop: int) -> Tensor:
     """Maps with half a crop of zeros around."""
     half = crop // 2
     return functional.pad(x, (half, half, half, half))

@@ -15,7 +15,9 @@ results). The lift is ours: the original reads the height of the motion from the
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -30,6 +32,7 @@ from .attention import Attention
 from .choice import choose
 from .images import CHANNELS, image_tensor
 from .lift import LiftHead
+from .pick_place import PickPlace
 from .resnet import STRIDE, NetworkConfig
 from .transport import Transport
 
@@ -47,7 +50,6 @@ __all__ = [
 
 Picture = tuple[np.ndarray, np.ndarray]
 """Colour (320, 160, 3) uint8 and height (320, 160) float32 [m], as in an observation."""
-
 
 _MOST_CHOICES, _MOST_LIFT = 360, 1.0  # far beyond what is sensible: a file may say anything
 
@@ -267,6 +269,10 @@ class Transporter(nn.Module):
             exact=config.exact,
             generator=generator,
         )
+        self.pick_place: PickPlace | None = None
+        """What computes attention and transport together, where it can."""
+        if config.pad_features and not (config.exact or self.transport.crop_before_query):
+            self.pick_place = PickPlace(self.attention, self.transport, bfloat16=config.bfloat16)
         n_lifts = len(config.lifts)
         self.lift = (
             LiftHead(n_lifts, images=config.images, crop=config.crop, generator=generator)
@@ -283,12 +289,8 @@ class Transporter(nn.Module):
         if (goal is not None) != (self.pictures == 2):
             raise InputError(f"{self.name}: {self.pictures - 1} goal pictures are needed")
         pictures = [current] if goal is None else [current, goal]
-        return torch.cat(
-            [
-                image_tensor(*each, scale=self.config.scale, fine=self.config.fine)
-                for each in pictures
-            ]
-        )
+        scale, fine = self.config.scale, self.config.fine
+        return torch.cat([image_tensor(*each, scale=scale, fine=fine) for each in pictures])
 
     def forward(self, batch: Batch) -> Losses:
         """Losses of a batch.
@@ -298,18 +300,18 @@ class Transporter(nn.Module):
         """
         image = batch.image
         self._check(image)
-        picks, places = (
-            _flat(name, pixel, self.config.shape)
-            for name, pixel in (("pick", batch.pick), ("place", batch.place))
-        )
+        picks = _flat("pick", batch.pick, self.config.shape)
+        places = _flat("place", batch.place, self.config.shape)
         n = self.config.n_rotations_train
-        attention = functional.cross_entropy(
-            self.attention(image).flatten(1), picks.to(image.device)
-        )
+        if self.pick_place is not None:
+            heat, logits = self.pick_place.both(image, batch.pick, n_rotations=n)
+        else:
+            heat = self.attention(image)
+            logits = self.transport(image, batch.pick, n_rotations=n)
+        attention = functional.cross_entropy(heat.flatten(1), picks.to(image.device))
         # Halves go to even, as in the original.
         rotation = torch.round(batch.theta.double() / (2 * math.pi / n)).long() % n
         label = rotation.to(image.device) * math.prod(self.config.shape) + places.to(image.device)
-        logits = self.transport(image, batch.pick, n_rotations=n)
         transport = functional.cross_entropy(logits.flatten(1), label)
         lift = attention.new_zeros(())
         if self.lift is not None:
@@ -330,19 +332,12 @@ class Transporter(nn.Module):
         """
         self._check(image)
         n = self.config.n_rotations_eval
-        heat = self.attention(image)
-        if avoid is not None:
-            heat = heat.masked_fill(avoid.to(heat.device), -math.inf)
-        choices = [
-            choose(
-                heat[k].cpu(),
-                lambda pick, seen=image[k : k + 1]: (  # type: ignore[misc]
-                    self.transport(seen, pick[None], n_rotations=n)[0].cpu()
-                ),
-                picks=self.config.picks,
-            )
-            for k in range(len(image))
-        ]
+        choices = []
+        for k in range(len(image)):
+            heat, place = self._heat(image[k : k + 1], n_rotations=n)
+            if avoid is not None:
+                heat = heat.masked_fill(avoid[k].to(heat.device), -math.inf)
+            choices.append(choose(heat.cpu(), place, picks=self.config.picks))
         pick, place = (
             torch.stack([getattr(each, name) for each in choices]) for name in ("pick", "place")
         )
@@ -356,6 +351,17 @@ class Transporter(nn.Module):
             np.where(yaw < -math.pi, yaw + 2 * math.pi, yaw),
             np.array(self.config.lifts)[choice],
         )
+
+    def _heat(
+        self, image: Tensor, *, n_rotations: int
+    ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Pick logits (H, W) of one image, and what says place logits (R, H, W) of a pick (2,)."""
+        if self.pick_place is not None:
+            heat, place = self.pick_place.each(image, n_rotations=n_rotations)
+        else:
+            heat = self.attention(image)
+            place = partial(self.transport.forward, image, n_rotations=n_rotations)
+        return heat[0], lambda pick: place(pick[None])[0].cpu()
 
     def _check(self, image: Tensor) -> None:
         shape = (CHANNELS * self.pictures * self.config.images, *self.config.shape)

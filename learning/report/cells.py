@@ -31,7 +31,7 @@ __all__ = ["Cell", "CurvePoint", "RunResult", "check_run", "pool", "version_note
 
 _ALIKE = ("agent", "schedule", "augment", "processes", "device", "patience")
 """Settings that runs of a cell have in common."""
-_SPREAD = ("snapshots", "doubling", "validate")
+_SPREAD = ("snapshots", "doubling", "shares", "validate", "patience")
 """Of a schedule: when snapshots are taken, and what they play, which is compared by itself."""
 _VERSIONS = ("warp-deform", "torch")
 

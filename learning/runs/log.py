@@ -50,6 +50,7 @@ class TrainingLog:
 
     Args:
         run: whose log
+        about: what every line says besides
         step: what an earlier call logged after this step is forgotten: it is done again
         tensorboard: write for TensorBoard too
         enabled: whether this process writes files
@@ -58,7 +59,16 @@ class TrainingLog:
         InputError: the log is damaged.
     """
 
-    def __init__(self, run: RunFolder, step: int, *, tensorboard: bool, enabled: bool) -> None:
+    def __init__(
+        self,
+        run: RunFolder,
+        step: int,
+        *,
+        about: Mapping[str, str] | None = None,
+        tensorboard: bool,
+        enabled: bool,
+    ) -> None:
+        self._about = dict(about or {})
         self._run, self._enabled = run, enabled
         self._sums: dict[str, Tensor] = {}
         self._lines = [line for line in read_log(run) if line["step"] <= step]
@@ -96,7 +106,7 @@ class TrainingLog:
         means = {name: float(total) / self._count for name, total in self._sums.items()}
         seconds, cpu = (now - then for now, then in zip(_clocks(), self._since, strict=True))
         costs = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu, 3)}
-        self._lines.append({"step": step, **means, "lr": lr, **costs})
+        self._lines.append({"step": step, **means, "lr": lr, **costs, **self._about})
         if self._board is not None:
             for name, value in means.items():
                 self._board.add_scalar(f"train/{name}", value, step)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
@@ -12,9 +12,11 @@ from ..models.transporter import Transporter, TransporterConfig
 from ..policy.policy import AGENTS
 from .processes import DEVICES
 from .schedules import SCHEDULES, Schedule, preset_schedule
-from .settings import TrainSettings
+from .settings import PrecisionName, TrainSettings
 
 __all__ = ["TrainConfig"]
+
+PRECISIONS = get_args(PrecisionName)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,19 +44,24 @@ class TrainConfig(TrainSettings):
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be {least} or more")
         plan = self.plan(self.demos or 0)  # refuses changes that do not go together
-        if self.patience is not None:
-            if self.patience < 1:
-                raise InputError(f"patience is {self.patience}; it must be 1 or more")
-            if not plan.validate:
-                raise InputError(
-                    f"patience is {self.patience} and validate 0; stopping early needs validation "
-                    "episodes, 1 or more"
-                )
-        for name in ("bf16", "network"):
-            if getattr(self, name) and self._sees_state:
+        if self.patience is not None and self.patience < 0:
+            raise InputError(f"patience is {self.patience}; it must be 0 or more")
+        if self.patience and not plan.validate:
+            raise InputError(
+                f"patience is {self.patience} and validate 0; stopping early needs validation "
+                "episodes, 1 or more"
+            )
+        if self.precision not in PRECISIONS:
+            raise InputError(
+                f"precision is {self.precision!r}; it must be one of {list(PRECISIONS)}"
+            )
+        for name, given in (("precision", self.precision != "auto"), ("network", self.network)):
+            if given and self._sees_state:
                 raise InputError(f"{name} is for agents over pictures; {self.agent} has its own")
-        if self.bf16 and self.exact:
-            raise InputError("bf16 and exact exclude each other: the original computes in float32")
+        if self.precision == "bfloat16" and self.exact:
+            raise InputError(
+                "precision bfloat16 and exact exclude each other: the original computes in float32"
+            )
 
     def plan(self, demos: int) -> Schedule:
         """The schedule in force with so many demonstrations."""
@@ -66,10 +73,12 @@ class TrainConfig(TrainSettings):
             name: getattr(self, name) for name in changed if getattr(self, name) is not None
         }
         if self.snapshots is not None:
-            wanted["doubling"] = False
+            wanted["shares"] = ()
         if self.validate is None and self.hold_out:
             wanted["validate"] = 0
-        return replace(plan, **wanted)
+        plan = replace(plan, **wanted)
+        patience = plan.patience if self.patience is None else self.patience
+        return replace(plan, patience=(patience or None) if plan.validate else None)
 
     @property
     def _sees_state(self) -> bool:

@@ -33,19 +33,22 @@ class Schedule:
     """Learn from mirror images, too, where the task has them."""
     snapshots: int = 10
     """Snapshots, the last one at the end."""
-    doubling: bool = False
-    """Every snapshot comes after twice the steps of the one before (so there are fewer where the
-    first ones would fall together), so that what is learnt soon is seen soon; else they are evenly
-    spread."""
+    shares: tuple[float, ...] = ()
+    """Where not empty, a snapshot comes after each of these shares of the steps (so there are fewer
+    where the first ones would fall together), in place of evenly spread ones."""
     validate: int = 0
     """Validation episodes that every snapshot plays; training ends when one solves them all."""
+    patience: int | None = None
+    """Training also ends after so many snapshots in a row that brought nothing."""
 
     def __post_init__(self) -> None:
         for name, least in (("steps", 1), ("batch", 1), ("snapshots", 1), ("warmup", 0),
                             ("validate", 0)):  # fmt: skip
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be {least} or more")
-        if self.snapshots > self.steps and not self.doubling:
+        if self.shares and not (0 < min(self.shares) and max(self.shares) == 1.0):
+            raise InputError(f"shares are {self.shares}; they must be above 0, and the greatest 1")
+        if self.snapshots > self.steps and not self.shares:
             raise InputError(
                 f"snapshots is {self.snapshots}; with steps = {self.steps} it must be 1 to "
                 f"{self.steps}"
@@ -61,13 +64,13 @@ class Schedule:
         Examples:
             >>> Schedule(steps=10, batch=1, lr=1.0, snapshots=4).snapshot_steps()
             (2, 5, 8, 10)
-            >>> Schedule(steps=4000, batch=1, lr=1.0, snapshots=5, doubling=True).snapshot_steps()
-            (250, 500, 1000, 2000, 4000)
+            >>> Schedule(steps=4000, batch=1, lr=1.0, shares=(0.075, 0.3, 1.0)).snapshot_steps()
+            (300, 1200, 4000)
         """
         n = self.snapshots
-        if self.doubling:
-            halved = (round(self.steps / 2**k) for k in range(n))
-            return tuple(sorted({step for step in halved if step}))
+        if self.shares:
+            steps = (round(share * self.steps) for share in self.shares)
+            return tuple(sorted({step for step in steps if step}))
         return tuple(round(k * self.steps / n) for k in range(1, n + 1))
 
     def lr_at(self, step: int) -> float:
@@ -95,8 +98,9 @@ SCHEDULES = {
         ema=0.998,
         mirror=True,
         snapshots=5,
-        doubling=True,
+        shares=(0.075, 0.15, 0.3, 0.6, 1.0),
         validate=20,
+        patience=2,
     ),
 }
 """By the names of the command line, for agents over pictures."""

@@ -14,10 +14,11 @@ from tyro.conf import Positional, arg
 
 from warp_deform.support.flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
 
-__all__ = ["AgentName", "PresetName", "TrainMethod", "TrainSettings"]
+__all__ = ["AgentName", "PrecisionName", "PresetName", "TrainMethod", "TrainSettings"]
 
 AgentName = Literal["transporter", "goal-split", "goal-stack", "gt-mlp", "gt-mlp-2step"]
 PresetName = Literal["paper", "fast"]
+PrecisionName = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,15 +54,17 @@ class TrainMethod:
     """Step size of Adam. By default, the preset's."""
     snapshots: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Number of snapshots, evenly spread. By default, `paper` keeps 10, and `fast` keeps one after
-    1/16, 1/8, 1/4, 1/2 and all of the steps."""
+    7.5, 15, 30, 60 and 100 % of the steps."""
     validate: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
     """Validation episodes that every snapshot plays. Training ends when a snapshot solves them all,
     and `eval` does not play them again. By default, 20 for `fast` (0 with --hold-out) and 0 for
     `paper`."""
-    patience: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """Also stop after this many snapshots in a row without improvement. This needs validation."""
-    bf16: bool = False
-    """Convolve in bfloat16, which is faster where the processor multiplies it natively."""
+    patience: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
+    """Also stop after this many snapshots in a row that brought nothing; 0: never. This needs
+    validation. By default, 2 for `fast` agents over pictures, and 0 for others."""
+    precision: PrecisionName = "auto"
+    """In which the networks of agents over pictures convolve. `auto` takes bfloat16 for `fast` on a
+    processor that multiplies it natively, and float32 otherwise."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the network computes. Under `torchrun`, each process takes one GPU."""
     untrained: bool = False

@@ -32,6 +32,9 @@ _MOMENTS = "exp_avg", "exp_avg_sq"
 class Trained:
     """Weights in training, their average over steps, and the optimiser's moments.
 
+    All weights lie in one vector, and the agent's are parts of it; so are moments and average. A
+    step of hundreds of small tensors costs ten times as much.
+
     Args:
         agent: whose weights
         plan: step sizes, and how long the average goes back
@@ -41,27 +44,39 @@ class Trained:
 
     def __init__(self, agent: nn.Module, plan: Schedule, run: RunFolder, key: str) -> None:
         self._plan, self._run, self._key = plan, run, key
-        self.weights = dict(agent.named_parameters())
-        self.optimizer = KerasAdam(agent.parameters(), lr=plan.lr)
-        self._average: dict[str, Tensor] | None = None
+        self._parameters = dict(agent.named_parameters())
+        self._flat = nn.Parameter(
+            torch.cat([each.detach().flatten() for each in self._parameters.values()])
+        )
+        for name, part in self._parts(self._flat.detach()).items():
+            self._parameters[name].data = part
+        self.optimizer = KerasAdam([self._flat], lr=plan.lr)
+        self._average: Tensor | None = None
         """None where snapshots hold the weights as they are."""
         if plan.ema:
-            self._average = {name: each.detach().clone() for name, each in self.weights.items()}
+            self._average = self._flat.detach().clone()
 
-    @torch.no_grad()
     def averaged(self) -> dict[str, Tensor]:
         """What snapshots hold, by name."""
-        if self._average is None:
-            return {name: each.detach() for name, each in self.weights.items()}
-        return self._average
+        return self._parts(self._flat.detach() if self._average is None else self._average)
 
+    def zero_grad(self) -> None:
+        """Forget gradients."""
+        for each in self._parameters.values():
+            each.grad = None
+
+    @torch.no_grad()
     def step(self, number: int) -> None:
         """Take the optimiser's step, counted from 1, and count it into the average."""
+        self._flat.grad = torch.cat(
+            [
+                (torch.zeros_like(each) if each.grad is None else each.grad).flatten()
+                for each in self._parameters.values()
+            ]
+        )
         self.optimizer.step()
         if self._average is not None:
-            with torch.no_grad():
-                for name, each in self._average.items():
-                    each.lerp_(self.weights[name].detach(), 1.0 - self._plan.kept_at(number))
+            self._average.lerp_(self._flat.detach(), 1.0 - self._plan.kept_at(number))
 
     def check(self, step: int) -> None:
         """See that all weights are finite; an average keeps what ever was not.
@@ -69,7 +84,8 @@ class Trained:
         Raises:
             WarpDeformError: they are not.
         """
-        if not all(bool(each.isfinite().all()) for each in self.averaged().values()):
+        weights = self._flat if self._average is None else self._average
+        if not bool(weights.isfinite().all()):
             raise WarpDeformError(f"weights are not finite at step {step}; lower the step size")
 
     def store(self, step: int) -> None:
@@ -85,32 +101,41 @@ class Trained:
         stored, step, key = self._run.read_state()
         if not step:
             return 0
-        for parameter in self.weights.values():
-            self.optimizer.state[parameter] = {
-                "step": torch.tensor(float(step)),
-                **{name: torch.zeros_like(parameter) for name in _MOMENTS},
-            }
+        self.optimizer.state[self._flat] = {
+            "step": torch.tensor(float(step), device=self._flat.device),
+            **{name: torch.zeros_like(self._flat.detach()) for name in _MOMENTS},
+        }
         wanted = self._tensors()
         stored_shapes, wanted_shapes = (
             {k: v.shape for k, v in each.items()} for each in (stored, wanted)
         )
         if key != self._key or stored_shapes != wanted_shapes:
             raise InputError(f"{self._run.state} is another run's; train into another folder")
-        with torch.no_grad():
-            for name, each in wanted.items():
-                each.copy_(stored[name])
+        for name, each in wanted.items():
+            each.copy_(stored[name])
         self.optimizer.param_groups[0]["steps"] = step
         return step
 
     def _tensors(self) -> dict[str, Tensor]:
-        """Weights, average and moments under one name each; not copied."""
-        tensors = {f"weights.{name}": each.detach() for name, each in self.weights.items()}
+        """Weights, average and moments under one name each; parts of vectors, not copied."""
+        vectors = {"weights": self._flat.detach()}
         if self._average is not None:
-            tensors |= {f"averaged.{name}": each for name, each in self._average.items()}
-        for name, parameter in self.weights.items():
-            for key in _MOMENTS:
-                tensors[f"{key}.{name}"] = self.optimizer.state[parameter][key]
-        return tensors
+            vectors["averaged"] = self._average
+        vectors |= {name: self.optimizer.state[self._flat][name] for name in _MOMENTS}
+        return {
+            f"{kind}.{name}": part
+            for kind, vector in vectors.items()
+            for name, part in self._parts(vector).items()
+        }
+
+    def _parts(self, vector: Tensor) -> dict[str, Tensor]:
+        """What belongs to each parameter of a vector of all, by name and in its shape."""
+        shapes = {name: each.shape for name, each in self._parameters.items()}
+        parts = vector.split([shape.numel() for shape in shapes.values()])
+        return {
+            name: part.view(shape)
+            for part, (name, shape) in zip(parts, shapes.items(), strict=True)
+        }
 
 
 def on_cpu(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -146,7 +171,7 @@ def claim(
         "seed": config.seed,
         "augment": config.augment,
         "hold_out": config.hold_out,
-        "patience": config.patience,
+        "patience": plan.patience,
         "validate": plan.validate,
         "processes": processes,
         "threads": config.threads,

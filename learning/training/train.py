@@ -31,6 +31,7 @@ from warp_deform.tasks.ground_truth import yaw_columns
 from ..data.batches import check_lifts, check_view, image_batch, state_batch, task_lifts
 from ..data.dataset import Demonstrations
 from ..models.gt_state import GtStateConfig
+from ..models.precision import has_bfloat16_units
 from ..models.transporter import PRESETS, Transporter
 from ..policy.policy import AGENTS, Agent, AgentDescription, make_agent
 from ..runs.folder import RunFolder
@@ -58,6 +59,7 @@ class TrainReport:
         snapshots: the steps of which there are snapshots
         validation: of snapshots on validation episodes, `n_success`, `n_episodes`, `mean_score` by
             step
+        chosen: the step whose snapshot did best on them, as `eval` would choose; None without them
         loss: mean over the last logged steps [nat]
         held_out: that of snapshots on held-out demonstrations by step [nat]
         seconds: of this call [s]
@@ -76,6 +78,7 @@ class TrainReport:
     patience: int | None
     snapshots: tuple[int, ...]
     validation: dict[int, dict[str, Any]]
+    chosen: int | None
     loss: float | None
     held_out: dict[int, float]
     seconds: float
@@ -122,6 +125,7 @@ def train(config: TrainConfig) -> TrainReport:
         # Go on where a run was interrupted, perhaps while its last snapshot was validated
         trained = Trained(agent, plan, run, key)
         first = trained.restore()
+        half = description.config.get("bfloat16", False)
         stopped = validation.evaluate([k for k in run.steps() if 0 < k <= first])
         network: nn.Module = DistributedDataParallel(agent) if world > 1 else agent
         due_steps, store = set(plan.snapshot_steps()), state_steps(plan)
@@ -133,7 +137,13 @@ def train(config: TrainConfig) -> TrainReport:
             unit="steps",
             shown=config.progress and rank == 0,
         )
-        log = TrainingLog(run, first, tensorboard=config.tensorboard, enabled=rank == 0)
+        log = TrainingLog(
+            run,
+            first,
+            about={"precision": "bfloat16" if half else "float32"},
+            tensorboard=config.tensorboard,
+            enabled=rank == 0,
+        )
         with log, bar as advance:
             for step in range(first + 1, plan.steps + 1):
                 if stopped:
@@ -144,7 +154,7 @@ def train(config: TrainConfig) -> TrainReport:
 
                 # One step of the optimiser
                 lr = trained.optimizer.param_groups[0]["lr"] = plan.lr_at(step)
-                trained.optimizer.zero_grad(set_to_none=True)
+                trained.zero_grad()
                 losses = network(*inputs)
                 loss = losses.total()
                 loss.backward()
@@ -196,9 +206,10 @@ def train(config: TrainConfig) -> TrainReport:
             seed=config.seed,
             steps=steps[-1],
             planned_steps=plan.steps,
-            patience=config.patience,
+            patience=plan.patience,
             snapshots=tuple(steps),
             validation=validation.results,
+            chosen=validation.chosen,
             loss=log.last_loss(),
             held_out=run.held_out(),
             seconds=time.perf_counter() - began,
@@ -219,7 +230,7 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
             n_rotations_train=max(chosen.n_rotations_train, yaws),
             n_rotations_eval=yaws,
             exact=config.exact or chosen.exact,
-            bfloat16=config.bf16 or chosen.bfloat16,
+            bfloat16=chosen.bfloat16 or _bfloat16(config),
         )
         return AgentDescription(task=config.task, agent=config.agent, config=asdict(sizes))
     choices = GtStateConfig(
@@ -235,6 +246,14 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
         config=asdict(choices),
         state_size=data.state_size,
     )
+
+
+def _bfloat16(config: TrainConfig) -> bool:
+    """Whether to convolve in bfloat16; `paper` does so only when asked to, as it is a reference."""
+    if config.precision == "auto":
+        fast = config.preset == "fast" and not config.exact
+        return fast and config.device == "cpu" and has_bfloat16_units()
+    return config.precision == "bfloat16"
 
 
 def _rehearse(

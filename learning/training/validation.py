@@ -13,6 +13,7 @@ from .processes import Process
 
 if TYPE_CHECKING:
     from ..evaluation.protocol import Protocol
+    from ..evaluation.summary import Evaluation
 
 __all__ = ["Validation"]
 
@@ -42,6 +43,10 @@ class Validation:
         """How the snapshot that played last did, in a few words."""
         self.results: dict[int, dict[str, Any]] = {}
         """`n_success`, `n_episodes` and `mean_score` of snapshots by step."""
+        self.chosen: int | None = None
+        """Step of the snapshot that did best, see `evaluation.summary.best`."""
+        self._task = task
+        self._evaluations: dict[int, Evaluation] = {}
         if episodes:
             from ..evaluation.protocol import Protocol, check_splits  # loads the simulator
 
@@ -53,9 +58,12 @@ class Validation:
         if self._protocol is None:
             return False
         from ..evaluation.snapshot import evaluate_snapshot, stopped_early
+        from ..evaluation.summary import best
 
         for step in steps if self._process.rank == 0 else ():
-            summary = evaluate_snapshot(self._run, step, self._protocol).summary
+            evaluation = evaluate_snapshot(self._run, step, self._protocol)
+            self._evaluations[step], summary = evaluation, evaluation.summary
+            self.chosen = best(list(self._evaluations.values()), task=self._task).step
             self.results[step] = {name: summary[name] for name in _REPORTED}
             self.note = (
                 f"validation {summary['n_success']} of {summary['n_episodes']} solved, "

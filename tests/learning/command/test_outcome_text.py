@@ -19,7 +19,7 @@ from warp_deform.command.main import main
 
 TRAINED: dict[str, Any] = {
     "task": "cable-line-notarget", "agent": "goal-split", "preset": "fast", "demos": 10,
-    "left_out": 0, "seed": 0, "steps": 250, "planned_steps": 4000, "patience": None,
+    "left_out": 0, "seed": 0, "steps": 250, "planned_steps": 4000, "patience": None, "chosen": 250,
     "validation": {250: {"n_success": 20, "n_episodes": 20, "mean_score": 1.0}},
     "snapshots": (250,),
     "loss": 8.814481811523438, "held_out": {}, "seconds": 148.22304895700006,
@@ -31,13 +31,20 @@ def test_training_that_stopped_says_why() -> None:
     said = trained(TRAINED, out=Path("runs/line"))
     assert "250 of up to 4000: a snapshot solved every validation episode" in said
     assert "step 250     20 of 20 validation episodes solved, mean score 1.000" in said
+    assert "chosen       step 250, by validation" in said
     assert "8.814 nat" in said and "95 s of CPU" in said and "this call 2 min" in said
     assert said.endswith("warp-deform eval runs/line")
     assert not re.search(r"\d\.\d{5}|None|\{|nan", said)
 
 
 def test_what_there_is_not_is_not_told_of() -> None:
-    plain = TRAINED | {"loss": None, "validation": {}, "steps": 4000, "stopped_early": False}
+    plain = TRAINED | {
+        "loss": None,
+        "validation": {},
+        "chosen": None,
+        "steps": 4000,
+        "stopped_early": False,
+    }
     said = trained(plain, out=Path("run"))
     assert "4000, as planned" in said
     assert not {"loss", "step", "held"} & {line.split()[0] for line in said.splitlines()}

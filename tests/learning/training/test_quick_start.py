@@ -60,6 +60,7 @@ def test_the_plain_commands_stop_when_all_is_solved(
     said = capsys.readouterr()
     report = json.loads(said.out)
     assert report["snapshots"] == [1, 2] and report["stopped_early"]
+    assert report["chosen"] == 2
     assert [each["n_success"] for each in report["validation"].values()] == [10, 20]
     assert episodes.played == [(step, 50_000 + n) for step in (1, 2) for n in range(20)]
     assert [line.split(":")[0] for line in said.err.splitlines()] == [f"train {TASK}"] * 2
@@ -86,10 +87,43 @@ def test_what_is_not_solved_is_trained_to_the_end(
 ) -> None:
     train, _, run = commands
     monkeypatch.setattr(evaluating, "_play_chunk", Episodes(solves_from=99))
+    assert main([*train, "--patience", "0"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["snapshots"] == [1, 2, 5, 10, 16] and not report["stopped_early"]
+    assert report["patience"] is None
+    assert RunFolder(run).read_settings()["validate"] == 20
+
+
+def test_two_snapshots_that_bring_nothing_end_it(
+    commands: tuple[list[str], list[str], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    train, _, _ = commands
+    monkeypatch.setattr(evaluating, "_play_chunk", Episodes(solves_from=99))
     assert main(train) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["snapshots"] == [1, 2, 4, 8, 16] and not report["stopped_early"]
-    assert RunFolder(run).read_settings()["validate"] == 20
+    assert report["snapshots"] == [1, 2, 5] and report["stopped_early"]
+    assert (report["patience"], report["chosen"]) == (2, 5), "of equals the last"
+
+
+def test_a_better_score_is_a_gain_where_nothing_is_solved(
+    commands: tuple[list[str], list[str], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A hard task is not given up while it is still being learnt."""
+    train, _, _ = commands
+
+    def play(chunk: evaluating._Chunk) -> Iterator[PlayedEpisode]:
+        step = int(chunk.snapshot.stem.split("_")[1])
+        for seed in chunk.seeds:
+            yield PlayedEpisode(seed, False, step / 20 - (step == 16), 3, "", "other")
+
+    monkeypatch.setattr(evaluating, "_play_chunk", play)
+    assert main(train) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["snapshots"] == [1, 2, 5, 10, 16] and report["chosen"] == 10
 
 
 def test_the_pages_have_the_commands_that_were_timed() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ def test_presets_are_the_papers_and_ours() -> None:
     paper = SCHEDULES["paper"]
     assert (paper.steps, paper.batch, paper.lr, paper.snapshots) == (20_000, 1, 1e-4, 10)
     assert (paper.ema, paper.decay, paper.warmup) == (0.0, False, 0)
-    assert SCHEDULES["fast"].snapshot_steps() == (250, 500, 1000, 2000, 4000)
+    assert SCHEDULES["fast"].snapshot_steps() == (300, 600, 1200, 2400, 4000)
 
 
 @pytest.mark.parametrize(
@@ -68,14 +67,13 @@ def test_snapshots_are_as_many_as_asked_for_and_evenly_spread(numbers: tuple[int
 
 
 @settings(derandomize=True, deadline=None, max_examples=200)
-@given(st.integers(1, 12), st.integers(1, 5000))
-def test_doubling_snapshots_come_after_twice_the_steps(n: int, steps: int) -> None:
-    snapshots = Schedule(steps=steps, batch=1, lr=1.0, snapshots=n, doubling=True).snapshot_steps()
-    assert (
-        snapshots[-1] == steps and snapshots[0] >= 1 and list(snapshots) == sorted(set(snapshots))
-    )
-    assert len(snapshots) <= n and (len(snapshots) == n or steps < 2**n)
-    assert all(abs(2 * a - b) <= 1 for a, b in pairwise(snapshots))
+@given(st.integers(1, 5000))
+def test_snapshots_at_shares_come_after_these_parts_of_the_steps(steps: int) -> None:
+    fast = replace(SCHEDULES["fast"], steps=steps)
+    snapshots = fast.snapshot_steps()
+    assert snapshots[-1] == steps and snapshots[0] >= 1
+    assert list(snapshots) == sorted({each for s in fast.shares if (each := round(s * steps))})
+    assert len(snapshots) == len(fast.shares) or steps < 20
 
 
 def test_validation_is_the_presets_unless_nothing_can_be_played(tmp_path: Path) -> None:
@@ -88,8 +86,26 @@ def test_validation_is_the_presets_unless_nothing_can_be_played(tmp_path: Path) 
     assert plan(validate=0).validate == 0 and plan(validate=7).validate == 7
     assert plan(hold_out=6).validate == 0 and plan(hold_out=6, validate=7).validate == 7
     assert plan(snapshots=4).snapshot_steps() == (1000, 2000, 3000, 4000), "as asked for"
-    assert plan(steps=10).snapshot_steps() == (1, 2, 5, 10)
+    assert plan(steps=10).snapshot_steps() == (1, 2, 3, 6, 10)
     assert plan(steps=2).snapshot_steps() == (1, 2)
+
+
+def test_patience_is_the_presets_unless_nothing_is_played(tmp_path: Path) -> None:
+    def patience(**changes: Any) -> int | None:
+        settings = {"task": "cable-ring", "agent": "transporter", "preset": "fast"} | changes
+        return TrainConfig(data=tmp_path, out=tmp_path, **settings).plan(10).patience
+
+    assert patience() == 2 and patience(patience=5) == 5
+    assert patience(patience=0) is None, "switched off"
+    assert patience(validate=0) is None and patience(hold_out=3) is None
+    assert patience(preset="paper") is None and patience(agent="gt-mlp") is None
+    assert patience(preset="paper", validate=3, patience=1) == 1
+
+
+@pytest.mark.parametrize("shares", [(0.5,), (0.0, 1.0), (0.5, 1.5)])
+def test_shares_end_with_the_last_step(shares: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match="shares are"):
+        Schedule(steps=4, batch=1, lr=1.0, shares=shares)
 
 
 @pytest.mark.parametrize(

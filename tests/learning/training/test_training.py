@@ -27,6 +27,7 @@ from warp_deform.errors import InputError
 from warp_deform.tasks.cable_line import CableLineNotarget
 
 TASK = "cable-line-notarget"
+HALF = ["--precision", "bfloat16"]
 SHORT = Schedule(steps=4, batch=1, lr=1e-3, warmup=2, decay=True, ema=0.9, snapshots=2)
 STATES = replace(SHORT, steps=60, batch=16, lr=3e-3)
 
@@ -145,7 +146,11 @@ def test_snapshots_hold_averaged_weights(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("agent", "flags", "expected"),
     [
-        ("goal-stack", ["--bf16", "--no-augment"], {"exact": False, "bfloat16": True}),
+        (
+            "goal-stack",
+            ["--precision", "bfloat16", "--no-augment"],
+            {"exact": False, "bfloat16": True},
+        ),
         ("goal-stack", ["--exact"], {"exact": True, "bfloat16": False}),
         ("gt-mlp", ["--exact"], {"exact": True}),
     ],
@@ -275,10 +280,17 @@ def test_damaged_and_foreign_snapshots_are_refused(
         ({"threads": 0}, "threads is 0; it must be 1 or more"),
         ({"validate": -3}, "validate is -3; it must be 0 or more"),
         ({"patience": 2}, "patience is 2 and validate 0; .* needs validation episodes, 1 or more"),
-        ({"patience": 0, "validate": 1}, "patience is 0; it must be 1 or more"),
+        ({"patience": -1, "validate": 1}, "patience is -1; it must be 0 or more"),
+        ({"precision": "half"}, "precision is 'half'; it must be one of"),
         ({"device": "tpu"}, "device is 'tpu'; it must be 'cpu' or 'cuda'"),
-        ({"agent": "gt-mlp", "bf16": True}, "bf16 is for agents over pictures; gt-mlp has its own"),
-        ({"exact": True, "bf16": True}, "bf16 and exact exclude each other"),
+        (
+            {"agent": "gt-mlp", "precision": "float32"},
+            "precision is for agents over pictures; gt-mlp has its own",
+        ),
+        (
+            {"exact": True, "precision": "bfloat16"},
+            "bfloat16 and exact exclude each other",
+        ),
     ],
 )
 def test_bad_settings(folder: Path, tmp_path: Path, changes: dict[str, Any], match: str) -> None:

@@ -147,8 +147,9 @@ class Validation:
             self.killed = None
             raise KeyboardInterrupt
         self.played.add(step)
-        summary = {"n_success": 0, "n_episodes": 1, "mean_score": self.values[step]}
-        return SimpleNamespace(summary=summary)
+        value = self.values[step]
+        summary = {"n_success": 0, "n_episodes": 1, "mean_score": value, "mean_actions": 1.0}
+        return SimpleNamespace(step=step, summary=summary)
 
     def stopped(self, run: RunFolder) -> bool:
         values = [self.values[step] for step in sorted(self.played)]
@@ -168,12 +169,13 @@ def test_a_kill_during_validation_changes_nothing(
     settings: dict[str, Any] = {"schedule": plan, "validate": 1, "patience": 1}
     Validation(values).install(monkeypatch)
     whole = train(config(folder, tmp_path / "whole", **settings))
-    assert whole.snapshots == (100, 200) and whole.stopped_early
+    assert whole.snapshots == (100, 200) and whole.stopped_early and whole.chosen == 100
     validation = Validation(values, killed=200)
     validation.install(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         train(config(folder, tmp_path / "cut", **settings))
     resumed = train(config(folder, tmp_path / "cut", **settings))
+    assert resumed.chosen == 100, "of the snapshots before the kill too"
     assert resumed.snapshots == whole.snapshots and resumed.weights_hash == whole.weights_hash
     assert validation.played == {100, 200}
 

@@ -48,7 +48,7 @@ CHANGED: dict[str, tuple[list[str], Any]] = {
     "snapshots": (["4"], 4),
     "validate": (["7"], 7),
     "patience": (["6"], 6),
-    "bf16": ([], True),
+    "precision": (["float32"], "float32"),
     "device": (["cuda"], "cuda"),
     "untrained": ([], True),
     "no_augment": ([], True),
@@ -105,7 +105,7 @@ def test_a_flag_of_train_changes_its_setting_alone(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words, value = CHANGED[name]
-    agent = ["--agent", "transporter"] if name == "bf16" else []
+    agent = ["--agent", "transporter"] if name == "precision" else []
     others = ["--validate", "1"] if name == "patience" else []
     seen: list[TrainConfig] = []
 
