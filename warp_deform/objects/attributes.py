@@ -6,6 +6,8 @@ with the worlds and any Newton tool can read them from the finished model.
 
 from __future__ import annotations
 
+import functools
+import sys
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -34,6 +36,22 @@ def attribute(name: str) -> str:
     return f"{NAMESPACE}:{name}"
 
 
+_FORWARD_ONLY = ("newton._src.utils.mesh", "newton._src.geometry.bvh")
+"""Where the kernels stand that `newton.ModelBuilder.finalize` launches: who is whose neighbour, and
+what encloses what. Nobody differentiates by these; with adjoints they compile in three times as
+long, before the first scene of a new machine is there."""
+
+
+@functools.cache
+def _leave_adjoints_out() -> None:
+    import warp as wp
+
+    for name in _FORWARD_ONLY:
+        # Newton may put them elsewhere one day: then they compile as it wants them to
+        if name in sys.modules:
+            wp.set_module_options({"enable_backward": False}, sys.modules[name])
+
+
 def register_attributes(builder: newton.ModelBuilder) -> None:
     """Declare our custom attributes on `builder`; calling it again changes nothing.
 
@@ -56,6 +74,8 @@ def register_attributes(builder: newton.ModelBuilder) -> None:
     # Newton takes seconds to import, and the tasks can be listed without it.
     import newton
     import warp as wp
+
+    _leave_adjoints_out()
 
     frequency = newton.Model.AttributeFrequency
     for name, where, dtype, default, references in (
