@@ -16,7 +16,7 @@ from warp_deform.robots import RobotName
 from warp_deform.support.flag_range import SEED, FlagRange
 from warp_deform.tasks.registry import task as find_task
 
-__all__ = ["PageOptions", "PlayOptions", "play"]
+__all__ = ["PageOptions", "PlayOptions", "ViewOptions", "play", "view"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +52,8 @@ class PlayOptions(PageOptions):
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """Name of the task; `warp-deform list` shows all of them."""
+    policy: Annotated[tuple[Path, ...], arg(metavar="RUN")] = ()
+    """Training runs, or snapshots: policies that may act in your place and show where they look."""
     record: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder for the episodes that are kept at the page; a later session goes on in it."""
     seed: Annotated[int | None, SEED] = None
@@ -66,12 +68,25 @@ def play(options: PlayOptions) -> Outcome:
     from warp_deform.page.play import PlaySession
     from warp_deform.page.server import check_websockets, listen, serve_until_interrupted
 
+    from ..page.policy_player import PolicyPlayer
+
     check_websockets()
     opener, bound = options.opener(), listen(options.port)
     with bound:
         quiet_warp()
+        players: list[PolicyPlayer] = []
+        for path in options.policy:
+            player = PolicyPlayer(path, task=options.task)
+            taken = [each.name for each in players]
+            if player.name in taken:
+                player.name = f"{player.name} {taken.count(player.name) + 1} ({path.name})"
+            players.append(player)
         session = PlaySession(
-            options.task, robot=options.robot, seed=options.seed, record=options.record
+            options.task,
+            robot=options.robot,
+            seed=options.seed,
+            record=options.record,
+            players=players,
         )
         serve_until_interrupted(session, bound, browser=opener)
     kept = session.kept.count if session.kept else 0
@@ -79,3 +94,39 @@ def play(options: PlayOptions) -> Outcome:
     return Outcome(
         data={"task": options.task, "episodes": kept}, text=f"played {options.task}{where}"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions(PageOptions):
+    """Watch recorded episodes in a page in the browser, and compare two."""
+
+    folder: Annotated[Positional[Path], arg(metavar="DIR")]
+    """Folder of episodes: of demonstrations, of a session of `play`, or of packed recordings of a
+    robot. Or the folder of a training run that was evaluated."""
+
+
+def view(options: ViewOptions) -> Outcome:
+    """Serve the page until Ctrl-C."""
+    if not options.folder.is_dir():
+        raise InputError(f"no folder {str(options.folder)!r}; `warp-deform demo` makes one")
+    from warp_deform.page.server import check_websockets, listen, serve_until_interrupted
+    from warp_deform.page.sources import EpisodeSource, Source
+    from warp_deform.page.view import ViewSession
+
+    from ..page.evaluations import EvaluationSource
+    from ..page.kinds import kind_of
+
+    check_websockets()
+    opener, bound = options.opener(), listen(options.port)
+    with bound:
+        quiet_warp()
+        source: Source
+        if (options.folder / "run.json").exists():
+            source = EvaluationSource(options.folder)
+        else:
+            source = EpisodeSource(options.folder, kind=kind_of)
+        session = ViewSession(source)
+        serve_until_interrupted(session, bound, browser=opener)
+    count = len(session.entries)
+    data = {"folder": options.folder, "episodes": count}
+    return Outcome(data=data, text=f"{options.folder}: {count} episodes")

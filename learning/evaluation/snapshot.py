@@ -26,7 +26,13 @@ from .play import PlayedEpisode, play_policy
 from .protocol import Protocol, goals_for, goals_of
 from .summary import Evaluation, summarise
 
-__all__ = ["evaluate_snapshot", "is_evaluated", "stopped_early", "trained_steps"]
+__all__ = [
+    "evaluate_snapshot",
+    "is_evaluated",
+    "read_played",
+    "stopped_early",
+    "trained_steps",
+]
 
 _CHUNK = 2 * SLOTS
 """Episodes that a process is given at a time: what a kill loses, against idle lanes at the end."""
@@ -197,7 +203,7 @@ class _Results:
         text = json.dumps(self._record, sort_keys=True)
         key = hashlib.blake2b(text.encode(), digest_size=6).hexdigest()
         self._path = run.evaluations / f"step_{step:08d}-{protocol.split}-{key}.json"
-        self.played = _read_played(self._path)
+        self.played = read_played(self._path)
 
     @property
     def whole(self) -> bool:
@@ -242,7 +248,7 @@ _PLAYED: Fields = {
 }
 
 
-def _read_played(path: Path) -> dict[int, PlayedEpisode]:
+def read_played(path: Path) -> dict[int, PlayedEpisode]:
     """Episodes of a file of results, by their seeds; none where there is no file."""
     if not path.exists():
         return {}

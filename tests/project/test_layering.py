@@ -47,6 +47,7 @@ FLOORS = {
     ],
     "learning": [
         "command",
+        "page",
         "sweep",
         "report",
         "training",

@@ -76,6 +76,7 @@ VERBS: dict[str, Verb] = {
         "show statistics of a dataset and draw its episodes",
     ),
     "play": Verb("learning.command.page:play", "pick and place by mouse, in a page in the browser"),
+    "view": Verb("learning.command.page:view", "watch recorded episodes in a page in the browser"),
     "convert": Verb(
         "learning.command.convert:convert", "convert datasets to and from other formats"
     ),

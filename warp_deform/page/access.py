@@ -16,14 +16,14 @@ from importlib.resources import files
 __all__ = ["FILES", "HEADERS", "Access", "Answer", "new_token", "static_file"]
 
 _HTML, _CSS, _SCRIPT = "text/html; charset=utf-8", "text/css", "text/javascript; charset=utf-8"
+_MODULES = ("page", "connection", "scene", "shadows", "topdown", "playback", "pointer", "panel",
+            "heat", "view")  # fmt: skip
 FILES = {
     "": ("index.html", _HTML),
     "page.css": ("page.css", _CSS),
+    "view.css": ("view.css", _CSS),
     "three.js": ("three.js", _SCRIPT),
-    **{
-        f"{name}.js": (f"{name}.js", _SCRIPT)
-        for name in ("page", "connection", "scene", "topdown", "playback", "pointer", "panel")
-    },
+    **{f"{name}.js": (f"{name}.js", _SCRIPT) for name in _MODULES},
 }
 """What is served, by the rest of the path behind the token: a file's name and its type."""
 

@@ -20,7 +20,8 @@ from ..robots.arm import Robot
 from ..worlds.arm_path import ArmPath
 from ..worlds.episode import StepReport
 
-__all__ = ["FRAMES_A_SECOND", "arm_arrays", "clip", "drawable_arrays", "grid_head", "pictures"]
+__all__ = ["FRAMES_A_SECOND", "arm_arrays", "clip", "drawable_arrays", "grid_head", "heat_picture",
+           "link_matrices", "pictures"]  # fmt: skip
 
 FRAMES_A_SECOND = 30
 _HIGH = 0.28
@@ -147,3 +148,9 @@ def clip(
         "links": link_matrices(robot, arm.at(times[:count])),
     }
     return arrays, float(times[count - 1])
+
+
+def heat_picture(probabilities: np.ndarray) -> np.ndarray:
+    """PNG, as bytes, of the square root of probabilities (H, W) over their largest."""
+    share = np.sqrt(probabilities / max(float(probabilities.max()), 1e-30))
+    return _png(np.rint(255 * share).astype(np.uint8))

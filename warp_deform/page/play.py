@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from ..worlds.loop import EpisodeRun
 from ..worlds.spaces import check_action
 from ..worlds.state import WorldState
 from ..worlds.worlds import Worlds
+from .contest import Contest, Standing
 from .drawing import (
     FRAMES_A_SECOND,
     arm_arrays,
@@ -31,6 +34,7 @@ from .drawing import (
     link_matrices,
     pictures,
 )
+from .guidance import at_work, has_gradients, play_alone, pull_of_place, sight_message
 from .keeping import HUMAN, KeptEpisodes
 from .measures import measures, score_meaning
 from .players import Player, demonstrators
@@ -53,10 +57,14 @@ class PlaySession:
         acted: who chose each of its actions
     """
 
+    page = "index.html"
     verbs: Verbs = {
         "act": {"pick": list, "place": list, "turn": float, "lift": float},
         "probe": {"xy": list, "turn": float},
         "demonstrate": {"who": str, "whole": bool},
+        "look": {"who": str},
+        "versus": {"who": str},
+        "gradient": {"pick": list, "place": list, "turn": float, "lift": float},
         "undo": {},
         "reset": {"seed": int},
         "next": {},
@@ -76,6 +84,7 @@ class PlaySession:
         self.worlds = Worlds(task, 1, robot=robot)
         self.kept = KeptEpisodes(record, self.worlds.task.name) if record else None
         self.players = demonstrators(players)
+        self.contest = Contest()
         self._version = 0
         self._arm, self._parts = arm_arrays(self.worlds.robot)
         self._links(self.worlds.robot.home_q)  # loads torch before anybody waits for it
@@ -154,7 +163,9 @@ class PlaySession:
             "task": task.name,
             "meaning": score_meaning(task),
             "robot": worlds.robot.name,
+            "instruction": task.instruction,
             "goal": task.goal_conditioned,
+            "gradients": has_gradients(task),
             "lifts": [stage.lift for stage in task.stages],
             "jaw": task.jaw is not None,
             "grid": grid_head(task.grid),
@@ -164,7 +175,7 @@ class PlaySession:
             "players": [{"name": p.name, "looks": p.looks} for p in self.players.values()],
             "records": self.kept is not None,
         }
-        return [pack("hello", self._arm, **about), self.scene()]
+        return [pack("hello", self._arm, **about), self.scene(), self._table()]
 
     def scene(self) -> bytes:
         """The message that shows the present state whole."""
@@ -243,6 +254,7 @@ class PlaySession:
     def _do_act(self, job: Job, post: Post) -> None:
         self._refuse_when_over()
         post(self.step(self.action(job), HUMAN))
+        self._note_standing(post)
 
     def step(self, action: Action, who: str) -> bytes:
         """Carry out an action and return the message that shows it.
@@ -275,22 +287,74 @@ class PlaySession:
             action=[float(each) for each in action],
         )
 
-    def _do_demonstrate(self, job: Job, post: Post) -> None:
+    def _player(self, job: Job) -> Player:
         player = self.players.get(job.values["who"])
         if player is None:
             raise InputError(f"there is nobody called {job.values['who'][:40]!r}")
+        return player
+
+    def _do_demonstrate(self, job: Job, post: Post) -> None:
+        player = self._player(job)
         self._refuse_when_over()
         while not self.over and not self.stop.is_set():
-            post(pack("work", who=player.name))
-            try:
-                action = player.choose(self.worlds, self.run)
-                if action is None:
-                    raise InputError(f"{player.name} sees nothing to do")
-                post(self.step(check_action(action, name=player.name), player.name))
-            finally:
-                post(pack("work", who=""))
+            with at_work(player.name, post):
+                action = self._choice(player, self.run)
+                post(sight_message(player, self.worlds, action, acts=True))
+                post(self.step(action, player.name))
+            self._note_standing(post)
             if not job.values["whole"]:
                 return
+
+    def _choice(self, player: Player, run: EpisodeRun[Step]) -> Action:
+        action = player.choose(self.worlds, run)
+        if action is None:
+            raise InputError(f"{player.name} sees nothing to do")
+        return check_action(action, name=player.name)
+
+    def _do_look(self, job: Job, post: Post) -> None:
+        """Show what somebody would do, and where it looks; nothing is done or drawn for it."""
+        player = self._player(job)
+        self._refuse_when_over()
+        with at_work(player.name, post):
+            action = self._choice(
+                player.aside(), replace(self.run, rng=copy.deepcopy(self.run.rng))
+            )
+            post(sight_message(player, self.worlds, action))
+
+    def _do_versus(self, job: Job, post: Post) -> None:
+        """Let somebody play the episode from its start; the person's goes on where it was."""
+        player = self._player(job)
+        worlds, now = self.worlds, self.worlds.state(0)
+        worlds.restore(0, self.start)
+        with at_work(player.name, post):
+            try:
+                standing = play_alone(player, worlds, self.run.seed, self.stop)
+            finally:
+                worlds.restore(0, now)
+                player.begin()
+        if standing is None:
+            raise InputError(f"{player.name} was stopped before it came to an end")
+        self.contest.note(self.run.seed, player.name, standing)
+        post(self._table())
+
+    def _do_gradient(self, job: Job, post: Post) -> None:
+        """Show where the adjoint says that the place of an action should move."""
+        self._refuse_when_over()
+        action = self.action(job)
+        with at_work("the adjoint", post):
+            pull = pull_of_place(self.worlds, action)
+        post(pack("gradient", place=[float(each) for each in action[3:5]], **pull))
+
+    def _note_standing(self, post: Post) -> None:
+        """Keep how the person's own episode stands, once it is over."""
+        if self.over and set(self.acted) == {HUMAN}:
+            score, solved = float(self.worlds.score(0)), self.worlds.solved(0)
+            standing = Standing(score, len(self.run.actions), solved)
+            self.contest.note(self.run.seed, "you", standing)
+            post(self._table())
+
+    def _table(self) -> bytes:
+        return pack("table", rows=self.contest.rows())
 
     def _do_undo(self, job: Job, post: Post) -> None:
         if not self.past:

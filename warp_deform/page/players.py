@@ -34,6 +34,9 @@ class Player(Protocol):
     def begin(self) -> None:
         """Forget what was before: another episode begins, or an action was taken back."""
 
+    def aside(self) -> Player:
+        """The same one, whose choices are not remembered by this one."""
+
     def choose(self, worlds: Worlds, run: EpisodeRun[Any]) -> Action | None:
         """The next action (7,), None where it sees nothing to do."""
 
@@ -52,6 +55,10 @@ class DemonstratorPlayer:
 
     def begin(self) -> None:
         """Nothing: it sees the state and no history."""
+
+    def aside(self) -> Player:
+        """Itself: it remembers nothing."""
+        return self
 
     def choose(self, worlds: Worlds, run: EpisodeRun[Any]) -> Action | None:
         """See `Player.choose`."""

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import InputError, WarpDeformError
 from ..support.extras import install_extra
-from .access import HEADERS, Access, static_file
+from .access import FILES, HEADERS, Access, static_file
 from .wire import MOST_BYTES, Job, NotUnderstoodError, Verbs, pack, parse_job
 
 if TYPE_CHECKING:
@@ -47,6 +47,8 @@ class Post(Protocol):
 class Session(Protocol):
     """What a page shows and does; every method is called by one thread."""
 
+    page: str
+    """The HTML file that is served at the address itself."""
     verbs: Verbs
     """What a page may ask for."""
     stop: threading.Event
@@ -119,7 +121,8 @@ class Served:
         )
         if answer.status == 101:
             return None
-        body = static_file(answer.file) if answer.status == 200 else b""
+        name = answer.file if answer.file != FILES[""][0] else self._session.page
+        body = static_file(name) if answer.status == 200 else b""
         told = {**HEADERS, "Content-Type": answer.kind, "Content-Length": str(len(body))}
         phrase = http.HTTPStatus(answer.status).phrase
         return Response(answer.status, phrase, Headers(told), body)

@@ -19,6 +19,7 @@ from warp_deform.page.wire import pack
 class Counter:
     """A session that counts."""
 
+    page = "index.html"
     verbs = {"add": {"number": int}, "big": {}, "wait": {}}
 
     def __init__(self):

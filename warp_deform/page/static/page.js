@@ -1,6 +1,7 @@
 // The page of `warp-deform play`: what comes from the server goes to the views, and back.
 import {connect} from "./connection.js";
-import {$, introduce, note, offerLifts, paint, tell} from "./panel.js";
+import {goalLayer, heatLayer, peak} from "./heat.js";
+import {$, introduce, note, offerLifts, paint, rank, tell} from "./panel.js";
 import {Playback} from "./playback.js";
 import {Hand} from "./pointer.js";
 import {openScene} from "./scene.js";
@@ -24,6 +25,7 @@ const hand = new Hand({
   },
   inside: ([x, y]) => { const [[x0, x1], [y0, y1]] = hello.bounds; return x >= x0 && x <= x1 && y >= y0 && y <= y1; },
   say: plan => {
+    hand.plan = plan;
     top.planned = plan;
     top.grasp = null;
     if (scene) { scene.plan(plan); if (plan) scene.highlight(null); }
@@ -52,7 +54,7 @@ function ask(message) {
 }
 
 function hear(message) {
-  ({hello: greeted, scene: staged, clip: moved, note: noted, grasp: probed, work: worked})[message.kind](message);
+  ({hello: greeted, scene: staged, clip: moved, note: noted, grasp: probed, work: worked, sight: seen, table: ranked, gradient: pulled})[message.kind](message);
   mark();
 }
 
@@ -74,6 +76,7 @@ function staged(message) {
   top.put(state);
   if (scene) { scene.build(message); scene.put(state); scene.highlight(null); }
   hand.drop();
+  forget();
   settle(message);
 }
 
@@ -84,8 +87,59 @@ function moved(message) {
   message.fps = hello.frames;
   hand.drop();
   light(null);
+  forget();
+  message.sight = coming;
+  coming = null;
   playback.add(message);
 }
+
+/** What somebody would do, and where it looks. */
+async function seen(message) {
+  if (message.acts) { coming = message; return; } // shown with the motion that follows
+  forget();
+  waiting = false;
+  const [px, py, , qx, qy, yaw] = message.action;
+  const maps = await Promise.all(["pick", "place"].map(name => message[name] && decode(message[name])));
+  ["pick", "place"].forEach((name, k) => { if (maps[k]) overlay(name, heatLayer(maps[k], name), 0.002 + 0.001 * k); });
+  sighted = {pick: [px, py], place: [qx, qy], turn: yaw};
+  top.planned = sighted;
+  if (scene) scene.plan(sighted);
+  $("sight").hidden = false;
+  $("sight").textContent = maps[0]
+    ? `${message.who}: orange is where it would pick, blue where it would place`
+    : `${message.who} sees the state and no picture, so it has no heat maps`;
+  document.body.dataset.peak = maps[0] ? peak(maps[0]).join(" ") : "none";
+  refresh();
+}
+
+let sighted = null, coming = null, moving = null;
+function overlay(name, layer, height) {
+  if (layer) top.layers[name] = layer; else delete top.layers[name];
+  if (scene) scene.overlay(name, layer, hello.grid, height);
+}
+
+/** Take away what was shown of others. */
+function forget() {
+  overlay("pick", null);
+  overlay("place", null);
+  if (sighted && top.planned === sighted) { top.planned = null; if (scene) scene.plan(null); }
+  sighted = null;
+  pulled({});
+  $("sight").hidden = true;
+  delete document.body.dataset.peak;
+  refresh();
+}
+
+function pulled({place, to, says}) {
+  waiting = false;
+  top.pull = to ? [place, to] : null;
+  if (scene) scene.gradient(to ? place : null, to);
+  if (says) { $("sight").hidden = false; $("sight").textContent = says; }
+  document.body.dataset.pull = to ? to.join(" ") : "";
+  refresh();
+}
+
+function ranked(message) { waiting = false; rank(message.rows); }
 
 function noted(message) {
   waiting = false;
@@ -108,14 +162,21 @@ async function settle(state) {
   tell(state, hello);
   mark();
   $("goal-box").hidden = !state.goal;
-  if (state.goal) paint("goal", state.goal);
+  if (state.goal) { goal = await paint("goal", state.goal); ghost(); }
   if (state.height) paint("height", state.height);
   if (!state.color) return;
   const picture = await decode(state.color);
   if (shown === state && !playback.playing) { top.still(picture); refresh(); }
 }
 
+let goal = null;
+function ghost() { if (scene && goal) scene.overlay("goal", $("ghost").checked ? goalLayer(goal) : null, hello.grid, 0.0012); refresh(); }
+
 function showFrame(clip, frame) {
+  if (clip !== moving) {
+    moving = clip;
+    if (clip.sight) seen({...clip.sight, acts: false}); else forget();
+  }
   const part = (array, rest) => array.subarray(frame * rest, (frame + 1) * rest);
   const size = array => array.shape.slice(1).reduce((a, b) => a * b, 1);
   const state = {q: part(clip.q, size(clip.q)), body: part(clip.body, size(clip.body)), links: part(clip.links, size(clip.links))};
@@ -166,6 +227,12 @@ function loop(now) {
   mark();
 }
 
+function pull() {
+  const plan = hand.plan;
+  if (!plan?.place) { note("click what to pick first, then hold the pointer where it would go"); return; }
+  ask({do: "gradient", pick: plan.pick, place: plan.place, turn: hand.turn, lift});
+}
+
 function hint() {
   if (!hello) return "connecting";
   if (playback.playing) return "";
@@ -183,6 +250,10 @@ $("keep").onclick = () => ask({do: "keep"});
 $("seeds").onsubmit = event => { event.preventDefault(); ask({do: "reset", seed: Math.round(Number($("seed").value))}); };
 $("step").onclick = () => ask({do: "demonstrate", who: $("who").value, whole: false});
 $("whole").onclick = () => ask({do: "demonstrate", who: $("who").value, whole: true});
+$("look").onclick = () => ask({do: "look", who: $("who").value});
+$("versus").onclick = () => ask({do: "versus", who: $("who").value});
+$("pull").onclick = () => pull();
+$("ghost").onchange = ghost;
 $("stop").onclick = () => send({do: "stop"});
 $("pause").onclick = () => playback.toggle();
 $("time").oninput = () => playback.scrub(Number($("time").value));
@@ -194,7 +265,7 @@ document.addEventListener("keydown", event => {
   const turn = event.shiftKey ? Math.PI / 36 : Math.PI / 12;
   const keys = {
     q: () => hand.setTurn(hand.turn + turn), e: () => hand.setTurn(hand.turn - turn), escape: () => hand.drop(),
-    u: () => $("undo").click(), n: () => $("next").click(), k: () => $("keep").click(), p: () => playback.toggle(),
+    u: () => $("undo").click(), n: () => $("next").click(), k: () => $("keep").click(), p: () => playback.toggle(), l: () => $("look").click(), g: () => pull(),
   };
   const key = event.key.toLowerCase();
   if (key in keys) keys[key]();

@@ -17,6 +17,9 @@ export function introduce(hello) {
   $("title").textContent = hello.task;
   $("score").title = hello.meaning;
   $("meaning").textContent = hello.meaning;
+  $("instruction").textContent = hello.instruction;
+  $("pull").hidden = !hello.gradients;
+  $("ghost-box").hidden = !hello.goal;
   $("keep").hidden = !hello.records;
   $("next").textContent = hello.goal ? "Next goal" : "Next";
   $("lifts").hidden = hello.lifts.length < 2;
@@ -55,8 +58,18 @@ export function tell(state, hello) {
   $("keep").disabled = !state.actions || Boolean(state.physics);
   $("keep").classList.toggle("call", state.solved);
   $("next").classList.toggle("call", state.solved && !hello.records);
-  $("step").disabled = $("whole").disabled = Boolean(state.over);
+  for (const id of ["step", "whole", "look"]) $(id).disabled = Boolean(state.over);
   $("seed").value = state.seed;
+}
+
+/** You beside others on the same seeds. */
+export function rank(rows) {
+  $("contest").hidden = !rows.length;
+  $("contest").tBodies[0].replaceChildren(...rows.map(row => {
+    const line = make("tr", "");
+    line.append(make("td", row.seed), make("td", row.who), make("td", row.score.toFixed(3)), make("td", `${row.actions}${row.solved ? ", solved" : ""}`, {className: row.solved ? "solved" : ""}));
+    return line;
+  }));
 }
 
 /** Draw PNG bytes on one of the small canvases. */

@@ -21,7 +21,7 @@ export class Hand {
       this.mode = "";
       this.from = null;
       if (!this.begin()) { this.start = null; return; }
-      if (onKnob(event)) this.mode = "turn";
+      if (this.pick && onKnob(event)) this.mode = "turn";
       else {
         const {xy, thing} = meant(event);
         this.from = xy;

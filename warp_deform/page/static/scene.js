@@ -1,4 +1,5 @@
 // The table in 3-D: furniture, arm, what is simulated, and marks of what is about to be done.
+import {FlatShadows} from "./shadows.js";
 import * as T from "./three.js";
 
 const EYE = [1.5, -0.8, 1.0], LOOK_AT = [0.42, -0.03, 0.14], FIELD = 0.73 * 180 / Math.PI;
@@ -83,7 +84,6 @@ class Scene {
     this.knob.position.x = 0.05;
     this.ring.add(this.knob);
     this.halo = put(new T.Mesh(new T.SphereGeometry(1, 20, 14), glow(0xedc948, {opacity: 0.75})));
-    this.cage = put(new T.Group());
     this.way = put(arrow(0xedc948));
     this.pull = put(arrow(0xff5759));
     this.sheets = {};
@@ -101,7 +101,7 @@ class Scene {
     map.magFilter = T.LinearFilter;
     // a picture's rows go along y and its first row is the top of a texture: turn it over
     map.flipY = false;
-    const sheet = new T.Mesh(new T.PlaneGeometry(wide, deep), new T.MeshBasicMaterial({map, transparent: true, depthWrite: false, side: T.DoubleSide}));
+    const sheet = new T.Mesh(new T.PlaneGeometry(wide, deep), new T.MeshBasicMaterial({map, transparent: true, depthWrite: false, depthTest: name === "goal", side: T.DoubleSide}));
     sheet.position.set(grid.origin[0] + (wide - grid.pixel) / 2, grid.origin[1] + (deep - grid.pixel) / 2, height);
     sheet.renderOrder = 1;
     this.sheets[name] = sheet;
@@ -110,6 +110,10 @@ class Scene {
 
   /** The arm's meshes and the furniture, once. */
   furnish(hello) {
+    if (this.slow && !this.flat) {
+      this.renderer.localClippingEnabled = true;
+      this.flat = new FlatShadows(this.scene, [-0.5, 1.0, -2.4], hello.bounds);
+    }
     for (const mesh of this.arm) { this.scene.remove(mesh); mesh.geometry.dispose(); }
     if (!this.slab) {
       const add = (size, at, rgb) => {
@@ -137,6 +141,7 @@ class Scene {
       this.scene.add(mesh);
       return mesh;
     });
+    this.flat?.cast("arm", this.arm);
   }
 
   /** What is simulated, of one episode. */
@@ -173,7 +178,7 @@ class Scene {
       this.things.add(box);
       return box;
     });
-    this.cage.clear();
+    this.flat?.cast("things", [this.balls, this.rods, ...this.cloths, ...this.boxes]);
   }
 
   /** One mesh a colour of sheet; vertices are shared by particle. */
@@ -231,6 +236,7 @@ class Scene {
       box.position.fromArray(pose).applyQuaternion(turn).add(at.fromArray(body, b));
       box.quaternion.copy(turn).multiply(new T.Quaternion().fromArray(pose, 3));
     });
+    this.flat?.follow();
     this.dirty = true;
   }
 
