@@ -17,6 +17,7 @@ from ..rendering.drawables import Drawables
 from ..rendering.pixels import SHAPE, PixelGrid
 from ..rendering.scene_view import LINK_COLORS
 from ..robots.arm import Robot
+from ..tasks.task import Snapshot
 from ..worlds.arm_path import ArmPath
 from ..worlds.episode import StepReport
 
@@ -116,7 +117,7 @@ def link_matrices(robot: Robot, q: np.ndarray) -> np.ndarray:
 
 
 def clip(
-    robot: Robot, report: StepReport, waiting: np.ndarray
+    robot: Robot, report: StepReport, waiting: np.ndarray, end: Snapshot
 ) -> tuple[dict[str, np.ndarray], float] | None:
     """The motion of one action, `FRAMES_A_SECOND`, and how long it lasts [s].
 
@@ -124,6 +125,7 @@ def clip(
 
     Args:
         waiting: joint positions (dof,) [rad] before the action
+        end: the state after it, which the last frame shows
     """
     frames, arm = report.frames, ArmPath(report, waiting)
     if frames is None or not len(frames.times):
@@ -133,6 +135,7 @@ def clip(
     shown = np.clip(np.searchsorted(frames.times, times), 0, len(frames.times) - 1)
     particle_q = np.asarray(frames.particle_q, np.float32)[shown]
     body_q = np.asarray(frames.body_q, np.float32)[shown]
+    particle_q[-1], body_q[-1] = end.particle_q, end.body_q
     whole = np.array(
         [
             np.isfinite(q).all() and np.isfinite(b).all()

@@ -120,6 +120,11 @@ class PlaySession:
         self._version += 1
 
     @property
+    def broken(self) -> bool:
+        """Whether a guard has fired, so that the state cannot be trusted."""
+        return not self.worlds.episodes[0].physics_ok
+
+    @property
     def over(self) -> str:
         """Why nothing more is to be done, empty while something is."""
         worlds, episode = self.worlds, self.worlds.episodes[0]
@@ -275,7 +280,7 @@ class PlaySession:
         if worlds.episodes[0].physics_ok:
             self.run.rows.append(observe(worlds, 0))
         self._version += 1
-        moved = clip(worlds.robot, report, waiting)
+        moved = clip(worlds.robot, report, waiting, worlds.episodes[0].snapshot)
         if moved is None:
             return self.scene()
         arrays, seconds = moved
@@ -347,7 +352,7 @@ class PlaySession:
 
     def _note_standing(self, post: Post) -> None:
         """Keep how the person's own episode stands, once it is over."""
-        if self.over and set(self.acted) == {HUMAN}:
+        if self.over and not self.broken and set(self.acted) == {HUMAN}:
             score, solved = float(self.worlds.score(0)), self.worlds.solved(0)
             standing = Standing(score, len(self.run.actions), solved)
             self.contest.note(self.run.seed, "you", standing)

@@ -98,7 +98,7 @@ class _Replay:
         self.outcome = report.outcome.value
         self.done += 1
         self.state = self.worlds.state(0)
-        return clip(self.worlds.robot, report, waiting)
+        return clip(self.worlds.robot, report, waiting, self.worlds.episodes[0].snapshot)
 
 
 class ViewSession:

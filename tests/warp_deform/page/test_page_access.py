@@ -74,14 +74,15 @@ def test_every_file_is_there_and_names_no_other_host():
             assert not re.search(
                 r"https?://|\bstyle=|\bon\w+=\"|\beval\(|new Function|innerHTML", text
             )
-    page = static_file("index.html").decode()
-    assert set(re.findall(r'(?:src|href)="([^"]+)"', page)) <= {*FILES, "data:,"}
+    for page in ("index.html", "view.html"):
+        named = re.findall(r'(?:src|href)="([^"]+)"', static_file(page).decode())
+        assert named and set(named) <= {*FILES, "data:,"}
     modules = {
         m
         for name, _ in FILES.values()
         for m in re.findall(rb'from "\./([^"]+)"', static_file(name))
     }
-    assert {module.decode() for module in modules} | {"page.js"} == {
+    assert {module.decode() for module in modules} | {"page.js", "view.js"} == {
         n for n in FILES if n.endswith(".js")
     }
     assert "unsafe" not in HEADERS["Content-Security-Policy"]

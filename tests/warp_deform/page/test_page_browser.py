@@ -14,6 +14,8 @@ from fixtures.page_server import serve_page
 
 from warp_deform.collecting.replay import verify
 from warp_deform.page.play import PlaySession
+from warp_deform.page.sources import EpisodeSource
+from warp_deform.page.view import ViewSession
 from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.worlds.worlds import Worlds
 
@@ -111,7 +113,7 @@ def test_playback_pauses_scrubs_and_changes_no_state(server, tab):
     stands = tab.data("time")
     assert 0 < float(stands) < float(tab.data("end"))
     state, places = session.worlds.hash(0), []
-    for share in ("0", "0.5", "1"):
+    for share in ("0", "0.6", "1"):
         page.locator("#time").fill(share)
         places.append(tab.data("q"))
     assert len(set(places)) == 3
@@ -134,6 +136,37 @@ def test_what_is_kept_can_be_replayed_and_the_second_tab_sees_it(server, browser
     tab.wait(seed=1, actions=0)
     other.page.close()
     assert verify(session.kept.folder, workers=1)["mismatches"] == 0
+
+
+def test_others_look_and_the_table_ranks_them(server, tab):
+    page = tab.page
+    page.select_option("#who", "scripted")
+    page.click("#look")
+    page.locator("body[data-peak='none']").wait_for(state="attached", timeout=60_000)
+    assert "no heat maps" in page.locator("#sight").inner_text()
+    page.click("#versus")
+    page.locator("#contest td.solved").wait_for(timeout=60_000)
+    cells = page.locator("#contest td").all_inner_texts()
+    assert cells[:2] == ["0", "scripted"] and cells[3].endswith("solved")
+    assert (tab.data("actions"), server.session.run.actions) == ("0", [])
+
+
+def test_recorded_episodes_are_watched_and_compared(server, browser):
+    """After the test that keeps one."""
+    source = EpisodeSource(server.session.kept.folder)
+    count = len(source.show(0).actions)
+    with serve_page(ViewSession(source)) as viewing:
+        tab = Tab(browser, viewing.access.address)
+        tab.wait(listed=1, pictures=1)
+        tab.page.select_option("#speed", "4")
+        tab.page.locator("#list .open").click()
+        tab.page.locator("#list .beside").click()
+        tab.wait(at0=count, at1=count, same0=True, same1=True, playing0=False, playing1=False)
+        assert "bit for bit" in tab.page.locator("#pane1 .says").inner_text()
+        tab.page.select_option("#which", "unsolved")
+        tab.wait(listed=0)
+        assert tab.errors == []
+        tab.page.close()
 
 
 def test_without_webgl_the_picture_from_above_plays(server, launch):

@@ -154,7 +154,7 @@ def test_a_guard_that_fires_is_told_and_undone(fresh, monkeypatch):
         act(fresh, action)
     with pytest.raises(InputError, match="guard"):
         KeptEpisodes.keep(None, fresh.worlds, fresh.run, fresh.acted)
-    assert [unpack(message)["kind"] for message in fresh.greet()] == ["hello", "scene"]
+    assert [unpack(message)["kind"] for message in fresh.greet()][:2] == ["hello", "scene"]
     (scene,) = ask(fresh, "undo")
     assert (scene["hash"], scene["physics"]) == (before, "")
     assert len(fresh.run.rows) == 1
@@ -168,10 +168,12 @@ def test_frames_that_are_not_finite_are_left_out(fresh):
     frames = Frames(np.arange(61) / 30, q, np.zeros((61, 0, 7)))
     robot = fresh.worlds.robot
     report = StepReport("invalid", 2.0, (), (), frames)
-    arrays, end = clip(robot, report, robot.home_q)
+    snapshot = fresh.worlds.episodes[0].snapshot
+    arrays, end = clip(robot, report, robot.home_q, snapshot)
     assert len(arrays["q"]) == 40 and end == pytest.approx(39 / 30)
     q[:] = np.nan
-    assert clip(robot, StepReport("invalid", 2.0, (), (), frames), robot.home_q) is None
+    report = StepReport("invalid", 2.0, (), (), frames)
+    assert clip(robot, report, robot.home_q, snapshot) is None
 
 
 def test_an_episode_of_a_person_is_a_demonstration(tmp_path):
@@ -208,8 +210,9 @@ def test_an_episode_of_a_person_is_a_demonstration(tmp_path):
 
 
 def test_demonstrators_act_step_by_step_or_until_they_are_stopped(fresh):
-    work, shown, done = ask(fresh, "demonstrate", who="visible", whole=False)
+    work, sight, shown, done = ask(fresh, "demonstrate", who="visible", whole=False)
     assert (work["who"], shown["acted"], done["who"]) == ("visible", ["visible"], "")
+    assert sight["action"] == shown["action"] and sight["acts"] and "pick" not in sight
     fresh.stop.set()
     assert ask(fresh, "demonstrate", who="visible", whole=True) == []
     fresh.stop.clear()
@@ -217,3 +220,26 @@ def test_demonstrators_act_step_by_step_or_until_they_are_stopped(fresh):
         ask(fresh, "demonstrate", who="me", whole=True)
     ask(fresh, "demonstrate", who="scripted", whole=True)
     assert fresh.over and "solved" in fresh.over
+
+
+def test_the_gradient_points_where_less_is_left_to_do():
+    """A place that is moved along the arrow has a lower loss, by about what is said."""
+    session = PlaySession("cable-shape", seed=0)
+    action = best(session)
+    action[3:5] += (0.03, -0.02)  # away from where the demonstrator places it
+    messages = []
+    at = {"pick": list(action[:2]), "place": list(action[3:5]), "turn": 0.0, "lift": action[6]}
+    before = hash_of(session)
+    losses, arrows = [], []
+    for _ in range(2):
+        messages = ask(session, "gradient", **at)
+        [told] = [message for message in messages if message["kind"] == "gradient"]
+        losses.append(float(told["says"].split()[3]))
+        arrows.append(np.subtract(told["to"], told["place"]))
+        at["place"] = list(np.add(told["place"], 0.2 * arrows[-1]))
+    assert np.linalg.norm(arrows[0]) == pytest.approx(0.06)
+    assert losses[1] < losses[0]
+    assert hash_of(session) == before and not session.run.actions
+    at["pick"] = [0.3, -0.45] if abs(action[1] + 0.45) > 0.1 else [0.3, 0.45]
+    [told] = [m for m in ask(session, "gradient", **at) if m["kind"] == "gradient"]
+    assert told["to"] is None and "nothing" in told["says"]

@@ -256,7 +256,7 @@ $("pull").onclick = () => pull();
 $("ghost").onchange = ghost;
 $("stop").onclick = () => send({do: "stop"});
 $("pause").onclick = () => playback.toggle();
-$("time").oninput = () => playback.scrub(Number($("time").value));
+$("time").oninput = () => { playback.scrub(Number($("time").value)); mark(); };
 $("time").onchange = () => { if (playback.finished) settle(playback.clip); $("time").blur(); };
 $("turn").oninput = () => hand.setTurn($("turn").value * Math.PI / 180);
 document.addEventListener("visibilitychange", () => { if (document.hidden && playback.playing) playback.finish(); });

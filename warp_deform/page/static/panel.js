@@ -39,7 +39,7 @@ export function offerLifts(lifts, chosen, choose) {
 
 /** The state in numbers and words. */
 export function tell(state, hello) {
-  $("where").textContent = `seed ${state.seed} · ${hello.robot} arm${hello.records ? ` · ${state.kept} kept` : ""}`;
+  $("where").textContent = `${hello.robot} arm${hello.records ? ` · ${state.kept} kept` : ""}`;
   $("score").textContent = state.score.toFixed(3);
   $("bar").firstElementChild.style.width = `${100 * Math.min(Math.max(state.score, 0), 1)}%`;
   const words = state.over || (state.actions ? `action ${state.actions} of ${state.most}` : `${state.most} actions at most`);

@@ -54,11 +54,11 @@ export class Playback {
   finish() {
     while (this.clip && !this.finished) {
       this.now = this.clip.end;
+      this.draw();
       this.ended(this.clip);
       if (this.at < this.clips.length - 1) { this.at++; this.now = 0; }
     }
     this.playing = false;
-    this.draw();
   }
 
   tick(seconds) {
@@ -67,9 +67,9 @@ export class Playback {
     if (this.now >= this.clip.end) {
       const over = this.clip;
       this.now = over.end;
+      this.draw();
       if (this.at < this.clips.length - 1) { this.at++; this.now = 0; } else this.playing = false;
       this.ended(over);
-    }
-    this.draw();
+    } else this.draw();
   }
 }

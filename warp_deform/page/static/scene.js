@@ -2,7 +2,8 @@
 import {FlatShadows} from "./shadows.js";
 import * as T from "./three.js";
 
-const EYE = [1.5, -0.8, 1.0], LOOK_AT = [0.42, -0.03, 0.14], FIELD = 0.73 * 180 / Math.PI;
+const EYE = [1.5, -0.8, 1.0], LOOK_AT = [0.42, -0.03, 0.14];
+const FIELD = 0.73, WIDE = 1.25; // rad from top to bottom, where a view is so much wider than high
 const FINGER = 0.015; // m: a particle so near to the ray is what the person means
 
 const tint = rgb => new T.Color().setRGB(rgb[0] / 255, rgb[1] / 255, rgb[2] / 255, T.SRGBColorSpace);
@@ -30,7 +31,7 @@ class Scene {
     this.renderer.shadowMap.enabled = !this.slow;
     this.renderer.shadowMap.type = T.PCFShadowMap;
     this.scene = new T.Scene();
-    this.camera = new T.PerspectiveCamera(FIELD, 1, 0.05, 20);
+    this.camera = new T.PerspectiveCamera(50, 1, 0.05, 20);
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(...EYE);
     this.orbit = new T.OrbitControls(this.camera, canvas);
@@ -312,6 +313,7 @@ class Scene {
       this.renderer.setPixelRatio(this.slow ? 1 : Math.min(devicePixelRatio, 2));
       this.renderer.setSize(w, h, false);
       this.camera.aspect = w / h;
+      this.camera.fov = 360 / Math.PI * Math.atan(Math.tan(FIELD / 2) * Math.max(1, WIDE * h / w));
       this.camera.updateProjectionMatrix();
       this.dirty = true;
     }
