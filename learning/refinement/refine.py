@@ -37,7 +37,7 @@ from warp_deform.planning import SearchConfig, lookahead_for, search
 from warp_deform.robots import robot as find_robot
 from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.tasks.task import Action, Task
+from warp_deform.tasks.task import Action
 from warp_deform.worlds.loop import SOLVED, EpisodeRun, play, worlds_for
 from warp_deform.worlds.worlds import Worlds
 
@@ -170,7 +170,7 @@ def seeds_by_task(source: Path, infos: Sequence[EpisodeInfo]) -> dict[tuple[str,
 def _check_search(task: str, robot: str, config: SearchConfig) -> None:
     """Raise InputError unless task and robot are known and have what the search goes by."""
     find_robot(robot)
-    if type(find_task(task)).loss is Task.loss and config.method == "gradient":
+    if config.method == "gradient" and not find_task(task).has_loss():
         raise InputError(f"{task} has no loss to differentiate; choose another method")
 
 

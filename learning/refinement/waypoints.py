@@ -30,7 +30,7 @@ from warp_deform.planning.waypoints import BentPath, WayPointConfig, WayPoints
 from warp_deform.rollout.rollouts import GripPath
 from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
-from warp_deform.tasks.task import Action, Task
+from warp_deform.tasks.task import Action
 from warp_deform.worlds.loop import EpisodeRun, play, worlds_for
 from warp_deform.worlds.state import WorldState
 from warp_deform.worlds.worlds import Worlds
@@ -101,7 +101,7 @@ def bend(config: BendConfig) -> BendReport:
     infos = EpisodeReader(source).infos()
     groups = seeds_by_task(source, infos)
     for task, _ in groups:
-        if type(find_task(task)).loss is Task.loss:
+        if not find_task(task).has_loss():
             raise InputError(f"{task} has no loss to differentiate, so no paths to bend by")
     _label(config, combine_hashes(info.state_hash for info in infos))
     todo = {k: [s for s in of if not _file(out, s).exists()] for k, of in groups.items()}
