@@ -1,6 +1,6 @@
 """What computing the networks of a `fast` agent together saves, against network by network.
 
-    python benchmarks/steps.py [--agents transporter goal-split] [--repeats 15] [--json]
+    python benchmarks/steps.py [--agents transporter goal-split] [--repeats 15] [--out FILE]
 
 CPU time of one thread, batch 1, random pictures, medians. A step is losses, gradients, the
 optimiser and the average of the weights; acting weighs up to five picks. "plain" computes network
@@ -102,6 +102,7 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=15, help="turns that every kind takes")
     parser.add_argument("--bfloat16", action="store_true", help="measure it here all the same")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="rows as lines of JSON")
     parser.add_argument("--json", action="store_true", help="one JSON object as the last line")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -110,7 +111,7 @@ def main() -> None:
         kinds.append("bfloat16")
     name_of_cpu = torch.cpu.get_capabilities().get("cpu_name", "unknown")
     print(f"{name_of_cpu}, bfloat16 units: {has_bfloat16_units()}")
-    rows = {}
+    rows = []
     for agent in arguments.agents:
         with tempfile.TemporaryDirectory() as folder:
             made = {kind: jobs(agent, kind, Path(folder)) for kind in kinds}
@@ -121,17 +122,14 @@ def main() -> None:
                     [[seconds(made[k][what]) for k in kinds] for _ in range(arguments.repeats)]
                 )
                 for kind, taken in zip(kinds, turns.T, strict=True):
-                    row = rows[f"{agent}, {what}, {kind}"] = {
-                        "seconds": float(np.median(taken)),
-                        "ratio": float(np.median(turns[:, 0] / taken)),
-                    }
-                    print(
-                        f"{agent:12} {what:5} {kind:9} {1e3 * row['seconds']:7.1f} ms, "
-                        f"plain / this {row['ratio']:5.2f}",
-                        flush=True,
-                    )
+                    ms, ratio = 1e3 * np.median(taken), np.median(turns[:, 0] / taken)
+                    print(f"{agent:12} {what:5} {kind:9} {ms:7.1f} ms, plain / this {ratio:5.2f}")
+                    about = {"cpu": name_of_cpu, "agent": agent, "what": what, "kind": kind}
+                    rows.append({**about, "ms": float(ms), "ratio": float(ratio)})
+    if arguments.out is not None:
+        arguments.out.write_text("".join(json.dumps(row) + "\n" for row in rows))
     if arguments.json:
-        print(json.dumps({"cpu": name_of_cpu, "rows": rows}))
+        print(json.dumps({"rows": rows}))
 
 
 if __name__ == "__main__":
