@@ -70,7 +70,7 @@ FLOORS = {
 }
 """Rooms from top to bottom; those of one floor do not know each other."""
 OPTIONAL = {
-    "pybullet", "pybullet_data", "ray", "tensorboard", "h5py", "panda_py",
+    "pybullet", "pybullet_data", "cmaes", "ray", "tensorboard", "h5py", "panda_py",
     "franky", "frankapy", "pyk4a", "pyrealsense2", "websockets", "playwright",
 }  # fmt: skip
 COMPUTED_IMPORTS = {

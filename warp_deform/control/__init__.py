@@ -9,6 +9,9 @@ _HOME = {
     "CONTROL_TASKS": ".registry",
     "ControlConfig": ".modes",
     "ControlWorlds": ".control_worlds",
+    "METHODS": ".plan_search",
+    "SwingProblem": ".swing_problem",
+    "optimize": ".plan_search",
 }
 
 __all__ = list(_HOME)

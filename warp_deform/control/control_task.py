@@ -33,9 +33,13 @@ class ControlTask(Task):
     def plan_to_goal(self, rng: np.random.Generator) -> np.ndarray | None:
         """Actions (T, 3), each of a length below 1, whose outcome is the goal; None: the layout's.
 
-        A plan that a guard ends is drawn again.
+        A plan that a guard ends, or whose outcome is no goal (`is_goal`), is drawn again.
         """
         return None
+
+    def is_goal(self, particle_q: np.ndarray) -> bool:
+        """Whether the state that a plan has led to, particles (P, 3) [m], is a goal to pursue."""
+        return True
 
     def layout_for(self, layout: Layout, particle_q: np.ndarray) -> Layout:
         """The layout whose goal is the state that a plan has led to, particles (P, 3) [m]."""

@@ -36,7 +36,7 @@ _NOTHING = (None, None)
 """What a tip holds, a particle or a body, when it holds neither."""
 _FREE_FLOOR = 0.001
 """Lowest height of a tip that holds nothing [m]: its radius."""
-_DRAWS = 20
+_DRAWS = 100
 """Plans to a goal that are drawn before a seed is given up."""
 Start = Literal["free", "held"]
 Release = Literal["rest", "moving"]
@@ -221,9 +221,9 @@ class ControlWorlds:
             for slot in led:
                 self.worlds.restore(slot, before[slot])
                 episode = self.worlds.episodes[slot]
-                if slot in ends:
+                if slot in ends and task.is_goal(ends[slot]):
                     episode.layout = task.layout_for(episode.layout, ends[slot])
-            waiting = [slot for slot in waiting if slot not in ends]
+                    waiting.remove(slot)
             if not waiting:
                 return
         seeds = ", ".join(str(self.worlds.episodes[slot].seed) for slot in waiting)

@@ -6,11 +6,14 @@ from ..errors import InputError
 from ..tasks.registry import task_of
 from ..tasks.task import Task
 from .control_task import ControlTask
+from .fold_fabric import FoldFabric1
 from .whip import Whip, WhipTarget
 
 __all__ = ["control_task"]  # `warp_deform.control` has `CONTROL_TASKS`
 
-CONTROL_TASKS: dict[str, type[ControlTask]] = {cls.name: cls for cls in (Whip, WhipTarget)}
+CONTROL_TASKS: dict[str, type[ControlTask]] = {
+    cls.name: cls for cls in (Whip, WhipTarget, FoldFabric1)
+}
 
 
 def control_task(task: str | Task) -> Task:

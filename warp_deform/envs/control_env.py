@@ -141,7 +141,7 @@ class ControlEnv(gymnasium.Env[Any, np.ndarray]):
         self.observing = Observing(self.worlds, obs_mode, ControlNumbers(self.control))
         self.observation_space = self.observing.space
         self.action_space = TipActions(control_mode, self.control.config)
-        self._view = WorldsView(self.worlds)
+        self._view = WorldsView(self.worlds, arm_follows=True)
         self._running = False
 
     @property

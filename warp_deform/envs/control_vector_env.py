@@ -73,6 +73,7 @@ class ControlVectorEnv(LaneVectorEnv):
             render_mode=render_mode,
             autoreset_mode=autoreset_mode,
             backend=backend,
+            arm_follows=True,
         )
         self.metadata = {**self.metadata, "render_fps": self.control.config.rate}
 

@@ -160,23 +160,32 @@ class PickPlaceEnv(gymnasium.Env[Any, np.ndarray]):
 
 
 class WorldsView:
-    """Draws slots of `worlds` for people, the arm in its home posture."""
+    """Draws slots of `worlds` for people.
 
-    def __init__(self, worlds: Worlds) -> None:
-        self._worlds = worlds
+    Args:
+        arm_follows: whether the arm is where the tip is; else it is in its home posture
+    """
+
+    def __init__(self, worlds: Worlds, *, arm_follows: bool = False) -> None:
+        self._worlds, self._follows = worlds, arm_follows
         self._scene: SceneView | None = None
 
     def frame(self, slot: int) -> np.ndarray:
         """Picture (360, 640, 3) uint8 of a slot."""
+        robot = self._worlds.robot
         if self._scene is None:
-            robot = self._worlds.robot
             self._scene = SceneView(_FRAME)
-            self._links = ArmMeshes(robot.meshes()).at(robot.link_poses(robot.home_q))
+            self._meshes = ArmMeshes(robot.meshes())
+            self._home = self._meshes.at(robot.link_poses(robot.home_q))
         episode = self._worlds.episodes[slot]
         state = episode.snapshot.particle_q, episode.snapshot.body_q
         if not all(np.isfinite(array).all() for array in state):
             return np.zeros((*_FRAME, 3), np.uint8)
-        return self._scene.render(episode.drawables, *state, self._links)
+        links = self._home
+        if self._follows:
+            found = robot.solve_top_down(episode.tip[None])
+            links = self._meshes.at(robot.link_poses(found.q[0])) if found.reached[0] else links
+        return self._scene.render(episode.drawables, *state, links)
 
 
 def ending(worlds: Worlds, slot: int, info: Mapping[str, Any]) -> tuple[bool, bool]:

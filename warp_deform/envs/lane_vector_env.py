@@ -47,6 +47,7 @@ class LaneVectorEnv(NamedCalls, VectorEnv[Any, Any, Any], abc.ABC):
         observation: space of one environment
         action: space of one environment, a Box of one dimension
         autoreset_mode: see `PickPlaceVectorEnv`, as are the other arguments
+        arm_follows: see `WorldsView`
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class LaneVectorEnv(NamedCalls, VectorEnv[Any, Any, Any], abc.ABC):
         render_mode: str | None,
         autoreset_mode: AutoresetMode | str,
         backend: Backend,
+        arm_follows: bool = False,
     ) -> None:
         self.render_mode = check_render_mode(render_mode, self.metadata)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
@@ -72,7 +74,7 @@ class LaneVectorEnv(NamedCalls, VectorEnv[Any, Any, Any], abc.ABC):
         self.ended = np.zeros(self.num_envs, bool)
         """(num_envs,) bool: which episodes are over and wait for their reset."""
         self._rngs: list[np.random.Generator | None] = [None] * self.num_envs
-        self._view = WorldsView(self.worlds)
+        self._view = WorldsView(self.worlds, arm_follows=arm_follows)
 
     @property
     def task(self) -> Task:

@@ -1,0 +1,135 @@
+"""`SwingProblem`: many plans for goals of swings, side by side in lanes of one simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..errors import InputError
+from ..rollout.rollouts import GripPath, rollout
+from .control_task import ControlTask
+from .control_worlds import ControlWorlds
+from .modes import TipTargets
+from .smooth_plans import KNOTS, actions_of
+
+__all__: list[str] = []  # `warp_deform.control` is the import path of what is here
+
+_LANES = 8
+
+
+class SwingProblem:
+    """Plans for the goals of seeds, of a task that holds a particle from the start.
+
+    A plan's loss is the task's at the end of its steps, with the bits of the environment of the
+    same seed under the same actions in the mode "tip_delta_position".
+
+    Args:
+        task: a name, or a `ControlTask` with a `held_particle`
+        seeds: of the goals
+        worlds: that run side by side, a multiple of 8
+
+    Raises:
+        InputError: the task holds nothing from the start, or there are no seeds, or `worlds` is no
+            multiple of 8.
+    """
+
+    def __init__(self, task: str | ControlTask, seeds: Sequence[int], *, worlds: int = 64) -> None:
+        if worlds < 1 or worlds % _LANES or not len(seeds):
+            raise InputError(f"worlds must be a multiple of {_LANES}, and seeds one or more")
+        self._control = ControlWorlds(task, worlds, lanes=_LANES)
+        found = self._control.task
+        if not isinstance(found, ControlTask) or found.held_particle is None:
+            raise InputError(f"{found.name} holds nothing from the start, so it is no swing")
+        self.task, self.seeds = found, [int(seed) for seed in seeds]
+        self._solver = self._control.worlds.solver
+        self._targets = TipTargets(
+            "tip_delta_position", self._control.config, self._control.limits, worlds
+        )
+        states = []
+        for first in range(0, len(self.seeds), worlds):
+            states += self._starts(self.seeds[first : first + worlds])
+        positions, velocities, floors, self.layouts = zip(*states, strict=True)
+        self._positions, self._velocities = np.stack(positions), np.stack(velocities)
+        self._floors = np.array(floors)
+        self._knot_times = self._times()
+
+    def _starts(self, seeds: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray, float, object]]:
+        """Positions, velocities, lowest height of the tip and layout of every seed."""
+        control = self._control
+        control.reset(dict(enumerate(seeds)))
+        control.control.end()
+        solver, episodes = self._solver, control.worlds.episodes
+        return [
+            (solver.particle_q(slot), solver.particle_qd(slot),
+             float(control.targets.floors[slot]), episodes[slot].layout)
+            for slot in range(len(seeds))
+        ]  # fmt: skip
+
+    def _times(self) -> np.ndarray:
+        """Of the knots (T + 2,) [s], in the kernel's arithmetic; the last is never reached."""
+        number, loop = self._solver.data.number, self._control.control.loop
+        ticks = loop.substeps * np.arange(self._control.horizon + 1)
+        clock = ticks.astype(number) * number(self._solver.config.dt)
+        return np.append(clock.astype(float), 1e6)
+
+    @property
+    def goals(self) -> int:
+        """Number of goals G."""
+        return len(self.seeds)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of the free numbers of a plan."""
+        return KNOTS, 3
+
+    def actions(self, numbers: np.ndarray) -> np.ndarray:
+        """Actions (..., T, 4) of the environment for plans (..., K, 3)."""
+        moves = actions_of(numbers, self._control.horizon)
+        return np.concatenate([moves, np.ones((*moves.shape[:-1], 1))], axis=-1)
+
+    def evaluate(self, numbers: np.ndarray) -> np.ndarray:
+        """Losses (G, N) of plans (G, N, K, 3); inf where a guard fires."""
+        goals, ends = self.run(numbers)
+        return self._losses(goals, ends).reshape(numbers.shape[:2])
+
+    def run(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Number of the goal (G N,) and particles (G N, P, 3) [m] at the end of every plan.
+
+        Particles are not numbers where a guard fires.
+        """
+        actions = self.actions(numbers).reshape(-1, self._control.horizon, 4)
+        of = np.repeat(np.arange(len(numbers)), numbers.shape[1])
+        room = self._control.worlds.count
+        parts = [slice(first, first + room) for first in range(0, len(actions), room)]
+        return of, np.concatenate([self._ends(of[part], actions[part]) for part in parts])
+
+    def _ends(self, of: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        solver, held = self._solver, self.task.held_particle
+        assert held is not None, "it was looked at before"
+        data, worlds = solver.data, list(range(len(of)))
+        places = self._positions[of, held].astype(float)
+        self._targets.floors[worlds] = self._floors[of]
+        self._targets.place(worlds, np.pad(places, ((0, 0), (0, 1))))
+        steps = [self._targets.follow(worlds, rows)[:, -1, :3] for rows in actions.swapaxes(0, 1)]
+        knots = np.stack([places, *steps, steps[-1]], axis=1)
+        for w in worlds:
+            data.lane("particles.x", w)[:] = self._positions[of[w]]
+            data.lane("particles.v", w)[:] = self._velocities[of[w]]
+        seconds = self._control.horizon * self._control.control.loop.seconds
+        paths = {w: GripPath(self._knot_times, knots[w], particle=held) for w in worlds}
+        runs = rollout(solver, worlds, paths=paths, least=2 * seconds, most=seconds)
+        ends = np.stack([solver.particle_q(w).astype(float) for w in worlds])
+        limits = solver.config.limits
+        wrong = [bool(runs[w].watch.problems(w, limits)) for w in worlds]
+        ends[wrong] = np.nan
+        return ends
+
+    def _losses(self, of: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        import torch
+
+        layouts = [self.layouts[g] for g in of]
+        with torch.no_grad():
+            q = torch.zeros((len(ends), 0, 7), dtype=torch.float64)
+            losses = self.task.losses(layouts, [], torch.from_numpy(ends), q).numpy()
+        return np.where(np.isfinite(losses), losses, np.inf)
