@@ -10,7 +10,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 from stable_baselines3.common.env_checker import check_env
 
-from warp_deform import ControlEnv, ControlVectorEnv
+from warp_deform import ControlEnv, ControlVectorEnv, PickPlaceEnv
 from warp_deform.control.control_worlds import ControlWorlds
 from warp_deform.control.modes import CONTROL_MODES, ControlConfig
 from warp_deform.errors import InputError
@@ -124,6 +124,27 @@ def test_no_random_action_makes_a_guard_fire_whatever_the_mode() -> None:
         assert all(worlds.worlds.episodes[slot].physics_ok for slot in range(8))
         tips = np.array([worlds.worlds.episodes[slot].tip for slot in range(8)])
         assert (tips[:, 2] >= 0.005 - 1e-9).all()
+
+
+def test_a_cable_that_is_flung_about_is_no_fault_and_its_start_is_that_of_picks_and_places() -> (
+    None
+):
+    worlds = ControlWorlds("cable-ring", 8, start="held", lanes=8)
+    worlds.reset({slot: slot for slot in range(8)})
+    plain = PickPlaceEnv("cable-ring")
+    worlds.reset({3: 11})
+    plain.reset(seed=11)
+    before = plain.worlds.episodes[0].snapshot.particle_q
+    free = ControlWorlds("cable-ring", 8, lanes=8)
+    free.reset({2: 11})
+    assert np.array_equal(free.worlds.episodes[2].snapshot.particle_q, before)
+    rng = np.random.default_rng(0)
+    for step in range(40):
+        if step % 4 == 0:
+            rows = rng.uniform(-1, 1, (8, 4))
+            rows[:, -1] = 1.0
+        worlds.step(dict(enumerate(rows)))
+    assert all(worlds.worlds.episodes[slot].physics_ok for slot in range(8))
 
 
 def test_an_episode_in_a_vector_is_that_of_a_single_environment_to_the_bit() -> None:
