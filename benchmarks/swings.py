@@ -2,9 +2,10 @@
 
     python benchmarks/swings.py [--tasks TASK...] [--evaluations N...] [--out FILE]
 
-Goals are those of 32 test seeds from 10,000. Rows of other tasks and numbers stay in the file. One row a task, method and number of evaluations a
+Goals are those of 32 test seeds from 10,000. One row a task, method and number of evaluations a
 goal: mean score of `whip`, and distance and shares within 10, 5, 2 and 1 cm of `whip-target`. CPU
-seconds are those of the process for all goals together.
+seconds are those of the process for all goals together. Rows of other tasks and numbers stay in the
+file.
 """
 
 from __future__ import annotations
