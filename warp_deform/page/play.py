@@ -34,6 +34,7 @@ from .drawing import (
     link_matrices,
     pictures,
 )
+from .fault import where_it_broke
 from .guidance import at_work, has_gradients, play_alone, pull_of_place, sight_message
 from .keeping import HUMAN, KeptEpisodes
 from .measures import measures, score_meaning
@@ -86,6 +87,7 @@ class PlaySession:
         self.players = demonstrators(players)
         self.contest = Contest()
         self._version = 0
+        self._fault = ""
         self._arm, self._parts = arm_arrays(self.worlds.robot)
         self._links(self.worlds.robot.home_q)  # loads torch before anybody waits for it
         self.reset(self._free(0) if seed is None else seed)
@@ -149,7 +151,9 @@ class PlaySession:
             "measures": measures(episode) if ok else {},
             "solved": worlds.solved(0),
             "over": self.over,
-            "physics": "" if ok else "; ".join(map(str, episode.problems)),
+            "physics": ""
+            if ok
+            else "; ".join(filter(None, [*map(str, episode.problems), self._fault])),
             "actions": len(self.run.actions),
             "most": worlds.task.max_actions,
             "outcomes": list(self.run.outcomes),
@@ -274,6 +278,7 @@ class PlaySession:
             worlds.restore(0, before)
             raise InputError("the arm cannot reach there with its tip down; nothing has moved")
         self.past.append(before)
+        self._fault = ""
         self.run.actions.append(np.array(action, dtype=float))
         self.run.outcomes.append(report.outcome.value)
         self.acted.append(who)
@@ -284,6 +289,9 @@ class PlaySession:
         if moved is None:
             return self.scene()
         arrays, seconds = moved
+        if self.broken:
+            drawables = worlds.episodes[0].drawables
+            self._fault = where_it_broke(drawables, arrays["q"], 1.0 / FRAMES_A_SECOND)
         return pack(
             "clip",
             {**arrays, **self._pictures()},

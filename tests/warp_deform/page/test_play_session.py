@@ -148,6 +148,7 @@ def test_a_guard_that_fires_is_told_and_undone(fresh, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(solver, "config", strict)
         (shown,) = act(fresh, action)
+    assert "near x" in shown["physics"]
     assert "stretch" in shown["physics"] and shown["over"] == "the physics broke"
     assert shown["score"] == 0.0 and not shown["solved"] and "color" not in shown
     with pytest.raises(InputError, match="over"):

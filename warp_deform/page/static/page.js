@@ -142,7 +142,7 @@ function pulled({place, to, says}) {
 function ranked(message) { waiting = false; rank(message.rows); }
 
 function noted(message) {
-  waiting = false;
+  waiting = probing = false;
   note(message.text, message.good);
 }
 
