@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..support.checked import NOT_NEGATIVE, POSITIVE, check_number, real_array
 from ..support.quaternion import quat_inverse, quat_multiply, quat_rotate
 from ..xpbd.continuing.continued_launch import ContinuedLaunch
-from ..xpbd.continuing.lasting_grips import KNOTS
+from ..xpbd.continuing.lasting_grips import MOST
 from ..xpbd.guards import Problem, WatchValues
 
 if TYPE_CHECKING:
@@ -63,15 +63,18 @@ class ControlLoop:
 
     Args:
         rate: control steps a second [Hz], each of a whole number of substeps
+        launch: with as many substeps; None: one that records nothing
 
     Raises:
         InputError: the rate has no whole number of substeps.
     """
 
-    def __init__(self, solver: FusedXPBD, *, rate: float = 20.0) -> None:
+    def __init__(
+        self, solver: FusedXPBD, *, rate: float = 20.0, launch: ContinuedLaunch | None = None
+    ) -> None:
         self.solver, self.rate = solver, float(rate)
         self.substeps = control_substeps(rate, solver.config.dt)
-        self._launch = ContinuedLaunch(solver, self.substeps)
+        self._launch = launch or ContinuedLaunch(solver, self.substeps)
 
     @property
     def worlds(self) -> np.ndarray:
@@ -135,8 +138,8 @@ class ControlLoop:
             body=body,
             position=at,
             rotation=turn,
-            offset=quat_rotate(back, place - at),
-            turn=quat_multiply(back, pose),
+            offset=quat_rotate(back, place - at) if tip is not None else np.zeros(3),
+            turn=quat_multiply(back, pose) if body is not None else _UPRIGHT,
         )
 
     def let_go(self, world: int, *, release: str = "rest", calm: float = 0.0) -> None:
@@ -222,10 +225,10 @@ class ControlLoop:
                 f"{name} of {count} worlds must have the shape ({count}, {width}) or "
                 f"({count}, K, {width}), not {array.shape}"
             )
-        if not 1 <= knots <= KNOTS // 4 or self.substeps % knots:
+        if not 1 <= knots <= MOST or self.substeps % knots:
             raise InputError(
                 f"{knots} knots a control step do not divide its {self.substeps} substeps, or are "
-                f"more than {KNOTS // 4}"
+                f"more than {MOST}"
             )
         if not np.isfinite(array).all():
             raise InputError(f"{name} holds numbers that are not finite")

@@ -11,15 +11,14 @@ import numpy as np
 from ..errors import InputError
 from ..objects.push import Push
 from ..support.checked import POSITIVE, check_number
-from ..support.quaternion import quat_rotate_vjp, quat_tangent
 from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
 from ..xpbd.lanes.tape import Kind
 from ..xpbd.packing.parts import PARTS, set_parts
-from ..xpbd.recording.derivatives import spring_rows
 from ..xpbd.recording.recorder import Recorder
 from ..xpbd.springs.viscosity import DAMP_EVERY
 from .rollouts import GripPath, prepare
+from .world_rows import WorldRows
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
 
@@ -108,7 +107,6 @@ class DifferentiableRollout:
         )
         self.watch: list[WatchValues] = []
         self._worlds: list[int] = []
-        self._spring_rows = spring_rows(solver.data)
         self.times = np.zeros(0)
         self.velocities = np.zeros((0, 0, 0, 3))
         self.body_poses = np.zeros((0, 0, 0, 7))
@@ -159,7 +157,7 @@ class DifferentiableRollout:
             raise InputError(
                 "derivatives are taken of worlds of one topology at a time, at least one"
             )
-        self._place()
+        rows = self._rows = WorldRows(data, self._worlds)
         marks = [round(check_number(t, "times", POSITIVE) / dt) for t in times]
         self._marks = marks
         self.times = np.array(marks) * dt
@@ -177,8 +175,7 @@ class DifferentiableRollout:
                     poses if body_poses is None else np.asarray(body_poses)[k],
                     twists if body_velocities is None else np.asarray(body_velocities)[k],
                 )
-        turns = data.arrays["bodies.q"].view
-        self._turns = [turns[data.body_rows(w)].copy() for w in self._worlds]
+        self._turns = rows.of_bodies(data.arrays["bodies.q"].view)
         end = marks[-1] * dt if marks else 0.0
         prepare(
             self.solver,
@@ -197,12 +194,13 @@ class DifferentiableRollout:
             for w, s in ((w, data.slot[w]) for w in self._worlds)
             if w in (paths or {})
         }
-        self._flips = {w: self._flipped(paths[w], rows) for w, rows in self._knots.items() if paths}
+        self._flips = {w: self._flipped(paths[w], own) for w, own in self._knots.items() if paths}
         self.watch = self.recorder.forward(marks)
-        self.body_poses = np.stack([self._poses(m) for m in marks], axis=1)
-        self.body_velocities = np.stack([self._twists(m) for m in marks], axis=1)
+        states = [self.recorder.states[m] for m in marks]
+        self.body_poses = np.stack([rows.poses(state) for state in states], axis=1)
+        self.body_velocities = np.stack([rows.twists(state) for state in states], axis=1)
         at, speed = (
-            np.stack([self._worldwise(self.recorder.states[m][name]) for m in marks], axis=1)
+            np.stack([rows.of_particles(state[name]) for state in states], axis=1)
             for name in ("particles.x", "particles.v")
         )
         self.velocities = speed
@@ -249,128 +247,40 @@ class DifferentiableRollout:
             parts: False leaves those by single particles and springs out, which take longer: then
                 `inverse_masses`, `radii`, `spring_stiffness` and `rest_lengths` are not numbers
         """
+        rows, states = self._rows, self.recorder.states
         given = {"particles.x": positions, "particles.v": velocities}
         cotangents: dict[int, dict[str, np.ndarray]] = {}
         for t, mark in enumerate(self._marks):
             cotangents[mark] = {
-                name: self._lanewise(name, np.asarray(values)[:, t])
+                name: rows.to_particles(name, np.asarray(values)[:, t])
                 for name, values in given.items()
                 if values is not None
             }
-            self._body_cotangents(cotangents[mark], t, mark, bodies, body_velocities)
+            at = (None if g is None else np.asarray(g)[:, t] for g in (bodies, body_velocities))
+            cotangents[mark] |= rows.body_cotangents(states[mark], *at)
         out = self.recorder.backward(cotangents, parts=parts)
         knots = {
-            name: {w: out[name][rows] for w, rows in self._knots.items()}
+            name: {w: out[name][own] for w, own in self._knots.items()}
             for name in ("position", "time", "rotation")
         }
         return Gradients(
-            positions=self._worldwise(out["x"]),
-            velocities=self._worldwise(out["v"]),
-            inverse_masses=self._worldwise(out["mass"]),
-            radii=self._worldwise(out["radius"]),
-            spring_stiffness=self._of_springs(out["spring_stiffness"]),
-            rest_lengths=self._of_springs(out["rest"]),
-            **{name: self._of_groups(out[name]) for name in WORLD_PARAMETERS},
-            body_poses=self._by_frames(out["body.x"], out["body.q"]),
+            positions=rows.of_particles(out["x"]),
+            velocities=rows.of_particles(out["v"]),
+            inverse_masses=rows.of_particles(out["mass"]),
+            radii=rows.of_particles(out["radius"]),
+            spring_stiffness=rows.of_springs(out["spring_stiffness"]),
+            rest_lengths=rows.of_springs(out["rest"]),
+            **{name: rows.of_groups(out[name]) for name in WORLD_PARAMETERS},
+            body_poses=rows.by_frames(self._turns, out["body.x"], out["body.q"]),
             body_velocities=np.concatenate(
-                [self._of_bodies(out["body.v"]), self._of_bodies(out["body.omega"])], axis=-1
+                [rows.of_bodies(out["body.v"]), rows.of_bodies(out["body.omega"])], axis=-1
             ),
-            body_inverse_masses=self._of_bodies(out["body.w"]),
+            body_inverse_masses=rows.of_bodies(out["body.w"]),
             way_points=knots["position"],
             knot_times=knots["time"],
             knot_rotations={w: g * self._flips[w] for w, g in knots["rotation"].items()},
-            fired=self._of_groups(out["fired"]),
+            fired=rows.of_groups(out["fired"]),
         )
-
-    def _poses(self, mark: int) -> np.ndarray:
-        """Poses (W, B, 7) of the bodies' frames at a mark."""
-        data, state = self.solver.data, self.recorder.states[mark]
-        x, q = self._of_bodies(state["bodies.x"]), self._of_bodies(state["bodies.q"])
-        if x.shape[1] == 0:
-            return np.concatenate([x, q], axis=-1)
-        com = data.topologies[data.world_topology[self._worlds[0]]].body_com
-        return np.stack([data.frame_poses(xw, qw, com) for xw, qw in zip(x, q, strict=True)])
-
-    def _twists(self, mark: int) -> np.ndarray:
-        """Twists (W, B, 6) of the bodies at a mark."""
-        state = self.recorder.states[mark]
-        return np.concatenate(
-            [self._of_bodies(state["bodies.v"]), self._of_bodies(state["bodies.omega"])], axis=-1
-        )
-
-    def _of_bodies(self, rows: np.ndarray) -> np.ndarray:
-        """An array by row of bodies -> (W, B, ...)."""
-        return rows[self._bodies]
-
-    def _body_cotangents(
-        self,
-        cotangent: dict[str, np.ndarray],
-        t: int,
-        mark: int,
-        bodies: np.ndarray | None,
-        twists: np.ndarray | None,
-    ) -> None:
-        """Add derivatives by poses of frames and twists as those by centres of mass."""
-        data, state = self.solver.data, self.recorder.states[mark]
-        com = data.topologies[data.world_topology[self._worlds[0]]].body_com
-        if not len(com):
-            return
-        for names, given in ((("x", "q"), bodies), (("v", "omega"), twists)):
-            if given is None:
-                continue
-            for name in names:
-                key = f"bodies.{name}"
-                cotangent[key] = np.zeros_like(data.arrays[key].view)
-            for k, w in enumerate(self._worlds):
-                rows, g = data.body_rows(w), np.asarray(given, dtype=float)[k, t]
-                cotangent[f"bodies.{names[0]}"][rows] = g[:, :3]
-                rest = g[:, 3:]
-                if names[1] == "q":
-                    turn = state["bodies.q"][rows]
-                    rest = quat_tangent(turn, rest - quat_rotate_vjp(turn, com, g[:, :3]))
-                cotangent[f"bodies.{names[1]}"][rows] = rest
-
-    def _by_frames(self, x: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Derivatives (W, B, 7) by the frames of the bodies at the start."""
-        data = self.solver.data
-        com = data.topologies[data.world_topology[self._worlds[0]]].body_com
-        by_x, by_q = self._of_bodies(x), self._of_bodies(q)
-        if by_x.shape[1]:
-            turned = zip(self._turns, by_x, by_q, strict=True)
-            by_q = np.stack(
-                [quat_tangent(t, gq + quat_rotate_vjp(t, com, gx)) for t, gx, gq in turned]
-            )
-        return np.concatenate([by_x, by_q], axis=-1)
-
-    def _place(self) -> None:
-        """Where the arrays of groups hold the worlds' numbers."""
-        data = self.solver.data
-        slots = data.slot[self._worlds]
-        self._group, self._lane = np.divmod(slots, data.lanes)
-        top = data.topologies[data.world_topology[self._worlds[0]]]
-        first = data.group_particle[self._group]
-        self._particles = first[:, None] + np.arange(top.particle_count)
-        springs = np.array([self._spring_rows[g][0].start for g in self._group])
-        self._springs = springs[:, None] + np.arange(len(top.spring_ij))
-        bodies = data.group_body[self._group] + self._lane * top.body_count
-        self._bodies = bodies[:, None] + np.arange(top.body_count)
-
-    def _worldwise(self, lanes: np.ndarray) -> np.ndarray:
-        """An array of particles in lanes (P..., 3, L) or (P..., L) -> (W, P, 3) or (W, P)."""
-        return lanes[self._particles, ..., self._lane[:, None]]
-
-    def _lanewise(self, name: str, values: np.ndarray) -> np.ndarray:
-        out = np.zeros_like(self.solver.data.arrays[name].view)
-        out[self._particles, ..., self._lane[:, None]] = values
-        return out
-
-    def _of_springs(self, lanes: np.ndarray) -> np.ndarray:
-        """An array of springs in lanes, see `spring_rows` -> (W, S)."""
-        return lanes[self._springs, self._lane[:, None]]
-
-    def _of_groups(self, lanes: np.ndarray) -> np.ndarray:
-        """An array (groups, ..., L) -> (W, ...)."""
-        return lanes[self._group, ..., self._lane]
 
 
 def substep_vjp(

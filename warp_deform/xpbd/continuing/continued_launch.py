@@ -51,7 +51,11 @@ class ContinuedLaunch:
         self.solver, self.data, self.substeps = solver, data, substeps
         self.dt = solver.config.dt
         self.grips = LastingGrips(data, self.dt)
-        own = {n: a.like() for n, a in data.arrays.items() if n.partition(".")[0] in _OWN}
+        own = {
+            name: array.like(1 if "frame" in name else None)  # nothing is filmed here
+            for name, array in data.arrays.items()
+            if name.partition(".")[0] in _OWN
+        }
         own |= {n: data.arrays[n].like() for n in (f"group.{f}" for f in _OWN_OF_GROUPS)}
         own["particles.tether"] = data.arrays["particles.tether"].like()
         own["particles.tether"].view[:] = NO_TETHER
@@ -199,7 +203,7 @@ class ContinuedLaunch:
         """
         self._known([world], begun=True)
         data, slot = self.data, int(self.data.slot[world])
-        particle, body = self.grips.held(slot)
+        particle, body = self.held(world)
         if particle < 0 and body < 0:
             return
         if particle >= 0:
@@ -220,6 +224,10 @@ class ContinuedLaunch:
         """Which of the worlds hold something (W,)."""
         return self.grips.holding(self.data.slot[worlds])
 
+    def held(self, world: int) -> tuple[int, int]:
+        """Numbers of the particle and of the body that a world holds, -1 for none."""
+        return self.grips.held(int(self.data.slot[world]))
+
     def _tether(self, world: int) -> np.ndarray:
         return self.data.lane_of(self.arrays["particles.tether"], world)
 
@@ -239,6 +247,7 @@ class ContinuedLaunch:
             InputError: a world has not begun.
         """
         worlds = self._known(worlds, begun=True)
+        self.check_room()
         self.grips.append(slots, self.substeps, positions, rotations)
         goes = np.zeros(self.data.world_count, bool)
         goes[worlds] = True
@@ -258,6 +267,9 @@ class ContinuedLaunch:
         self._run_kernel(begins=False)
         self.runs[worlds] = state[groups, :, lanes]
 
+    def check_room(self) -> None:
+        """Refuse another part for which there is no memory; here it takes none."""
+
     def _take_part(self, worlds: np.ndarray) -> None:
         active = self.arrays["group.active"].view
         active[:] = 0.0
@@ -269,16 +281,24 @@ class ContinuedLaunch:
 
     def _run_kernel(self, *, begins: bool) -> None:
         launch = self._launch(begins)
-        mirrored = (*self.arrays.values(), *self._control.values(), *self._first_run.values())
+        self._to_device()
+        launch.launch(0 if begins else self.substeps)
+        self._to_host()
+
+    def _own(self) -> tuple[Mirrored, ...]:
+        return (*self.arrays.values(), *self._control.values(), *self._first_run.values())
+
+    def _to_device(self) -> None:
         if not self.data.device.is_cpu:
             self.data.to_device()
-            for one in mirrored:
-                one.to_device()
-        launch.launch(0 if begins else self.substeps)
+            for mirrored in self._own():
+                mirrored.to_device()
+
+    def _to_host(self) -> None:
         if not self.data.device.is_cpu:
             self.data.to_host()
-            for one in mirrored:
-                one.to_host()
+            for mirrored in self._own():
+                mirrored.to_host()
 
     def _launch(self, begins: bool) -> GroupLaunch:
         """The recorded launch of a part, or of none, in which worlds begin."""
@@ -294,15 +314,14 @@ class ContinuedLaunch:
                 control = self._first_run if first else self._control
                 tape.state, tape.counters = control["state"].array, control["counters"].array
                 structs[KERNEL_ARGUMENTS.index("tape")] = tape
-                settings = solver._new_settings(
-                    solver.config,
-                    0 if first else self.substeps,
-                    0,
-                    self.dt,
-                    damp_every(self.substeps),
-                )
-                self._launches[first] = solver.group_launch(solver._kernel, [settings, *structs])
+                inputs = [self.settings(0 if first else self.substeps), *structs]
+                self._launches[first] = solver.group_launch(solver._kernel, inputs)
         return self._launches[begins]
+
+    def settings(self, substeps: int) -> Any:
+        """The kernel's settings for so many substeps."""
+        every = damp_every(self.substeps)
+        return self.solver._new_settings(self.solver.config, substeps, 0, self.dt, every)
 
     def particles(self, name: str, worlds: np.ndarray) -> np.ndarray:
         """Positions "x" or velocities "v" (W, P, 3) of worlds of one topology."""

@@ -9,10 +9,12 @@ import numpy as np
 from ..packing.data import SolverData
 from ..packing.mirrored import Mirrored
 
-__all__ = ["KNOTS", "PER_WORLD", "LastingGrips"]
+__all__ = ["KNOTS", "MOST", "PER_WORLD", "LastingGrips"]
 
-KNOTS = 64
-"""Room for the knots of a world: those that the tip has passed make place for new ones."""
+KNOTS = 18
+"""Room for the knots of a world: where the tip is, those ahead of it, and one beyond."""
+MOST = KNOTS - 2
+"""Knots that may be added at once."""
 BEYOND = 1.0e6
 """Time [s] of the knot that ends every path, at the place of the one before it: as it is never
 reached, nothing is let go."""
@@ -92,14 +94,18 @@ class LastingGrips:
     ) -> None:
         """Let the paths of the slots (S,) go on through K knots, the last of them `substeps` ahead.
 
+        Their tips stand at the last knot but the one beyond; all before it are dropped.
+
         Args:
             positions: (S, K, 3) [m]
             rotations: (S, K, 4) quat_xyzw, on either side
         """
         count, views = positions.shape[1], self._views
-        if (views["knot_end"][slots] + count > (slots + 1) * KNOTS).any():
-            self._drop_passed(slots)
-        at = views["knot_end"][slots] - 1
+        first, last = slots * KNOTS, views["knot_end"][slots] - 2
+        for name in _AT_KNOTS:
+            views[name][first] = views[name][last]
+        views["knot"][slots] = first
+        at = first + 1
         ticks = views["tick"][slots]
         for k in range(count):
             clock = (ticks + substeps * (k + 1) // count).astype(self._number) * self._dt
@@ -113,17 +119,6 @@ class LastingGrips:
         for name in ("position", "rotation"):
             views[name][at] = views[name][at - 1]
         views["knot_end"][slots] = at + 1
-
-    def _drop_passed(self, slots: np.ndarray) -> None:
-        """Move the knots that are still needed to the beginning of their room."""
-        for slot in slots:
-            knot, end, first = (
-                int(self._views["knot"][slot]), int(self._views["knot_end"][slot]), slot * KNOTS
-            )  # fmt: skip
-            for name in _AT_KNOTS:
-                self._views[name][first : first + end - knot] = self._views[name][knot:end].copy()
-            self._views["knot"][slot] = first
-            self._views["knot_end"][slot] = first + end - knot
 
     def save(self, slot: int) -> dict[str, np.ndarray]:
         """A copy of what a slot holds, and of the part of its path that it is still to follow."""

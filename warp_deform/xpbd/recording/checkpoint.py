@@ -9,7 +9,7 @@ import numpy as np
 from ..packing.data import WATCHED, SolverData
 from ..packing.mirrored import Mirrored
 
-__all__ = ["Checkpoints"]
+__all__ = ["INPUTS", "Checkpoints"]
 
 _STATE = (
     "particles.x", "particles.v", "particles.xp", "particles.xr", "particles.w",
@@ -19,7 +19,7 @@ _STATE = (
     "bodies.touching", "bodies.support", *(f"watch.{name}" for name in WATCHED),
 )  # fmt: skip
 """What a launch changes and a later one needs; the lists of fabrics are trimmed to their length."""
-_INPUTS = (
+INPUTS = (
     "springs.length", "springs.compliance", "springs.limit", "springs.floor", "topology.radius",
     "pairs.distance", "particles.w0", "particles.tether", "bodies.w0", "bodies.inertia",
     "bodies.inverse_inertia", "shapes.friction", "shapes.center", "shapes.half",
@@ -42,10 +42,18 @@ class Checkpoints:
     """Saves and restores what launches change: a solver's arrays and the kernel's own `control`.
 
     The arrays are those that the solver has now, even if it replaces some of them later.
+
+    Args:
+        own: arrays in place of the solver's of the same names
     """
 
-    def __init__(self, data: SolverData, control: Mapping[str, Mirrored]) -> None:
-        self.data, self._control, self._arrays = data, control, dict(data.arrays)
+    def __init__(
+        self,
+        data: SolverData,
+        control: Mapping[str, Mirrored],
+        own: Mapping[str, Mirrored] | None = None,
+    ) -> None:
+        self.data, self._control, self._arrays = data, control, {**data.arrays, **(own or {})}
         self._held = [name for name in _STATE if name in data.arrays]
         if data.has_sheets:
             self._held += _SHEET_STATE
@@ -54,10 +62,10 @@ class Checkpoints:
 
     def save_inputs(self) -> dict[str, np.ndarray]:
         """A copy of what a rollout is set up with, besides the state that it starts from."""
-        return {name: self._arrays[name].view.copy() for name in _INPUTS}
+        return {name: self._arrays[name].view.copy() for name in INPUTS}
 
     def restore_inputs(self, saved: Mapping[str, np.ndarray]) -> None:
-        for name in _INPUTS:
+        for name in INPUTS:
             self._arrays[name].view[...] = saved[name]
             self._arrays[name].to_device()
 

@@ -25,10 +25,13 @@ class Derivatives:
     """The arrays of the structs `Adjoint` and `BodyAdjoint`, which are `by_state` and `by_bodies`.
 
     The arrays of knots are as long as the solver's when this was made.
+
+    Args:
+        knots: room for so many of them; None: as the solver has
     """
 
-    def __init__(self, data: SolverData) -> None:
-        self._data = data
+    def __init__(self, data: SolverData, *, knots: int | None = None) -> None:
+        self._data, self._knots = data, data.knot_room if knots is None else knots
         self._arrays = self._new_arrays()
         self._spring_first = wp.array(_spring_places(data)[0], dtype=wp.int32, device=data.device)
         self._springs = spring_rows(data)
@@ -40,7 +43,7 @@ class Derivatives:
     def _new_arrays(self) -> dict[str, Mirrored]:
         data = self._data
         t, L, groups = data.types, data.lanes, data.group_count
-        particles, knots = int(data.group_particle[-1]), data.knot_room
+        particles, knots = int(data.group_particle[-1]), self._knots
         arrays = {name: self._mirrored(particles, t.V3, (3, L)) for name in ("x", "v", "xp")}
         scratch = ("then_x", "then_v", "then_g", "then_h")
         arrays |= {name: self._mirrored(particles, t.V3, (3, L)) for name in scratch}

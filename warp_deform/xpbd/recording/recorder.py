@@ -11,8 +11,6 @@ import warp as wp
 
 from ...errors import InputError
 from ...xpbd.fused_xpbd import FusedXPBD
-from ..bodies.body_contact import VISIT
-from ..bodies.body_sweeps import VISITS
 from ..group_launch import GroupLaunch
 from ..guards import WatchValues
 from ..kernels.adjoint import adjoint_kernel
@@ -23,19 +21,31 @@ from ..packing.mirrored import Mirrored
 from ..springs.viscosity import DAMP_EVERY
 from .checkpoint import Checkpoints
 from .derivatives import Derivatives
+from .sweep_arena import SWEPT, contact_notes
 from .tape_room import Stacks, TapeRoom, new_stacks
 
-__all__ = ["STORAGES", "Recorder"]
+__all__ = ["KEPT", "STORAGES", "Recorder", "check_storage"]
 
 STORAGES = ("auto", "full", "replay")
-_KEPT = 0.25
+KEPT = 0.25
 """Share of `memory` for tapes that "auto" keeps."""
 _LONG, _NEAR = 8 * 2**20, 4 * 2**20
 """Bytes of a tape that is kept, and of the one that is used again, where memory allows. A longer
 one saves no more launches to speak of, and where it has too little room less is run in vain."""
-_SWEPT = ("topology", "springs", "pairs", "shapes", "group", "particles", "bodies", "contacts",
-          "grips", "sheets", "lines")  # fmt: skip
 _READ = ("particles.x", "particles.v", *(f"bodies.{n}" for n in ("x", "q", "v", "omega")))
+
+
+def check_storage(storage: str) -> str:
+    """The storage, if there is such a one.
+
+    Raises:
+        InputError: there is none.
+    """
+    if storage not in STORAGES:
+        raise InputError(
+            f"storage must be {', '.join(STORAGES[:-1])} or {STORAGES[-1]}, not {storage!r}"
+        )
+    return storage
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +90,8 @@ class Recorder:
         dt: float | None = None,
         damp_every: int = DAMP_EVERY,
     ) -> None:
-        if storage not in STORAGES:
-            raise InputError(
-                f"storage must be {', '.join(STORAGES[:-1])} or {STORAGES[-1]}, not {storage!r}"
-            )
-        self.solver, self.storage, self.memory, self.sleep = solver, storage, memory, sleep
+        self.solver, self.storage = solver, check_storage(storage)
+        self.memory, self.sleep = memory, sleep
         self.dt, self.damp_every = dt or solver.config.dt, damp_every
         data = solver.data
         self._variant = (data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets,
@@ -97,12 +104,7 @@ class Recorder:
         state = Mirrored(data.group_count * STATE, types.V, device, data.number, (L,))
         counters = Mirrored(data.group_count * COUNTERS, wp.int32, device, np.int32, ())
         self._control = {"state": state, "counters": counters}
-        contacts = len(data.arrays["contacts.mu"].view)
-        self._notes = {
-            "code": wp.zeros(contacts, dtype=wp.vec4i, device=device),
-            "visit": wp.zeros(contacts * VISITS, dtype=wp.vec2i, device=device),
-            "log": wp.zeros(contacts * VISITS * VISIT, dtype=data.scalar, device=device),
-        }
+        self._notes = contact_notes(data)
         self._no_tape = types.Tape()
         self._no_tape.part = 1
         for name, mirrored in self._control.items():
@@ -128,9 +130,9 @@ class Recorder:
         self._checkpoints = Checkpoints(data, self._control)
         self._derivatives = Derivatives(data)
         self._forward: dict[bool, GroupLaunch] = {}
-        swept = [data.struct(name) for name in _SWEPT]
+        swept = [data.struct(name) for name in SWEPT]
         for name, array in self._notes.items():
-            setattr(swept[_SWEPT.index("contacts")], name, array)
+            setattr(swept[SWEPT.index("contacts")], name, array)
         by = self._derivatives
         self._sweep = self.solver.group_launch(
             adjoint_kernel(*self._variant),
@@ -221,7 +223,7 @@ class Recorder:
         most = self.memory / 4 / per_substep
         if self.storage == "full":
             return max(8, round(min(last, _LONG / per_substep, most)))
-        if self.storage == "auto" and self._stored + _LONG <= _KEPT * self.memory:
+        if self.storage == "auto" and self._stored + _LONG <= KEPT * self.memory:
             return max(8, round(min(_LONG / per_substep, most)))
         # checkpoints and a tape take the least room together when they take as much of it
         least = np.sqrt(last * checkpoint / per_substep)
@@ -232,7 +234,7 @@ class Recorder:
         if self.storage != "auto":
             return self.storage == "full"
         size = self._room.nbytes(self._room.room(length))
-        return self._stored + size <= _KEPT * self.memory
+        return self._stored + size <= KEPT * self.memory
 
     def _append(self, segment: _Segment) -> None:
         self._segments.append(segment)
@@ -351,8 +353,8 @@ class Recorder:
             self._settings.max_steps = segment.end
             for at, value in (
                 (0, self._settings),
-                (1 + len(_SWEPT), tape.struct),
-                (2 + len(_SWEPT), by.by_state),
+                (1 + len(SWEPT), tape.struct),
+                (2 + len(SWEPT), by.by_state),
             ):
                 sweep.set_param_at_index(at, value)
             sweep.launch(segment.end - segment.begin)

@@ -144,9 +144,9 @@ class TapeRoom:
             raise InputError(f"the tape would need {nbytes} bytes of {memory}: {_LESS}")
         return nbytes
 
-    def learn(self, stacks: Stacks, steps: int) -> None:
-        """Take in how much `steps` substeps took."""
-        used = stacks.used() / steps
+    def learn(self, stacks: Stacks, steps: int | np.ndarray) -> None:
+        """Take in how much `steps` substeps took, of all groups or of each (groups,)."""
+        used = stacks.used() / np.reshape(steps, (-1, 1))
         self.use = used if self.use is None else np.maximum(self.use, used)
         self.grow()
 
