@@ -137,15 +137,35 @@ def finite(data: Any, positions: np.ndarray) -> np.ndarray:
 
 
 class MujocoWorld:
-    """One scene in MuJoCo."""
+    """One scene in MuJoCo.
 
-    def __init__(self, scene: PeerScene, settings: MujocoSettings | None = None) -> None:
+    Args:
+        held: number of a bead of a cable that is joined to a tip, which `lead` moves
+    """
+
+    def __init__(
+        self,
+        scene: PeerScene,
+        settings: MujocoSettings | None = None,
+        *,
+        held: int | None = None,
+    ) -> None:
         self._mujoco = import_mujoco()
         self._settings = settings or mujoco_settings(scene.name)
-        write = _block if scene.cable is None else _cable
-        self._model = self._mujoco.MjModel.from_xml_string(write(scene, self._settings))
+        if scene.cable is None:
+            text = _block(scene, self._settings)
+        else:
+            text = _cable(scene, self._settings, held)
+        self._model = self._mujoco.MjModel.from_xml_string(text)
         self._data = self._mujoco.MjData(self._model)
         self._mujoco.mj_forward(self._model, self._data)
+
+    def lead(self, target: np.ndarray, seconds: float) -> None:
+        """Advance by so many seconds, in which the tip goes straight to a target (3,) [m]."""
+        steps, tip = round(seconds * self._settings.hz), self._data.mocap_pos[0]
+        for way in np.linspace(tip, target, steps + 1)[1:]:
+            tip[:] = way
+            self._mujoco.mj_step(self._model, self._data)
 
     def frame(self) -> None:
         """Advance by 1 / FRAME_RATE simulated seconds."""
@@ -165,7 +185,7 @@ def _numbers(values: Any) -> str:
     return " ".join(f"{float(value):.9g}" for value in np.ravel(values))
 
 
-def _cable(scene: PeerScene, settings: MujocoSettings) -> str:
+def _cable(scene: PeerScene, settings: MujocoSettings, held: int | None = None) -> str:
     cable = scene.cable
     assert cable is not None
     free = settings.links == "connect"
@@ -184,6 +204,9 @@ def _cable(scene: PeerScene, settings: MujocoSettings) -> str:
         else:
             tendons.append(f'<spatial name="t{i}"><site site="s{i}"/><site site="s{j}"/></spatial>')
             links.append(f'<tendon tendon1="t{i}"/>')
+    if held is not None:
+        bodies.append(f'<body name="tip" mocap="true" pos="{_numbers(scene.beads[held])}"/>')
+        links.append(f'<connect body1="tip" body2="b{held}" anchor="0 0 0"/>')
     return _document(
         settings,
         body="".join(bodies),
