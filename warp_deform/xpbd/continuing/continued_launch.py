@@ -12,11 +12,12 @@ from ...errors import InputError
 from ..group_launch import GroupLaunch
 from ..guards import Problem, WatchValues
 from ..lanes.tape import COUNTERS, STATE, RunColumn
-from ..packing.data import KERNEL_ARGUMENTS, WATCHED
+from ..packing.data import KERNEL_ARGUMENTS
 from ..packing.mirrored import Mirrored
 from ..packing.topology import tethers
 from ..springs.tether import NO_TETHER
 from ..springs.viscosity import damp_every
+from .guard_notes import GuardNotes
 from .lasting_grips import LastingGrips
 from .near_lists import NearLists
 from .world_run import WorldRun, lists_of, places_of
@@ -71,6 +72,7 @@ class ContinuedLaunch:
             ),
         }  # fmt: skip
         self._near = NearLists(data, own, self._control["counters"])
+        self._notes = GuardNotes(data, own)
         self._first_run = {name: mirrored.like() for name, mirrored in self._control.items()}
         self._config: Any = None
         self._launches: dict[bool, GroupLaunch] = {}
@@ -94,8 +96,7 @@ class ContinuedLaunch:
         for w in worlds:
             self.grips.let_go(int(self.data.slot[w]))
         self._take_part(worlds)
-        for name in WATCHED:
-            self.arrays[f"watch.{name}"].view[self._group[worlds], self._lane[worlds]] = 0
+        self._notes.clear(worlds)
         self._run_kernel(begins=True)
         state = self._of_lanes(self._first_run["state"])
         self.runs[worlds] = state[self._group[worlds], :, self._lane[worlds]]
@@ -333,33 +334,13 @@ class ContinuedLaunch:
 
     # -- guards
 
-    def _seen(self, worlds: np.ndarray) -> dict[str, np.ndarray]:
-        """What the guards have noted of the worlds (W,) since they have begun."""
-        at = self._group[worlds], self._lane[worlds]
-        seen = {name: self.arrays[f"watch.{name}"].view[at] for name in WATCHED}
-        # these the kernel writes for all worlds of a group
-        for name, column in (("steps", RunColumn.STEPS), ("clamped", RunColumn.CLAMPED)):
-            seen[name] = self.runs[worlds, column]
-        return seen
-
     def problems(self, worlds: np.ndarray) -> dict[int, tuple[Problem, ...]]:
         """Guards that have fired in the worlds since each has begun, of those where one has."""
-        limits, seen = self.solver.config.limits, self._seen(worlds)
-        bad = (seen["nonfinite"] > 0) | (seen["overflow"] > 0)
-        for name, limit in (
-            ("stretch", limits.stretch), ("depth", limits.depth), ("box_depth", limits.box_depth),
-            ("box_overlap", limits.box_overlap), ("clamped", limits.clamped_steps),
-        ):  # fmt: skip
-            bad |= seen[name] > limit
-        if not bad.any():
-            return {}
-        return {int(w): self.watch(int(w)).problems(int(w), limits) for w in worlds[bad]}
+        return self._notes.problems(worlds, self.solver.config.limits, self.runs)
 
     def watch(self, world: int) -> WatchValues:
         """What the guards have noted of a world since it has begun, as in one launch."""
-        seen = {name: value.item() for name, value in self._seen(np.array([world])).items()}
-        whole = {name: int(seen.pop(name)) for name in ("steps", "clamped", "overflow")}
-        return WatchValues(**whole, nonfinite=seen.pop("nonfinite") > 0, **seen)
+        return self._notes.values(world, self.runs)
 
     # -- saving
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from ..bodies.body_contact import VISIT
 from ..bodies.body_sweeps import VISITS
+from ..continuing.continued_launch import ContinuedLaunch
 from ..kernels.adjoint import adjoint_kernel
 from ..kernels.forward import forward_kernel
 from ..lanes.tape import COUNTERS, STATE
@@ -17,9 +18,6 @@ from ..packing.mirrored import Mirrored
 from .checkpoint import Checkpoints
 from .derivatives import Derivatives
 from .tape_room import Stacks, TapeRoom, new_stacks
-
-if TYPE_CHECKING:
-    from .recorded_launch import RecordedLaunch
 
 __all__ = ["SWEPT", "SweepArena", "contact_notes"]
 
@@ -46,7 +44,7 @@ class SweepArena:
         knots: room for those of a world
     """
 
-    def __init__(self, launch: RecordedLaunch, arrays: Mapping[str, Mirrored], knots: int) -> None:
+    def __init__(self, launch: ContinuedLaunch, arrays: Mapping[str, Mirrored], knots: int) -> None:
         self._launch, self._data, data = launch, launch.data, launch.data
         self._arrays: dict[str, Mirrored] = {}
         for name, mirrored in arrays.items():
