@@ -1,4 +1,4 @@
-"""Three minutes from nothing: demonstrations, training, and places that were never shown."""
+"""Two minutes from nothing: demonstrations, training, and places that were never shown."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from learning.training.train import train
 from warp_deform.collecting.collect import CollectConfig, collect
 
 TASK = "cable-shape"
+STEPS = 110
+"""Enough: more than a third of the places are close by then."""
 
 
 def place_errors(snapshot: Path, held_out: Demonstrations) -> np.ndarray:
@@ -40,10 +42,10 @@ def place_errors(snapshot: Path, held_out: Demonstrations) -> np.ndarray:
 
 
 @pytest.mark.timeout(900)
-def test_held_out_places_are_learnt_in_three_minutes(tmp_path: Path) -> None:
+def test_held_out_places_are_learnt_in_two_minutes(tmp_path: Path) -> None:
     collect(CollectConfig(task=TASK, episodes=10, out=tmp_path / "demos"))
     collect(CollectConfig(task=TASK, episodes=10, seed=50_000, out=tmp_path / "held-out"))
-    schedule = replace(SCHEDULES["fast"], steps=200, snapshots=1, validate=0)
+    schedule = replace(SCHEDULES["fast"], steps=STEPS, snapshots=1, validate=0)
     out = tmp_path / "run"
     train(
         TrainConfig(
@@ -57,9 +59,9 @@ def test_held_out_places_are_learnt_in_three_minutes(tmp_path: Path) -> None:
         )
     )
     held_out = Demonstrations(tmp_path / "held-out", task=TASK)
-    before, after = (place_errors(RunFolder(out).snapshot(step), held_out) for step in (0, 200))
+    before, after = (place_errors(RunFolder(out).snapshot(step), held_out) for step in (0, STEPS))
     assert len(before) > 30
     # a share is steadier than a median: half of the places are a choice among many beads
     close = [float((errors < 0.02).mean()) for errors in (before, after)]
-    assert close[1] > 0.25 and close[1] > 3 * close[0]  # 0.42 and 0.07
-    assert after.mean() < 0.75 * before.mean()  # 0.064 and 0.123 m
+    assert close[1] > 0.25 and close[1] > 3 * close[0]  # 0.37 and 0.08
+    assert after.mean() < 0.75 * before.mean()  # 0.067 and 0.116 m

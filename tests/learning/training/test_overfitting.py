@@ -15,9 +15,9 @@ from learning.training.schedules import Schedule
 from learning.training.train import train
 from warp_deform.episodes import Episode
 
-PICTURES = Schedule(steps=80, batch=1, lr=2e-4, warmup=5, decay=True, snapshots=1)
+PICTURES = Schedule(steps=30, batch=1, lr=5e-4, warmup=5, decay=True, snapshots=1)
 GOALS = Schedule(steps=25, batch=1, lr=5e-4, warmup=5, snapshots=1)
-STATES = Schedule(steps=1200, batch=1, lr=3e-3, warmup=50, decay=True, snapshots=1)
+STATES = Schedule(steps=500, batch=1, lr=3e-3, warmup=50, decay=True, snapshots=1)
 AGENTS = {
     "transporter": ("cable-ring", PICTURES),
     "goal-split": ("cable-line-notarget", GOALS),
