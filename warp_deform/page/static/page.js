@@ -47,6 +47,7 @@ function light(grasp) {
 
 /** Ask for something that changes the state, as it is now. */
 function ask(message) {
+  if (waiting) note("one thing at a time: what was asked for before is still at work", true);
   if (waiting || !latest) return false;
   waiting = send({...message, at: latest.version});
   mark();

@@ -46,6 +46,7 @@ export class Playback {
     let left = share * this.length;
     this.at = 0;
     while (this.at < this.clips.length - 1 && left > this.clip.end) left -= this.clips[this.at++].end;
+    if (share >= 1) [this.at, left] = [Math.max(0, this.clips.length - 1), Infinity]; // no rounding
     this.now = this.clip ? Math.min(left, this.clip.end) : 0;
     this.draw();
   }

@@ -1,0 +1,90 @@
+"""Makes the moving picture of the page: a policy shows where it looks, and moves the block.
+
+    python docs/make_page.py docs/images/page.webp
+
+The page is driven in headless Chromium, where the processor draws it. The picture loops.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from playwright.sync_api import sync_playwright
+
+ROOT = Path(__file__).resolve().parent.parent
+POLICY = ROOT / "benchmarks/results/learning/policies/block-notarget-goal-split-100"
+TASK, SEED = "block-notarget", 10_000
+FPS, SPEED = 6, 1.5
+LOOK_SECONDS, LAST_SECONDS, QUALITY = 1.2, 1.5, 55
+SIZE = (405, 720)  # rows and columns [pixels]
+
+
+def main(path: Path) -> None:
+    """Let the policy play an episode and write what the page looks like."""
+    command = [sys.executable, "-m", "warp_deform", "play", TASK, "--seed", str(SEED)]
+    server = subprocess.Popen(
+        [*command, "--policy", str(POLICY)], stderr=subprocess.PIPE, text=True
+    )
+    assert server.stderr is not None
+    address = next(found[0] for line in server.stderr if (found := re.search(r"http://\S+", line)))
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.goto(address)
+        frames = play(page)
+        browser.close()
+    server.terminate()
+    server.wait()
+    film = cv2.Animation()
+    film.frames = frames
+    film.durations = np.full(len(frames), 1000 // FPS, np.int32)
+    film.durations[-1] = round(1000 * LAST_SECONDS)
+    if not cv2.imwriteanimation(str(path), film, [cv2.IMWRITE_WEBP_QUALITY, QUALITY]):
+        sys.exit(f"{path} cannot be written")
+
+
+def play(page: Any) -> list[np.ndarray]:
+    """Frames of the episode: before every action where the policy looks, then the motion."""
+    wait(page, "[data-actions='0']")
+    page.select_option("#speed", "4")
+    frames: list[np.ndarray] = []
+    begins, actions = 0.0, 0
+    while page.locator("body").get_attribute("data-over") == "":
+        page.click("#look")
+        wait(page, "[data-peak][data-waiting='false']")
+        frames += [shot(page)] * round(LOOK_SECONDS * FPS)
+        page.click("#step")
+        actions += 1
+        wait(page, f"[data-actions='{actions}'][data-playing='false']")
+        ends = float(page.locator("body").get_attribute("data-end"))
+        for time in np.arange(begins, ends, SPEED / FPS):
+            page.locator("#time").fill(f"{time / ends:.3f}")
+            frames.append(shot(page))
+        page.locator("#time").fill("1")
+        page.locator("#time").dispatch_event("change")
+        begins = ends
+    page.wait_for_timeout(300)
+    return [*frames, shot(page)]
+
+
+def wait(page: Any, state: str) -> None:
+    """Wait until the page's body has these attributes."""
+    page.locator(f"body{state}").wait_for(state="attached", timeout=120_000)
+
+
+def shot(page: Any) -> np.ndarray:
+    """What the page shows, smaller (H, W, 3) uint8 BGR."""
+    page.wait_for_timeout(60)
+    picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    return cv2.resize(picture, SIZE[::-1], interpolation=cv2.INTER_AREA)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
