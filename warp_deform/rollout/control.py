@@ -160,7 +160,7 @@ class ControlLoop:
 
     def holding(self, worlds: Sequence[int] | None = None) -> np.ndarray:
         """Which of the worlds (None: all that have begun) hold something (W,)."""
-        return self._launch.holding(self._rows(worlds))
+        return self._launch.holding(self.worlds if worlds is None else worlds)
 
     def advance(
         self,
@@ -187,30 +187,19 @@ class ControlLoop:
             InputError: shapes that do not fit, numbers that are not finite, a world that has not
                 begun; nothing has moved then.
         """
-        rows = self._rows(worlds)
-        held = np.flatnonzero(self._launch.holding(rows))
-        slots = self.solver.data.slot[rows[held]]
-        last, turned = self._launch.grips.target(slots)
-        positions = self._knots(targets, len(rows), 3, "targets")
-        turns = self._knots(rotations, len(rows), 4, "rotations")
-        counts = {k.shape[1] for k in (positions, turns) if k is not None} or {1}
-        if len(counts) > 1:
-            raise InputError(f"targets and rotations have {sorted(counts)} knots a step: as many")
-        (count,) = counts
-        places = last[:, None] if positions is None else positions[held]
-        turned = turned[:, None]
+        plan = self._launch.plan(worlds)
+        positions = self._knots(targets, len(plan.worlds), 3, "targets")
+        turns = self._knots(rotations, len(plan.worlds), 4, "rotations")
+        if positions is not None and turns is not None and positions.shape[1] != turns.shape[1]:
+            counts = positions.shape[1], turns.shape[1]
+            raise InputError(f"targets and rotations have {counts} knots a step: as many of both")
+        if positions is not None:
+            positions = positions[plan.held]
         if turns is not None:
-            turned = _unit(turns[held], turns[held].shape, "rotations")
-        self._launch.advance(
-            rows,
-            slots,
-            np.broadcast_to(places, (len(held), count, 3)),
-            np.broadcast_to(turned, (len(held), count, 4)),
-        )
-        return self._launch.problems(rows)
-
-    def _rows(self, worlds: Sequence[int] | None) -> np.ndarray:
-        return self.worlds if worlds is None else np.asarray(worlds, dtype=int).reshape(-1)
+            turns = turns[plan.held]
+            turns = _unit(turns, turns.shape, "rotations")
+        self._launch.advance(plan, positions, turns)
+        return self._launch.problems(plan.worlds)
 
     def _knots(
         self, values: np.ndarray | None, count: int, width: int, name: str
@@ -238,11 +227,11 @@ class ControlLoop:
 
     def particle_q(self, worlds: Sequence[int] | None = None) -> np.ndarray:
         """Positions (W, P, 3) [m] of the particles of worlds (None: all that have begun)."""
-        return self._launch.particles("x", self._rows(worlds))
+        return self._launch.particles("x", worlds)
 
     def particle_qd(self, worlds: Sequence[int] | None = None) -> np.ndarray:
         """Velocities (W, P, 3) [m/s] of the particles of worlds (None: all that have begun)."""
-        return self._launch.particles("v", self._rows(worlds))
+        return self._launch.particles("v", worlds)
 
     def watch(self, world: int) -> WatchValues:
         """What the guards have noted of a world since it has begun."""

@@ -299,9 +299,12 @@ class TensorControlLoop:
 
     def _run(self, places: np.ndarray, turns: np.ndarray) -> tuple[int, TensorState]:
         """Run a step; the number of its recording, and the state after it."""
-        live = np.isin(self.worlds, self._plain.worlds)
-        names = np.asarray(self.worlds)[live]
-        self.problems = self._plain.advance(places[live], turns[live], worlds=names.tolist())
+        names = self.worlds
+        live = self._launch.open[names]
+        if not live.all():
+            names = [w for w, goes_on in zip(names, live, strict=True) if goes_on]
+            places, turns = places[live], turns[live]
+        self.problems = self._plain.advance(places, turns, worlds=names)
         return self._launch.last, self._read(self._rows)
 
     def _sweep(

@@ -6,20 +6,21 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
 from ...errors import InputError
 from ..group_launch import GroupLaunch
 from ..guards import Problem, WatchValues
-from ..lanes.tape import COUNTERS, STATE, RunColumn
+from ..lanes.tape import STATE, RunColumn
 from ..packing.data import KERNEL_ARGUMENTS
 from ..packing.mirrored import Mirrored
 from ..packing.topology import tethers
 from ..springs.tether import NO_TETHER
 from ..springs.viscosity import damp_every
 from .guard_notes import GuardNotes
+from .lane_runs import LaneRuns
 from .lasting_grips import LastingGrips
 from .near_lists import NearLists
+from .plan import Plan, plan_of
 from .world_run import WorldRun, lists_of, places_of
 
 if TYPE_CHECKING:
@@ -63,26 +64,19 @@ class ContinuedLaunch:
         for name in ("least_steps", "most_steps"):
             own[f"group.{name}"].view[:] = FOREVER
         self.arrays: dict[str, Mirrored] = own | self.grips.arrays
-        self._control = {
-            "state": Mirrored(
-                data.group_count * STATE, data.types.V, data.device, data.number, (data.lanes,)
-            ),
-            "counters": Mirrored(
-                data.group_count * COUNTERS, wp.int32, data.device, np.int32, ()
-            ),
-        }  # fmt: skip
+        self._runs = LaneRuns(data)
+        self._control = self._runs.control
         self._near = NearLists(data, own, self._control["counters"])
         self._notes = GuardNotes(data, own)
         self._first_run = {name: mirrored.like() for name, mirrored in self._control.items()}
         self._config: Any = None
         self._launches: dict[bool, GroupLaunch] = {}
         self._group, self._lane = np.divmod(data.slot, data.lanes)
-        self.runs = np.zeros((data.world_count, STATE), data.number)
-        """Of every world, what the kernel keeps of it between two parts, see `RunColumn`."""
         self.open = np.zeros(data.world_count, bool)
         """Which worlds (W,) have begun and not ended."""
         self._launched = np.zeros(data.world_count, bool)
         """Worlds whose near pairs stand in the lists; those of others are parked."""
+        self._plans: dict[tuple[int, ...] | None, Plan] = {}
 
     # -- worlds
 
@@ -98,8 +92,8 @@ class ContinuedLaunch:
         self._take_part(worlds)
         self._notes.clear(worlds)
         self._run_kernel(begins=True)
-        state = self._of_lanes(self._first_run["state"])
-        self.runs[worlds] = state[self._group[worlds], :, self._lane[worlds]]
+        state = self._first_run["state"].view.reshape(-1, STATE, self.data.lanes)
+        self._runs.put(worlds, state[self._group[worlds], :, self._lane[worlds]])
         self._launched[worlds] = False
         self._near.parked |= {int(w): np.zeros(0, np.int32) for w in worlds}
         self._open(worlds, True)
@@ -131,6 +125,7 @@ class ContinuedLaunch:
         return rows
 
     def _open(self, worlds: np.ndarray, is_open: bool) -> None:
+        self._plans = {}
         self.open[worlds] = self.solver.continued[worlds] = is_open
 
     # -- holding
@@ -174,7 +169,8 @@ class ContinuedLaunch:
             self._tether(world)[:] = tethers(top, particle)
         else:
             data.views["bodies.w"][data.body_rows(world)][body] = 0.0
-        self.runs[world, RunColumn.HOLDING] = 1.0
+        self._runs.set(world, RunColumn.HOLDING, 1.0)
+        self._plans = {}
 
     def check_holdable(self, world: int, particle: int | None, body: int | None) -> None:
         """Refuse to hold what cannot be held.
@@ -218,8 +214,9 @@ class ContinuedLaunch:
             if not moving:
                 data.views["bodies.v"][row] = data.views["bodies.omega"][row] = 0.0
         self.grips.let_go(slot)
-        self.runs[world, RunColumn.HOLDING] = 0.0
-        self.runs[world, RunColumn.CALM] = calm
+        self._runs.set(world, RunColumn.HOLDING, 0.0)
+        self._runs.set(world, RunColumn.CALM, calm)
+        self._plans = {}
 
     def holding(self, worlds: Sequence[int] | np.ndarray) -> np.ndarray:
         """Which of the worlds hold something (W,)."""
@@ -234,39 +231,49 @@ class ContinuedLaunch:
 
     # -- running
 
-    def advance(
-        self, worlds: np.ndarray, slots: np.ndarray, positions: np.ndarray, rotations: np.ndarray
-    ) -> None:
-        """Run the next part in `worlds`; the others that have begun pause.
-
-        Args:
-            slots: of those that hold something (S,); the next two go on with their paths
-            positions: (S, K, 3) [m]
-            rotations: (S, K, 4) quat_xyzw
+    def plan(self, worlds: Sequence[int] | np.ndarray | None = None) -> Plan:
+        """How to run worlds (None: all that have begun, ascending), worked out once.
 
         Raises:
-            InputError: a world has not begun.
+            InputError: one has not begun.
         """
-        worlds = self._known(worlds, begun=True)
+        key = None if worlds is None else tuple(worlds)
+        if key not in self._plans:
+            rows = self._known(np.flatnonzero(self.open) if key is None else key, begun=True)
+            held = np.flatnonzero(self.holding(rows))
+            self._plans[key] = plan_of(self.data, rows, held)
+        return self._plans[key]
+
+    def advance(
+        self,
+        plan: Plan,
+        positions: np.ndarray | None = None,
+        rotations: np.ndarray | None = None,
+    ) -> None:
+        """Run the next part in the worlds of a plan; the others that have begun pause.
+
+        Args:
+            plan: what `plan` gave since anything began, ended, was taken or let go
+            positions: of the tips that hold something, in the plan's order (S, K, 3) [m]; None:
+                they wait
+            rotations: (S, K, 4) quat_xyzw; None: they do not turn
+        """
+        worlds = plan.worlds
         self.check_room()
-        self.grips.append(slots, self.substeps, positions, rotations)
-        goes = np.zeros(self.data.world_count, bool)
-        goes[worlds] = True
-        for w in np.flatnonzero(goes != self._launched):
-            if goes[w]:
-                self._near.unpark(int(w))
-            elif self.open[w]:
-                self._near.park(int(w))
-        self._launched = goes
-        self._take_part(worlds)
-        state = self._of_lanes(self._control["state"])
-        groups, lanes = self._group[worlds], self._lane[worlds]
-        state[:, RunColumn.ON] = 0.0
-        state[groups, :, lanes] = self.runs[worlds]
-        state[groups, RunColumn.ON, lanes] = 1.0
-        self._control["counters"].view.reshape(-1, COUNTERS)[:, 0] = 0
+        if len(plan.slots):
+            self.grips.append(plan.slots, self.substeps, positions, rotations)
+        if not self._runs.launched_last(worlds):
+            goes = np.zeros(self.data.world_count, bool)
+            goes[worlds] = True
+            for w in np.flatnonzero(goes != self._launched):
+                if goes[w]:
+                    self._near.unpark(int(w))
+                elif self.open[w]:
+                    self._near.park(int(w))
+            self._launched = goes
+            self._take_part(worlds)
+        self._runs.enter(worlds)
         self._run_kernel(begins=False)
-        self.runs[worlds] = state[groups, :, lanes]
 
     def check_room(self) -> None:
         """Refuse another part for which there is no memory; here it takes none."""
@@ -275,10 +282,6 @@ class ContinuedLaunch:
         active = self.arrays["group.active"].view
         active[:] = 0.0
         active[self._group[worlds], self._lane[worlds]] = 1.0
-
-    def _of_lanes(self, state: Mirrored) -> np.ndarray:
-        """The kernel's state (groups, STATE, L)."""
-        return state.view.reshape(-1, STATE, self.data.lanes)
 
     def _run_kernel(self, *, begins: bool) -> None:
         launch = self._launch(begins)
@@ -324,23 +327,22 @@ class ContinuedLaunch:
         every = damp_every(self.substeps)
         return self.solver._new_settings(self.solver.config, substeps, 0, self.dt, every)
 
-    def particles(self, name: str, worlds: np.ndarray) -> np.ndarray:
-        """Positions "x" or velocities "v" (W, P, 3) of worlds of one topology."""
-        first = self.data.group_particle[self._group[worlds]]
-        count = self.data.topologies[self.data.world_topology[worlds[0]]].particle_count
-        rows = first[:, None] + np.arange(count)
-        view: np.ndarray = self.data.views[f"particles.{name}"]
-        return view[rows, :, self._lane[worlds][:, None]]
+    def particles(self, name: str, worlds: Sequence[int] | None) -> np.ndarray:
+        """Positions "x" or velocities "v" (W, P, 3) of worlds of one topology, see `plan`."""
+        scalars = self.plan(worlds).scalars
+        if scalars is None:
+            raise InputError("no world is under control: call begin() first")
+        return self.data.views[f"particles.{name}"].reshape(-1).take(scalars)
 
     # -- guards
 
     def problems(self, worlds: np.ndarray) -> dict[int, tuple[Problem, ...]]:
         """Guards that have fired in the worlds since each has begun, of those where one has."""
-        return self._notes.problems(worlds, self.solver.config.limits, self.runs)
+        return self._notes.problems(worlds, self.solver.config.limits, self._runs)
 
     def watch(self, world: int) -> WatchValues:
         """What the guards have noted of a world since it has begun, as in one launch."""
-        return self._notes.values(world, self.runs)
+        return self._notes.values(world, self._runs)
 
     # -- saving
 
@@ -354,7 +356,7 @@ class ContinuedLaunch:
         places = places_of(self.data, self.arrays, world)
         lists = lists_of(self.data, world)
         return WorldRun(
-            run=self.runs[world].copy(),
+            run=self._runs.rows(np.array([world]))[0],
             pairs=self._near.pairs(world),
             arrays={name: place.copy() for name, place in (places | lists).items()},
             grip=self.grips.save(int(self.data.slot[world])),
@@ -377,7 +379,7 @@ class ContinuedLaunch:
         for name, rows in lists_of(self.data, world).items():
             rows[...] = saved.arrays[name]
         self.grips.restore(int(self.data.slot[w]), saved.grip)
-        self.runs[w] = saved.run
+        self._runs.put(np.array([w]), saved.run[None])
         self._launched[w] = False
         self._near.parked[int(w)] = saved.pairs
         self._open(np.array([w]), True)

@@ -84,41 +84,44 @@ class LastingGrips:
         held: np.ndarray = (self._views["particle"][slots] >= 0) | (self._views["body"][slots] >= 0)
         return held
 
-    def target(self, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the paths of the slots (S,) end: positions (S, 3) [m], rotations (S, 4)."""
-        last = self._views["knot_end"][slots] - 1
-        return self._views["position"][last].copy(), self._views["rotation"][last].copy()
-
     def append(
-        self, slots: np.ndarray, substeps: int, positions: np.ndarray, rotations: np.ndarray
+        self,
+        slots: np.ndarray,
+        substeps: int,
+        positions: np.ndarray | None,
+        rotations: np.ndarray | None,
     ) -> None:
         """Let the paths of the slots (S,) go on through K knots, the last of them `substeps` ahead.
 
         Their tips stand at the last knot but the one beyond; all before it are dropped.
 
         Args:
-            positions: (S, K, 3) [m]
-            rotations: (S, K, 4) quat_xyzw, on either side
+            positions: (S, K, 3) [m]; None: where the tips are
+            rotations: (S, K, 4) quat_xyzw, on either side; None: as they are
         """
-        count, views = positions.shape[1], self._views
-        first, last = slots * KNOTS, views["knot_end"][slots] - 2
-        for name in _AT_KNOTS:
-            views[name][first] = views[name][last]
-        views["knot"][slots] = first
-        at = first + 1
-        ticks = views["tick"][slots]
+        views, first = self._views, slots * KNOTS
+        time, position, rotation = (views[name] for name in _AT_KNOTS)
+        last = views["knot_end"][slots] - 2
+        time[first] = time[last]
+        place = position[last]
+        turn = rotation[last]
+        position[first], rotation[first] = place, turn
+        count = max(1 if k is None else k.shape[1] for k in (positions, rotations))
+        ticks, at = views["tick"][slots], first
         for k in range(count):
-            clock = (ticks + substeps * (k + 1) // count).astype(self._number) * self._dt
-            views["time"][at] = clock
-            views["position"][at] = positions[:, k]
-            before, turn = views["rotation"][at - 1], rotations[:, k].astype(self._number)
-            other_side = (before * turn).sum(axis=1, keepdims=True) < 0
-            views["rotation"][at] = np.where(other_side, -turn, turn)
             at = at + 1
-        views["time"][at] = BEYOND
-        for name in ("position", "rotation"):
-            views[name][at] = views[name][at - 1]
-        views["knot_end"][slots] = at + 1
+            time[at] = (ticks + substeps * (k + 1) // count).astype(self._number) * self._dt
+            if positions is not None:
+                place = positions[:, k]
+            position[at] = place
+            if rotations is not None:
+                given = rotations[:, k].astype(self._number)
+                other_side = (turn * given).sum(axis=1, keepdims=True) < 0
+                turn = np.where(other_side, -given, given)
+            rotation[at] = turn
+        at = at + 1
+        time[at], position[at], rotation[at] = BEYOND, place, turn
+        views["knot"][slots], views["knot_end"][slots] = first, at + 1
 
     def save(self, slot: int) -> dict[str, np.ndarray]:
         """A copy of what a slot holds, and of the part of its path that it is still to follow."""
