@@ -11,12 +11,13 @@ between two of the latter, too.
 
 Process CPU microseconds per control step and world, float32, one thread, kernels compiled before,
 the least over repeats that take turns, and control steps a second and core. `times` is how much
-longer the chain takes. Worlds stand side by side in 8 lanes; a lone world has a lane of its own.
+longer the chain takes, and how much longer MuJoCo takes than `continued`. Worlds stand side by side
+in 8 lanes; a lone world has a lane of its own.
 
-With `--mujoco` a lone cable runs in MuJoCo, too, at the cheapest settings that
-`benchmarks/peers.py` found for a crumpled one, with the same targets; its bead is joined to a tip
-that it does not reach exactly. Those settings are for a fall onto the table: how far links are from
-their length at the end is printed as `stretch`, for all.
+With `--mujoco` a lone cable runs in MuJoCo, too, with the same targets; its bead is joined to a tip
+that it follows by some millimetres. Its settings are the cheapest of 24 (120 to 960 steps a second,
+CG and Newton, joints and tendons) after which links were within 2 % of their length at the end, as
+`stretch` tells of all; those that suffice for a fall onto the table stretch them by a fifth.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ import numpy as np
 import torch
 
 from warp_deform.objects import CableConfig, ClothConfig, add_cable, add_cloth, cloth_sheet
-from warp_deform.peers.mujoco_peer import MujocoWorld
+from warp_deform.peers.mujoco_peer import MujocoSettings, MujocoWorld
 from warp_deform.peers.scene import peer_scene
 from warp_deform.quiet import quiet_warp
 from warp_deform.rollout import (
@@ -53,6 +54,7 @@ SOLVERS = {
     "cable": SolverConfig(damping=1.0, limits=LIMITS),
     "fabric": FABRIC_SOLVER,
 }
+MUJOCO = MujocoSettings(hz=240, solver="CG", iterations=20, tolerance=1e-4, links="connect")
 Episode = Callable[[], np.ndarray]
 """Plays 20 control steps from the start; returns the last positions."""
 
@@ -188,7 +190,7 @@ class MujocoCable:
 
     def reset(self) -> None:
         """Begin anew."""
-        self.world = MujocoWorld(peer_scene("cable"), held=0)
+        self.world = MujocoWorld(peer_scene("cable"), MUJOCO, held=0)
 
     def play(self) -> np.ndarray:
         for target in self.scene.targets[:, 0]:

@@ -266,15 +266,18 @@ def test_memory_is_bounded_as_a_whole(settled: tuple[SolverFusedXPBD, np.ndarray
     assert most["auto"] <= memory < most["full"]
     loop = TensorControlLoop(solver, storage="full", memory=memory)
     loop.begin([0], positions=torch.from_numpy(start).requires_grad_())
+    loop.hold(0, particle=3)
     with pytest.raises(InputError, match="allow more memory"):
         for _ in range(20):
-            loop.advance()
-    where = solver.particle_q(0)
+            loop.advance(loop.tips + 1e-3)
+    where, tip = solver.particle_q(0), loop.tips.clone()
     with pytest.raises(InputError, match="allow more memory"):
-        loop.advance()
+        loop.advance(loop.tips + 1e-3)
     assert np.array_equal(solver.particle_q(0), where)
+    # it goes on from there once there is room
     loop.detach()
-    loop.advance()
+    state = loop.advance(tip + 1e-3)
+    assert torch.allclose(state.positions[:, 3], tip + 1e-3, atol=1e-9)
     loop.end()
 
 

@@ -106,20 +106,21 @@ class ContinuedLaunch:
         """
         worlds = self._known(worlds, begun=True)
         for w in worlds:
-            self.let_go(int(w), moving=False)
+            self._let_go(int(w), moving=False, calm=0)
             self._near.parked.pop(int(w), None)
         self._launched[worlds] = False
         self._open(worlds, False)
 
     def _known(self, worlds: Sequence[int] | np.ndarray, *, begun: bool) -> np.ndarray:
-        rows = np.asarray(worlds, dtype=int).reshape(-1)
-        if len(rows) and not (0 <= rows.min() and rows.max() < self.data.world_count):
-            raise InputError(f"no worlds {rows.tolist()}: the solver has {self.data.world_count}")
-        if len(np.unique(rows)) < len(rows):
-            raise InputError(f"a world is named twice in {rows.tolist()}")
-        if (self.open[rows] != begun).any():
-            wrong = rows[self.open[rows] != begun][0]
-            raise InputError(f"world {wrong} has {'not begun' if begun else 'begun already'}")
+        names = [int(w) for w in worlds]
+        if names and not (0 <= min(names) and max(names) < self.data.world_count):
+            raise InputError(f"no worlds {names}: the solver has {self.data.world_count}")
+        if len(set(names)) < len(names):
+            raise InputError(f"a world is named twice in {names}")
+        wrong = [w for w in names if self.open[w] != begun]
+        if wrong:
+            raise InputError(f"world {wrong[0]} has {'not begun' if begun else 'begun already'}")
+        rows = np.array(names, dtype=int)
         if not begun and self.solver.continued[rows].any():
             raise InputError(f"worlds {rows.tolist()} are under another control")
         return rows
@@ -199,6 +200,9 @@ class ContinuedLaunch:
             InputError: the world has not begun.
         """
         self._known([world], begun=True)
+        self._let_go(world, moving=moving, calm=calm)
+
+    def _let_go(self, world: int, *, moving: bool, calm: int) -> None:
         data, slot = self.data, int(self.data.slot[world])
         particle, body = self.held(world)
         if particle < 0 and body < 0:
@@ -273,7 +277,11 @@ class ContinuedLaunch:
             self._launched = goes
             self._take_part(worlds)
         self._runs.enter(worlds)
-        self._run_kernel(begins=False)
+        try:
+            self._run_kernel(begins=False)
+        except InputError:
+            self.grips.cut(plan.slots)
+            raise
 
     def check_room(self) -> None:
         """Refuse another part for which there is no memory; here it takes none."""

@@ -123,6 +123,14 @@ class LastingGrips:
         time[at], position[at], rotation[at] = BEYOND, place, turn
         views["knot"][slots], views["knot_end"][slots] = first, at + 1
 
+    def cut(self, slots: np.ndarray) -> None:
+        """Take back what was added last to the paths of the slots (S,), before it was run."""
+        views, first = self._views, slots * KNOTS
+        for name in _AT_KNOTS:
+            views[name][first + 1] = views[name][first]
+        views["time"][first + 1] = BEYOND
+        views["knot_end"][slots] = first + 2
+
     def save(self, slot: int) -> dict[str, np.ndarray]:
         """A copy of what a slot holds, and of the part of its path that it is still to follow."""
         knot, end = int(self._views["knot"][slot]), int(self._views["knot_end"][slot])

@@ -56,6 +56,9 @@ class NearLists:
         """Put the pairs of a world that goes on back on its group's list."""
         group, lane, rows, first = self._place(world)
         pairs = self.parked.pop(world) + np.int32(first)
+        if not len(pairs):
+            self._mask[rows, lane] = 0
+            return
         union = np.union1d(self._pair[rows], pairs)
         masks = np.zeros((len(union), self._data.lanes), self._mask.dtype)
         masks[np.searchsorted(union, self._pair[rows])] = self._mask[rows]

@@ -78,6 +78,7 @@ class RecordedLaunch(ContinuedLaunch):
         self._next = 0
         self._stored = 0
         self._checkpoint_bytes = self._own_bytes = 0
+        self._needed: tuple[np.ndarray, int] | None = None
         self._spent: list[Stacks] = []
         self._arena: SweepArena | None = None
         self._taped: Any = None
@@ -142,17 +143,21 @@ class RecordedLaunch(ContinuedLaunch):
             InputError: there is none.
         """
         if self.recording:
-            part = self._size() if self._keeps() else self._checkpoint_bytes
+            part = self._sized()[1] if self._keeps() else self._checkpoint_bytes
             self._count(self._own_bytes + part)
 
-    def _size(self) -> int:
-        return self._room.nbytes(self._room.room(self.substeps))
+    def _sized(self) -> tuple[np.ndarray, int]:
+        """Room (groups, 4) that the tape of a part is thought to need, and its bytes."""
+        if self._needed is None:
+            room = self._room.room(self.substeps)
+            self._needed = room, self._room.nbytes(room)
+        return self._needed
 
     def _keeps(self) -> bool:
         """Whether the tape of the next part is kept."""
         if self.storage != "auto":
             return self.storage == "full"
-        return self._stored + self._size() <= KEPT * self.memory
+        return self._stored + self._sized()[1] <= KEPT * self.memory
 
     def _count(self, more: int) -> None:
         """Note the bytes that are in use, with so many `more`; InputError: too many."""
@@ -168,21 +173,23 @@ class RecordedLaunch(ContinuedLaunch):
         while self._keeps():
             tape = self._kept_tape()
             self._launch_taped(tape)
-            full = tape.full()
-            self._room.learn(tape, np.maximum(tape.read("steps"), 1))
-            if not full.any():
+            full = tape.full().any()
+            if full or self._room.use is None:
+                self._room.learn(tape, np.maximum(tape.read("steps"), 1))
+                self._needed = None
+            if not full:
                 return tape
             self._room.grow(double=True)
             self._checkpoints.restore(checkpoint)
         return None
 
     def _kept_tape(self) -> Stacks:
-        room = self._room.room(self.substeps)
+        room, nbytes = self._sized()
         while self._spent:
             spent = self._spent.pop()
             if (spent.room >= room).all() and (spent.room <= 4 * room + 64).all():
                 return spent
-        self._count(self._room.nbytes(room))
+        self._count(nbytes)
         return new_stacks(self.data, self._control, room)
 
     def _launch_taped(self, tape: Stacks) -> None:

@@ -124,8 +124,10 @@ class SweepArena:
             tape.struct.resume, tape.struct.last = 1, 0
             self._forward.set_param_at_index(self._tape_at, tape.struct)
             self._forward.launch(self._launch.substeps)
-            room.learn(tape, np.maximum(tape.read("steps"), 1))
-            if tape.full().any():
+            full = tape.full().any()
+            if full or room.use is None:
+                room.learn(tape, np.maximum(tape.read("steps"), 1))
+            if full:
                 room.grow(double=True)
             else:
                 self._on_again = number
