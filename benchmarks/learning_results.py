@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import csv
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +29,17 @@ def main() -> None:
     parser.add_argument("--share", nargs="+", type=Path, default=[], help="runs to hand on")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/learning"))
     options = parser.parse_args()
-    runs, notes = read_runs(options.runs)
-    for note in notes:
+    for note in check_in(options.runs, options.out):
         print(note)
+    for path in options.share:
+        share_run(path, options.out / "policies" / path.name)
+    report = write_report([options.out / "runs"], options.out)
+    print(report.text)
+
+
+def check_in(paths: Sequence[Path], out: Path) -> list[str]:
+    """Write what evaluated runs came to into folders under `out`/runs; returns notes on others."""
+    runs, notes = read_runs(paths)
     for run in runs:
         name = f"{run.task}-{run.agent}-{run.demos}-{run.seed}"
         if run.settings["preset"] != "fast":
@@ -45,16 +53,13 @@ def main() -> None:
         )
         if steps != usual.steps:
             name += f"-{steps}-steps"
-        target = RunFolder(options.out / "runs" / name)
+        target = RunFolder(out / "runs" / name)
         target.path.mkdir(parents=True, exist_ok=True)
         settings = {key: value for key, value in run.settings.items() if key != "data"}
         write_json(target.settings, settings)  # the path of the data is this machine's
         write_json(target.report, {k: v for k, v in run.info.items() if k != "videos"})
         write_episodes(RunFolder(run.path), run.info, target.path)
-    for path in options.share:
-        share_run(path, options.out / "policies" / path.name)
-    report = write_report([options.out / "runs"], options.out)
-    print(report.text)
+    return notes
 
 
 def write_episodes(run: RunFolder, info: Mapping[str, Any], target: Path) -> None:
