@@ -10,7 +10,7 @@ from ..support.quaternion import quat_rotate, quat_rotate_vjp, quat_tangent
 from ..xpbd.packing.data import SolverData
 from ..xpbd.recording.derivatives import spring_rows
 
-__all__: list[str] = []  # a tool of this room
+__all__ = ["WorldRows"]
 
 
 class WorldRows:

@@ -49,7 +49,7 @@ NEEDED = {
     "goals": [LINE, "--out", "d"], "replay": ["d"], "inspect": ["d"],
     "convert": ["d", "o", "--from", "deformable-ravens"],
     "train": [LINE, "--agent", "gt-mlp", "--data", "d", "--out", "r"], "eval": ["r"],
-    "sweep": ["grid.toml"], "refine": ["d", "--out", "o"],
+    "sweep": ["grid.toml"], "refine": ["d", "--out", "o"], "play": [LINE], "view": ["d"],
 }  # fmt: skip
 
 
