@@ -18,7 +18,7 @@ from ..tasks.task import Task
 from ..worlds.observing import Observing, ObsMode, goal_shape
 from ..worlds.rewards import RewardMode
 from .env import WorldsView, check_render_mode
-from .reset_options import IGNORED, check_options, goal_for, next_seed
+from .reset_options import single_start
 
 __all__ = ["ControlEnv", "ControlNumbers", "TipActions"]
 
@@ -168,9 +168,7 @@ class ControlEnv(gymnasium.Env[Any, np.ndarray]):
             InputError: an option is unknown, or the goal is not this task's.
         """
         super().reset(seed=seed)
-        number = int(seed) if seed is not None else next_seed(self.np_random)
-        given = check_options(options, "goal", *IGNORED).get("goal")
-        goals = {} if given is None else {0: goal_for(self.task, given, seed=number)}
+        number, goals = single_start(self.task, seed, options, self.np_random)
         self._running = False
         self.control.reset({0: number}, goals=goals)
         self._running = True

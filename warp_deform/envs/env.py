@@ -21,7 +21,7 @@ from ..worlds.observing import Observing, ObsMode
 from ..worlds.rewards import RewardMode, Rewards
 from ..worlds.spaces import information
 from ..worlds.worlds import Worlds
-from .reset_options import IGNORED, check_options, goal_for, next_seed
+from .reset_options import single_start
 
 __all__ = ["PickPlaceEnv", "WorldsView"]
 
@@ -106,9 +106,7 @@ class PickPlaceEnv(gymnasium.Env[Any, np.ndarray]):
             InputError: an option is unknown, or the goal is not this task's.
         """
         super().reset(seed=seed)
-        number = int(seed) if seed is not None else next_seed(self.np_random)
-        given = check_options(options, "goal", *IGNORED).get("goal")
-        goals = {} if given is None else {0: goal_for(self.task, given, seed=number)}
+        number, goals = single_start(self.task, seed, options, self.np_random)
         self._running = False
         self.worlds.reset({0: number}, goals=goals)
         self._run = EpisodeRun[Any](number, episode_rng(number, DEMONSTRATOR_STREAM))

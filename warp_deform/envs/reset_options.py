@@ -15,7 +15,7 @@ from ..rendering.pixels import SHAPE
 from ..tasks.free_space import FreeSpace
 from ..tasks.task import Task
 
-__all__ = ["IGNORED", "check_options", "goal_for", "next_seed"]
+__all__ = ["IGNORED", "check_options", "goal_for", "next_seed", "single_start"]
 
 GoalOption = Goal | str | os.PathLike[str]
 
@@ -38,6 +38,19 @@ def check_options(options: Mapping[str, Any] | None, *known: str) -> Mapping[str
             ours = ", ".join(option for option in known if option not in IGNORED)
             raise InputError(f"reset has no option {name!r}; it has {ours}")
     return options or {}
+
+
+def single_start(
+    task: Task, seed: int | None, options: Mapping[str, Any] | None, rng: np.random.Generator
+) -> tuple[int, dict[int, Goal]]:
+    """The seed of an environment's next episode, and the goal by slot if one was given.
+
+    Raises:
+        InputError: an option is unknown, or the goal is not this task's.
+    """
+    number = int(seed) if seed is not None else next_seed(rng)
+    given = check_options(options, "goal", *IGNORED).get("goal")
+    return number, {} if given is None else {0: goal_for(task, given, seed=number)}
 
 
 def goal_for(task: Task, given: GoalOption, *, seed: int) -> Goal:

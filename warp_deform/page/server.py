@@ -129,6 +129,8 @@ class Served:
 
     async def handle(self, connection: ServerConnection) -> None:
         """Serve one tab until it goes."""
+        from websockets.exceptions import ConnectionClosed
+
         if len(self._tabs) >= MOST_TABS:
             await connection.close(_TOO_MANY, f"{MOST_TABS} tabs are open")
             return
@@ -143,7 +145,7 @@ class Served:
         finally:
             self._drop(tab)
             sender.cancel()
-            with contextlib.suppress(asyncio.CancelledError, Exception):
+            with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                 await sender
 
     async def _take(self, tab: _Tab, raw: str | bytes) -> bool:
