@@ -44,7 +44,7 @@ class Protocol:
         goal_folder: a folder of goals that the test episodes share in turn instead
         stage_rule: who chooses the lift, "action" (the policy) or "privileged" (the paper's hidden
             rule, which reads the simulator)
-        retry: whether agents over pictures remember what they missed and what they just put down,
+        retry: whether agents over pictures remember what they missed, just put down and did twice,
             and pick elsewhere, see `policy.RetryingPolicy`; the paper's do not
         motions_must_succeed: whether an action that the arm cannot carry out ends the episode,
             unsolved, as in the original; else it costs an action

@@ -17,7 +17,7 @@ from hardware.arm.pick_place import PickPlaceAction, PickPlaceOutcome
 from hardware.episodes.episode import Observation
 from learning.data.batches import task_lifts
 from learning.models.transporter import PRESETS
-from learning.policy.memory import MISSED, PUT_DOWN, RESTING, Memory
+from learning.policy.memory import MISSED, PUT_DOWN, REPEATED, RESTING, Memory
 from learning.policy.policy import AgentDescription, ImagePolicy, make_agent
 from learning.runs.folder import RunFolder
 
@@ -41,6 +41,39 @@ def test_what_failed_is_tried_elsewhere_and_what_was_put_down_rests() -> None:
         memory.chose(pick, pick + 0.1)
         discs = memory.avoid(changed=True)
     np.testing.assert_array_equal([xy for xy, _ in discs], PLACES[-RESTING:] + 0.1)
+
+
+def done(memory: Memory, pick: np.ndarray, place: np.ndarray) -> list[tuple[float, ...]]:
+    """Do an action that changes the picture; picks that are avoided since, for being repeated."""
+    memory.chose(pick, place)
+    avoided = memory.avoid(changed=True)
+    return [tuple(xy) for xy, _ in avoided[min(len(memory._done), RESTING) :]]
+
+
+def test_an_action_that_was_undone_and_done_again_is_not_done_a_third_time() -> None:
+    left, right = np.array([0.3, 0.0]), np.array([0.6, 0.1])
+    out = np.array([0.05, 0.0])
+    near = np.array([0.0, 0.9 * REPEATED])
+    memory = Memory()
+    assert done(memory, left, left - out) == done(memory, right, right + out) == []
+    assert done(memory, left + near, left - out) == [tuple(left + near)]
+    assert done(memory, right, right + out + near) == [tuple(left + near), tuple(right)]
+    assert {reach for _, reach in memory.avoid(changed=False)[RESTING:]} == {REPEATED}
+    assert done(memory, left + 3 * out, left) == [tuple(right)]  # what was repeated rests, too
+    assert done(memory, right - 3 * out, right) == []
+
+
+@pytest.mark.parametrize("other", ["pick", "place", "undone"])
+def test_only_the_same_action_done_counts_as_repeated(other: str) -> None:
+    pick, place, away = np.array([0.3, 0.0]), np.array([0.4, 0.1]), np.array([0.0, 1.1 * REPEATED])
+    memory = Memory()
+    done(memory, pick, place)
+    if other == "undone":  # it changed nothing: that pick missed
+        memory.chose(pick, place)
+        assert [reach for _, reach in memory.avoid(changed=False)] == [MISSED, PUT_DOWN]
+        return
+    again = (pick + away, place) if other == "pick" else (pick, place + away)
+    assert done(memory, *again) == []
 
 
 @pytest.fixture
