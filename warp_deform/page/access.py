@@ -9,23 +9,43 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 
-__all__ = ["FILES", "HEADERS", "Access", "Answer", "new_token", "static_file"]
+__all__ = ["FILES", "HEADERS", "Access", "Answer", "StaticFile", "new_token"]
 
-_HTML, _CSS, _SCRIPT = "text/html; charset=utf-8", "text/css", "text/javascript; charset=utf-8"
-_MODULES = ("page", "connection", "scene", "shadows", "topdown", "playback", "pointer", "panel",
-            "heat", "view")  # fmt: skip
-FILES = {
-    "": ("index.html", _HTML),
-    "page.css": ("page.css", _CSS),
-    "view.css": ("view.css", _CSS),
-    "three.js": ("three.js", _SCRIPT),
-    **{f"{name}.js": (f"{name}.js", _SCRIPT) for name in _MODULES},
+_KINDS = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css",
+    "js": "text/javascript; charset=utf-8",
 }
-"""What is served, by the rest of the path behind the token: a file's name and its type."""
+
+
+@dataclass(frozen=True)
+class StaticFile:
+    """A file that is served, of the folder `static` of a package."""
+
+    name: str
+    package: str = __package__
+
+    @property
+    def kind(self) -> str:
+        """What a browser is told that it is."""
+        return _KINDS[self.name.rpartition(".")[2]]
+
+    def read(self) -> bytes:
+        """Its bytes."""
+        return files(self.package).joinpath("static", self.name).read_bytes()
+
+
+_MODULES = ("three", "page", "connection", "scene", "shadows", "topdown", "playback", "pointer",
+            "panel", "heat", "view")  # fmt: skip
+FILES: Mapping[str, StaticFile] = {
+    name: StaticFile(name)
+    for name in ("page.css", "view.css", *(f"{module}.js" for module in _MODULES))
+}
+"""What is served to every session's page, by the rest of the path behind the token."""
 
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -48,18 +68,12 @@ class Answer:
     """What a request gets: a status, and with 200 a file; 101 lets it become a WebSocket."""
 
     status: int
-    file: str = ""
-    kind: str = "text/plain"
+    file: StaticFile | None = None
 
 
 def new_token() -> str:
     """A secret for one run of the server."""
     return secrets.token_urlsafe(16)
-
-
-def static_file(name: str) -> bytes:
-    """The bytes of one of the page's files."""
-    return files(__package__).joinpath("static", name).read_bytes()
 
 
 @dataclass(frozen=True)
@@ -68,10 +82,12 @@ class Access:
 
     Attributes:
         port: that it listens on
+        files: all that is served
     """
 
     port: int
     token: str = field(default_factory=new_token, repr=False)
+    files: Mapping[str, StaticFile] = field(default_factory=lambda: FILES, repr=False)
 
     @property
     def hosts(self) -> tuple[str, ...]:
@@ -109,4 +125,4 @@ class Access:
             return Answer(404)
         if upgrade:
             return Answer(101 if rest == SOCKET else 404)
-        return Answer(200, *FILES[rest]) if rest in FILES else Answer(404)
+        return Answer(200, self.files[rest]) if rest in self.files else Answer(404)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from ..worlds.loop import EpisodeRun
 from ..worlds.spaces import check_action
 from ..worlds.state import WorldState
 from ..worlds.worlds import Worlds
+from .access import StaticFile
 from .contest import Contest, Standing
 from .drawing import (
     FRAMES_A_SECOND,
@@ -58,7 +59,7 @@ class PlaySession:
         acted: who chose each of its actions
     """
 
-    page = "index.html"
+    files: Mapping[str, StaticFile] = {"": StaticFile("index.html")}
     verbs: Verbs = {
         "act": {"pick": list, "place": list, "turn": float, "lift": float},
         "probe": {"xy": list, "turn": float},

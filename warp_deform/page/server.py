@@ -14,26 +14,28 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import InputError, WarpDeformError
 from ..support.extras import install_extra
-from .access import FILES, HEADERS, Access, static_file
+from .access import FILES, HEADERS, Access, StaticFile
 from .wire import MOST_BYTES, Job, NotUnderstoodError, Verbs, pack, parse_job
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
-__all__ = ["Post", "Served", "Session", "listen", "serve_until_interrupted"]
+__all__ = ["Post", "Served", "Session", "listen", "serve_until_interrupted", "serving"]
 
 MOST_JOBS = 16
 """Jobs that wait for the simulation; further ones are refused."""
 MOST_MESSAGES = 16
 """Messages that wait for one tab; a tab that does not read them is cut off."""
 MOST_TABS = 8
+_LAST_MESSAGES = 1.0
+"""Time for tabs to take the last messages before the server ends [s]."""
 _NOT_UNDERSTOOD, _TOO_MANY = 1003, 1013
 
 
@@ -47,8 +49,8 @@ class Post(Protocol):
 class Session(Protocol):
     """What a page shows and does; every method is called by one thread."""
 
-    page: str
-    """The HTML file that is served at the address itself."""
+    files: Mapping[str, StaticFile]
+    """What is served beside `access.FILES`; "" is what is served at the address itself."""
     verbs: Verbs
     """What a page may ask for."""
     stop: threading.Event
@@ -74,9 +76,9 @@ class _Tab:
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """A job and whose it is; None asks for the greeting."""
+    """A job and whose it is: None is the program itself; no job asks for the greeting."""
 
-    tab: _Tab
+    tab: _Tab | None
     job: Job | None
 
 
@@ -102,10 +104,19 @@ class Served:
         self._thread.start()
 
     async def close(self) -> None:
-        """Let the job in hand end, and the thread."""
+        """Let the job in hand end, and the thread; tabs have a moment for what was said last."""
         self._session.stop.set()
         self._jobs.put(None)
         await asyncio.to_thread(self._thread.join, 10.0)
+        sent = [asyncio.create_task(tab.waiting.join()) for tab in self._tabs]
+        if sent:
+            await asyncio.wait(sent, timeout=_LAST_MESSAGES)
+        for each in sent:
+            each.cancel()
+
+    def tell(self, job: Job) -> None:
+        """Have the session do a job of the program's own; from any thread, in their order."""
+        self._in_loop(self._ask, _Asked(None, job))
 
     def request(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to an HTTP request; None lets it become a WebSocket."""
@@ -121,9 +132,9 @@ class Served:
         )
         if answer.status == 101:
             return None
-        name = answer.file if answer.file != FILES[""][0] else self._session.page
-        body = static_file(name) if answer.status == 200 else b""
-        told = {**HEADERS, "Content-Type": answer.kind, "Content-Length": str(len(body))}
+        body = answer.file.read() if answer.file else b""
+        kind = answer.file.kind if answer.file else "text/plain"
+        told = {**HEADERS, "Content-Type": kind, "Content-Length": str(len(body))}
         phrase = http.HTTPStatus(answer.status).phrase
         return Response(answer.status, phrase, Headers(told), body)
 
@@ -168,7 +179,7 @@ class Served:
         return True
 
     def _ask(self, asked: _Asked) -> None:
-        self._waiting += asked.job is not None
+        self._waiting += asked.tab is not None and asked.job is not None
         self._jobs.put(asked)
 
     def _work(self) -> None:
@@ -193,7 +204,8 @@ class Served:
             self._session.do(asked.job, post)
         except WarpDeformError as error:
             post(_note(str(error)), everyone=False)
-        self._in_loop(self._done)
+        if asked.tab is not None:
+            self._in_loop(self._done)
 
     def _in_loop(self, call: Callable[..., Any], *arguments: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed: nobody listens any more
@@ -231,6 +243,7 @@ class Served:
 async def _send(tab: _Tab) -> None:
     while True:
         await tab.connection.send(await tab.waiting.get())
+        tab.waiting.task_done()
 
 
 def _note(text: str) -> bytes:
@@ -272,7 +285,8 @@ async def serving(session: Session, bound: socket.socket) -> AsyncIterator[Serve
     """Serve a session on a socket of `listen`."""
     from websockets.asyncio.server import serve
 
-    served = Served(session, Access(bound.getsockname()[1]))
+    access = Access(bound.getsockname()[1], files={**FILES, **session.files})
+    served = Served(session, access)
     async with serve(
         served.handle,
         sock=bound,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -18,6 +19,7 @@ from ..rendering.pixels import BOUNDS
 from ..tasks.registry import task as find_task
 from ..worlds.state import WorldState
 from ..worlds.worlds import Worlds
+from .access import StaticFile
 from .drawing import (
     FRAMES_A_SECOND,
     arm_arrays,
@@ -104,7 +106,7 @@ class _Replay:
 class ViewSession:
     """Episodes of a source; see `server.Session`. What a page opens is its own affair."""
 
-    page = "view.html"
+    files: Mapping[str, StaticFile] = {"": StaticFile("view.html")}
     verbs: Verbs = {
         "thumbnails": {"keys": list},
         "open": {"key": int, "side": int},

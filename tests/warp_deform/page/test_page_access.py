@@ -6,9 +6,10 @@ import re
 
 import pytest
 
-from warp_deform.page.access import FILES, HEADERS, Access, static_file
+from warp_deform.page.access import FILES, HEADERS, Access, StaticFile
 
-ACCESS = Access(4321, "secret-token")
+PAGES = {"": StaticFile("index.html")}
+ACCESS = Access(4321, "secret-token", {**FILES, **PAGES})
 HOST, ORIGIN = ("127.0.0.1:4321",), ("http://127.0.0.1:4321",)
 
 
@@ -68,22 +69,22 @@ def test_tokens_are_long_and_never_the_same():
 
 def test_every_file_is_there_and_names_no_other_host():
     """Scripts and styles are ours alone: the policy allows nothing inline and nobody else."""
-    for name, _ in FILES.values():
-        text = static_file(name).decode()
-        if name != "three.js":
+    for file in (*FILES.values(), StaticFile("index.html"), StaticFile("view.html")):
+        text = file.read().decode()
+        if file.name != "three.js":
             assert not re.search(
                 r"https?://|\bstyle=|\bon\w+=\"|\beval\(|new Function|innerHTML", text
             )
     for page in ("index.html", "view.html"):
-        named = re.findall(r'(?:src|href)="([^"]+)"', static_file(page).decode())
+        named = re.findall(r'(?:src|href)="([^"]+)"', StaticFile(page).read().decode())
         assert named and set(named) <= {*FILES, "data:,"}
     modules = {
         m
-        for name, _ in FILES.values()
-        for m in re.findall(rb'from "\./([^"]+)"', static_file(name))
+        for file in FILES.values()
+        for m in re.findall(rb'from "\./([^"]+)"', file.read())
     }
     assert {module.decode() for module in modules} | {"page.js", "view.js"} == {
         n for n in FILES if n.endswith(".js")
     }
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
-    assert static_file("three.LICENSE").startswith(b"The MIT License")
+    assert StaticFile("three.LICENSE").read().startswith(b"The MIT License")

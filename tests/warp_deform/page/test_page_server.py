@@ -12,6 +12,7 @@ from fixtures.page_server import hear, serve_page
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from warp_deform.errors import InputError
+from warp_deform.page.access import StaticFile
 from warp_deform.page.server import MOST_JOBS, MOST_MESSAGES, MOST_TABS, listen
 from warp_deform.page.wire import pack
 
@@ -19,7 +20,7 @@ from warp_deform.page.wire import pack
 class Counter:
     """A session that counts."""
 
-    page = "index.html"
+    files = {"": StaticFile("index.html")}
     verbs = {"add": {"number": int}, "big": {}, "wait": {}}
 
     def __init__(self):
