@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable
 from typing import TextIO
@@ -13,13 +12,14 @@ from warp_deform.errors import InputError, WarpDeformError
 
 from ..arm.pick_place import PickPlaceAction
 from ..episodes.episode import Observation
-from ..episodes.operators import Answer, Proposal
+from ..episodes.operators import Answer, Proposal, described
 from ..vision.overlay import draw_action
 from ..vision.top_down_view import TopDownView
 from .choosers import tangent_at
 
 __all__ = [
     "HumanChooser",
+    "Show",
     "TerminalOperator",
     "ViewPixel",
     "click_pick_and_place",
@@ -28,6 +28,8 @@ __all__ = [
 
 ViewPixel = tuple[float, float]
 """Row and column in the view from above [px]."""
+Show = Callable[[np.ndarray, TopDownView], tuple[ViewPixel, ViewPixel] | None]
+"""Shows the enlarged view; returns the pixels of pick and place, None to stop."""
 
 
 class TerminalOperator:
@@ -46,19 +48,9 @@ class TerminalOperator:
 
     def confirm(self, proposal: Proposal) -> Answer:
         """Show what is proposed and wait for an answer."""
-        action = proposal.action
-        if action is None:
-            text = "the arm goes to its home pose"
-        else:
-            turn = math.degrees(action.place_yaw - action.pick_yaw)
-            heights = ", ".join(f"{name} {T[2, 3]:.3f}" for name, T in proposal.poses.items())
-            text = (
-                f"action {proposal.number}: pick {_xy(action.pick_xy)} at "
-                f"{math.degrees(action.pick_yaw):.0f} deg, place {_xy(action.place_xy)} "
-                f"turned by {turn:.0f} deg; z [m]: {heights}"
-            )
-            if proposal.picture is not None:
-                text += f"\n  drawn in {proposal.picture}"
+        text = described(proposal)
+        if proposal.picture is not None:
+            text += f"\n  drawn in {proposal.picture}"
         answers = {"": Answer.DO, "s": Answer.SKIP, "q": Answer.STOP}
         while True:
             reply = self._ask(f"{text}\n  Enter: do it, s: another, q: stop > ").strip().lower()
@@ -100,10 +92,6 @@ def _prompt(text: str, source: TextIO | None = None) -> str:
     return line.rstrip("\n") if line else "q"
 
 
-def _xy(xy: tuple[float, float]) -> str:
-    return f"({xy[0]:.3f}, {xy[1]:.3f})"
-
-
 class HumanChooser:
     """A person shows where to pick and place; the fingers go across the cable there.
 
@@ -116,7 +104,7 @@ class HumanChooser:
 
     def __init__(
         self,
-        show: Callable[[np.ndarray, TopDownView], tuple[ViewPixel, ViewPixel] | None],
+        show: Show,
         *,
         view: TopDownView | None = None,
     ) -> None:

@@ -14,7 +14,7 @@ from ..episodes.goals import GoalMask
 from ..rig.config import AgentName
 from ..rig.rig import Rig
 from .choosers import PolicyChooser, RandomChooser, ScriptedChooser
-from .human import HumanChooser, click_pick_and_place, type_pick_and_place
+from .human import HumanChooser, Show, click_pick_and_place, type_pick_and_place
 
 __all__ = ["make_chooser"]
 
@@ -27,6 +27,7 @@ def make_chooser(
     seed: int,
     policy: Path | None = None,
     budget: int | None = None,
+    show: Show = click_pick_and_place,
 ) -> Chooser:
     """Return the chooser that `--agent` names.
 
@@ -37,6 +38,7 @@ def make_chooser(
         seed: of random draws
         policy: training run or snapshot, of the agent "policy" alone
         budget: simulated actions for each real one, of the agent "planner"; default: its own
+        show: where a person points, of the agent "human"; default: in a window
 
     Raises:
         InputError: an agent that needs what there is not
@@ -60,7 +62,7 @@ def make_chooser(
         config = PlannerConfig() if budget is None else PlannerConfig(budget=budget)
         return PlannerChooser(seed=seed, view=rig.view, config=config)
     if agent == "human":
-        return HumanChooser(click_pick_and_place, view=rig.view)
+        return HumanChooser(show, view=rig.view)
     if agent == "typed":
         return HumanChooser(type_pick_and_place, view=rig.view)
     assert_never(agent)

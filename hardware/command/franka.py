@@ -17,38 +17,33 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg, subcommand
 
-from warp_deform.command.main import CommandOptions, Outcome
+from warp_deform.command.main import Outcome
 from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
 from warp_deform.support.flag_range import FlagRange
 
-from ..rig.config import AgentName, RigConfig
+from ..rig.config import AgentName
 from .calibrate import CALIBRATE, CalibrateOptions
+from .capture import CaptureGoalOptions, capture_goal
 from .doctor import DoctorOptions, doctor
 from .emulate import EmulateOptions, emulate
 from .records import ReplayOptions, ScoreOptions, replay, score
+from .rig_options import RigOptions, operator_page
 
 if TYPE_CHECKING:
     from ..episodes.episode import EpisodeResult
     from ..episodes.goals import GoalMask
+    from ..page.operator import PageOperator
     from ..rig.rig import Rig
 
-__all__ = ["CaptureGoalOptions", "CollectOptions", "RunOptions", "franka"]
+__all__ = ["CollectOptions", "RunOptions", "franka"]
 
 _DRY_ACTIONS = 1
 """Nothing moves in a dry run, so every further action would be planned on the same picture."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _RigOptions(RigConfig, CommandOptions):
-    """Robot, camera and where their calibration is: what to open."""
-
-    auto: bool = False
-    """Do not ask before every action of a real arm."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunOptions(_RigOptions):
+class RunOptions(RigOptions):
     """Run one episode and record it.
 
     Nothing needs to be installed or prepared for `--robot sim`.
@@ -86,17 +81,6 @@ class CollectOptions(RunOptions):
     """Episodes to record."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CaptureGoalOptions(_RigOptions):
-    """Write the mask of the cable as it lies now, as a goal.
-
-    With --camera sim the simulated chain is laid along a curve first.
-    """
-
-    out: Annotated[Path, arg(metavar="FILE.png")]
-    """File for the mask. The camera's picture is written beside it."""
-
-
 _CALIBRATE = (
     "Measure the setup, in the order board, lens, table, camera. points or hand can take the place "
     "of camera. docs/hardware.md explains each step."
@@ -125,16 +109,18 @@ def _run(options: RunOptions) -> Outcome:
 
     folder = options.out or _next_folder(Path("franka-episodes"))
     clock = time.monotonic()
-    with open_rig(options) as rig:
-        result = _episode(options, rig, folder, seed=options.seed)
-    data = {**_described(options, result), "seconds": time.monotonic() - clock}
+    with operator_page(options, {"verb": "run", "agent": options.agent}) as page:
+        with open_rig(options) as rig:
+            result = _episode(options, rig, folder, page, seed=options.seed)
+        data = {**_described(options, result), "seconds": time.monotonic() - clock}
+        if page is not None:
+            page.over(_text(data))
     return Outcome(data=data, text=_text(data), failure=_failure(result))
 
 
 def _collect(options: CollectOptions) -> Outcome:
     from warp_deform.episodes import EpisodeWriter
 
-    from ..agents.human import TerminalOperator
     from ..recordings.pack import pack
     from ..rig.rig import open_rig
     from ..twin.camera import SimCamera
@@ -144,7 +130,10 @@ def _collect(options: CollectOptions) -> Outcome:
     live, writer = options.out / "live", EpisodeWriter(options.out)
     done: list[EpisodeResult] = []
     demonstrations = 0
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as opened, contextlib.ExitStack() as stack:
+        page = opened.enter_context(
+            operator_page(options, {"verb": "collect", "agent": options.agent})
+        )
         rig: Rig | None = None
         for number in range(options.episodes):
             seed = options.seed + number
@@ -154,12 +143,11 @@ def _collect(options: CollectOptions) -> Outcome:
                 rig = stack.enter_context(open_rig(replace(options, seed=seed)))
             if isinstance(rig.camera, SimCamera):
                 rig.camera.reseed(seed)
-            simulated = rig.toss is not None or options.auto
-            if not simulated and not TerminalOperator().wait(
-                f"episode {number + 1}: toss the cable"
-            ):
-                break
-            done.append(_episode(options, rig, _next_folder(live), seed=seed))
+            if rig.toss is None:
+                operator = options.operator(page, watched=True)
+                if not operator.wait(f"episode {number + 1}: toss the cable"):
+                    break
+            done.append(_episode(options, rig, _next_folder(live), page, seed=seed))
             if done[-1].error is not None:
                 break
             if not done[-1].outcomes:
@@ -170,16 +158,17 @@ def _collect(options: CollectOptions) -> Outcome:
                 demonstrations += 1
             else:
                 _say(f"{done[-1].folder} is not kept as a demonstration: {_why_not(done[-1])}")
-    data = {
-        "out": options.out,
-        "episodes": len(done),
-        "demonstrations": demonstrations,
-        "actions": sum(len(r.outcomes) for r in done),
-        "recordings": [r.folder for r in done],
-    }
-    text = (
-        f"{len(done)} episodes, {demonstrations} of them kept as demonstrations, in {options.out}"
-    )
+        data = {
+            "out": options.out,
+            "episodes": len(done),
+            "demonstrations": demonstrations,
+            "actions": sum(len(r.outcomes) for r in done),
+            "recordings": [r.folder for r in done],
+        }
+        kept = f"{demonstrations} of them kept as demonstrations"
+        text = f"{len(done)} episodes, {kept}, in {options.out}"
+        if page is not None:
+            page.over(text)
     return Outcome(data=data, text=text, failure=_failure(done[-1]) if done else None)
 
 
@@ -187,14 +176,15 @@ def _why_not(result: EpisodeResult) -> str:
     return "it begins where it ends" if result.score is None else "it did not reach its goal"
 
 
-def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> EpisodeResult:
+def _episode(
+    options: RunOptions, rig: Rig, folder: Path, page: PageOperator | None, *, seed: int
+) -> EpisodeResult:
     from warp_deform.support.revision import running_revision
 
-    from ..agents.human import TerminalOperator
+    from ..agents.human import click_pick_and_place
     from ..agents.make import make_chooser
     from ..episodes.episode import EpisodeConfig, run_episode
     from ..episodes.goals import write_picture
-    from ..episodes.operators import Unattended
     from ..recordings.recorder import EpisodeRecorder, RecorderConfig
 
     actions = options.max_actions
@@ -203,8 +193,22 @@ def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> Episo
     settings = EpisodeConfig(max_actions=actions, view=rig.view)
     goal = _goal(options, rig, seed)
     chooser = make_chooser(
-        options.agent, rig, goal, seed=seed, policy=options.policy, budget=options.budget
+        options.agent,
+        rig,
+        goal,
+        seed=seed,
+        policy=options.policy,
+        budget=options.budget,
+        show=click_pick_and_place if page is None else page.point,
     )
+
+    def say(line: str) -> None:
+        _say(line)
+        if page is not None:
+            page.say(line)
+
+    if page is not None:
+        page.begin(rig.calibration)
     described = RecorderConfig(
         robot_id=options.robot_id,
         camera_id=options.camera_id,
@@ -235,10 +239,11 @@ def _episode(options: RunOptions, rig: Rig, folder: Path, *, seed: int) -> Episo
             recorder=recorder,
             goal=mask,
             config=settings,
-            operator=TerminalOperator() if options.real and not options.auto else Unattended(),
+            operator=options.operator(page, watched=options.real),
             empty=rig.empty,
             toss=rig.toss,
-            say=_say,
+            say=say,
+            show=None if page is None else page.look,
         )
 
 
@@ -252,28 +257,6 @@ def _goal(options: RunOptions, rig: Rig, seed: int) -> GoalMask | None:
     if isinstance(options, CollectOptions):
         return None
     raise InputError("run needs --goal; capture one with `warp-deform franka capture-goal`")
-
-
-def _capture_goal(options: CaptureGoalOptions) -> Outcome:
-    import numpy as np
-
-    from ..episodes.goals import sampled_goal, write_goal
-    from ..rig.rig import open_rig
-    from ..vision.segmentation import segment_cable
-
-    with open_rig(options) as rig:
-        if rig.lay is not None:
-            targets = sampled_goal(options.seed, rig.view).targets
-            assert targets is not None
-            z = float(rig.calibration.table.height_m) + 0.003
-            rig.lay(np.column_stack([targets, np.full(len(targets), z)]))
-        view = rig.view.rectify(rig.camera.read().rgb, rig.calibration)
-        mask = segment_cable(view, empty=rig.empty)
-    if not mask.any():
-        raise InputError("no cable is seen; lay it into the workspace, under even light")
-    beside = write_goal(options.out, mask, view)
-    data = {"goal": options.out, "view": beside, "pixels": int(np.count_nonzero(mask))}
-    return Outcome(data=data, text=f"{data['pixels']} px of cable: {options.out}, {beside}")
 
 
 def _say(line: str) -> None:
@@ -323,7 +306,7 @@ def _failure(result: EpisodeResult) -> str | None:
 _VERBS: dict[type, Callable[[Any], Outcome]] = {
     DoctorOptions: doctor,
     **CALIBRATE,
-    CaptureGoalOptions: _capture_goal,
+    CaptureGoalOptions: capture_goal,
     CollectOptions: _collect,
     RunOptions: _run,
     ReplayOptions: replay,

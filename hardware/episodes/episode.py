@@ -162,6 +162,7 @@ def run_episode(
     empty: np.ndarray | None = None,
     toss: Callable[[int], None] | None = None,
     say: Callable[[str], None] = lambda line: None,
+    show: Callable[[Frame, Observation, np.ndarray], None] | None = None,
 ) -> EpisodeResult:
     """Run an episode; the recorder is finished afterwards.
 
@@ -177,6 +178,7 @@ def run_episode(
         empty: the view of the foam without a cable, (H, W, 3) uint8, see `segment_cable`
         toss: tosses a simulated cable again, given how often it was; see the module
         say: takes what goes on, a line each time
+        show: takes what is seen before every action, and the view with the masks' outlines
 
     Raises:
         InputError: goal and view differ in size, or the calibration belongs to another home pose
@@ -197,6 +199,7 @@ def run_episode(
         empty,
         toss,
         say,
+        show,
     )
     robot.begin_episode()
     chooser.reset()
@@ -233,6 +236,7 @@ class _Episode:
     empty: np.ndarray | None
     toss: Callable[[int], None] | None
     say: Callable[[str], None]
+    show: Callable[[Frame, Observation, np.ndarray], None] | None
     masks: list[np.ndarray] = field(default_factory=list)
     outcomes: list[PickPlaceOutcome] = field(default_factory=list)
 
@@ -306,7 +310,10 @@ class _Episode:
         return 0.0 if self.goal is None else score_masks([mask], self.goal).iou[0]
 
     def _record(self, frame: Frame, seen: Observation) -> None:
-        iou = self.recorder.observe(frame, seen.view, seen.mask, overlay=self._drawn(seen, None))
+        drawn = self._drawn(seen, None)
+        iou = self.recorder.observe(frame, seen.view, seen.mask, overlay=drawn)
+        if self.show is not None:
+            self.show(frame, seen, drawn)
         score = "" if iou is None else f", overlap {iou:.3f}"
         self.say(f"after {seen.index} actions: {np.count_nonzero(seen.mask)} px of cable{score}")
 

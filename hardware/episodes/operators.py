@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -16,7 +17,7 @@ from ..arm.pick_place import PickPlaceAction
 from ..arm.robot import MotionError, ReflexError, SafetyViolation
 from ..arm.safe_robot import SafeRobot
 
-__all__ = ["Answer", "Operator", "Proposal", "Unattended", "until_cleared"]
+__all__ = ["Answer", "Operator", "Proposal", "Unattended", "described", "until_cleared"]
 
 T = TypeVar("T")
 
@@ -49,8 +50,26 @@ class Proposal:
     picture: Path | None = None
 
 
+def described(proposal: Proposal) -> str:
+    """A line that says what is proposed."""
+    action = proposal.action
+    if action is None:
+        return "the arm goes to its home pose"
+    turn = math.degrees(action.place_yaw - action.pick_yaw)
+    heights = ", ".join(f"{name} {T[2, 3]:.3f}" for name, T in proposal.poses.items())
+    return (
+        f"action {proposal.number}: pick {_xy(action.pick_xy)} at "
+        f"{math.degrees(action.pick_yaw):.0f} deg, place {_xy(action.place_xy)} "
+        f"turned by {turn:.0f} deg; z [m]: {heights}"
+    )
+
+
+def _xy(xy: tuple[float, float]) -> str:
+    return f"({xy[0]:.3f}, {xy[1]:.3f})"
+
+
 class Operator(Protocol):
-    """Whoever watches the robot."""
+    """Whoever watches the robot: a person at a terminal, at a page, or nobody."""
 
     attends: bool
     """Whether a person answers. What a person has cleared is no recovery without an operator."""
@@ -61,6 +80,10 @@ class Operator(Protocol):
 
     def go_on(self, problem: WarpDeformError) -> bool:
         """Whether the cause of a problem is cleared and the episode may go on."""
+        ...
+
+    def wait(self, text: str) -> bool:
+        """Wait for something to be done by hand; False where the operator stops instead."""
         ...
 
 
@@ -76,6 +99,10 @@ class Unattended:
     def go_on(self, problem: WarpDeformError) -> bool:
         """Only after a reflex."""
         return isinstance(problem, ReflexError)
+
+    def wait(self, text: str) -> bool:
+        """Go on: nobody does anything by hand."""
+        return True
 
 
 def until_cleared(

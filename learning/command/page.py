@@ -2,48 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from warp_deform.command.main import CommandOptions, Outcome
+from warp_deform.command.main import Outcome
+from warp_deform.command.page_options import PageOptions
 from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
 from warp_deform.robots import RobotName
-from warp_deform.support.flag_range import SEED, FlagRange
+from warp_deform.support.flag_range import SEED
 from warp_deform.tasks.registry import task as find_task
 
-__all__ = ["PageOptions", "PlayOptions", "ViewOptions", "play", "view"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PageOptions(CommandOptions):
-    """Where the page is served."""
-
-    port: Annotated[int, arg(metavar="P"), FlagRange(0, 65535)] = 0
-    """Port of the loopback interface; 0 takes any that is free."""
-    browser: bool = False
-    """Open the page in this machine's browser."""
-
-    def opener(self) -> Callable[[str], object] | None:
-        """What opens an address, where that was asked for.
-
-        Raises:
-            InputError: this machine has no browser that Python knows of.
-        """
-        if not self.browser:
-            return None
-        import webbrowser
-
-        try:
-            return webbrowser.get().open
-        except webbrowser.Error as error:
-            raise InputError(
-                "no browser was found; leave --browser out and open the address by hand"
-            ) from error
+__all__ = ["PlayOptions", "ViewOptions", "play", "view"]
 
 
 @dataclass(frozen=True, kw_only=True)

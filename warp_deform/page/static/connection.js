@@ -19,7 +19,8 @@ export function unpack(buffer) {
 
 /**
  * Keep a connection: `hear` is called with every message, `change` with "open" or, when it is lost,
- * "lost" (the server may come back) or "gone" (it answers, and does not know this address any more).
+ * "lost" (the server may come back) or "gone" (it answers, and does not know this address any more);
+ * where it returns false, nobody tries again.
  */
 export function connect(hear, change) {
   const here = location.href.split(/[?#]/)[0];
@@ -31,8 +32,7 @@ export function connect(hear, change) {
     socket.onmessage = event => hear(unpack(event.data));
     socket.onclose = async () => {
       const answer = await fetch(here, {cache: "no-store"}).catch(() => null);
-      change(answer && !answer.ok ? "gone" : "lost");
-      setTimeout(open, 1000);
+      if (change(answer && !answer.ok ? "gone" : "lost") !== false) setTimeout(open, 1000);
     };
   };
   open();

@@ -2,8 +2,8 @@
 
 const SCALE = 3; // canvas pixels a pixel of the picture
 
-/** A picture from PNG bytes. */
-export const decode = bytes => createImageBitmap(new Blob([bytes], {type: "image/png"}));
+/** A picture from PNG bytes, or from those of another type. */
+export const decode = (bytes, type = "image/png") => createImageBitmap(new Blob([bytes], {type}));
 
 export class TopDown {
   constructor(canvas) {
