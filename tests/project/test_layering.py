@@ -58,7 +58,7 @@ FLOORS = {
     ],
     "hardware": [
         "command",
-        "measuring",
+        "measuring page",
         "agents",
         "rig episodes",
         "twin recordings",
