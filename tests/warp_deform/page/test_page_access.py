@@ -78,11 +78,7 @@ def test_every_file_is_there_and_names_no_other_host():
     for page in ("index.html", "view.html"):
         named = re.findall(r'(?:src|href)="([^"]+)"', StaticFile(page).read().decode())
         assert named and set(named) <= {*FILES, "data:,"}
-    modules = {
-        m
-        for file in FILES.values()
-        for m in re.findall(rb'from "\./([^"]+)"', file.read())
-    }
+    modules = {m for file in FILES.values() for m in re.findall(rb'from "\./([^"]+)"', file.read())}
     assert {module.decode() for module in modules} | {"page.js", "view.js"} == {
         n for n in FILES if n.endswith(".js")
     }
