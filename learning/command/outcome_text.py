@@ -30,6 +30,11 @@ def trained(report: Mapping[str, Any], *, out: Path) -> str:
         "learnt from": _count(report["demos"], "demonstration"),
         "steps": f"{steps}, as planned" if steps == planned else f"{steps} of up to {planned}",
     }
+    if report["corrected"]:
+        lines["learnt from"] = (
+            f"{_count(report['demos'] - report['corrected'], 'demonstration')} and "
+            f"{_count(report['corrected'], 'corrected episode')}, {report['labels']} labels in all"
+        )
     if report["left_out"]:
         lines["learnt from"] += f"; {_count(report['left_out'], 'recording')} left out as none"
     validation = report["validation"]

@@ -11,13 +11,14 @@ import copy
 import os
 import secrets
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from warp_deform.episodes import Episode, EpisodeReader, episode_name, read_index
+from warp_deform.episodes.corrected import is_corrected, labels_of
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
 
@@ -40,9 +41,10 @@ class Transition(NamedTuple):
     Attributes:
         color: before the action (H, W, 3) uint8
         height: before the action (H, W) float32 [m]
-        goal_color: at the end of the demonstration, which counts as its goal (H, W, 3) uint8
-        goal_height: at the end of the demonstration (H, W) float32 [m]
-        action: (7,) float64 pick x, y, yaw, place x, y, yaw, lift [m, rad]
+        goal_color: at the end of the demonstration, which counts as its goal (H, W, 3) uint8; of a
+            corrected episode its own goal
+        goal_height: the same as heights (H, W) float32 [m]
+        action: what is to be learnt (7,) float64 pick x, y, yaw, place x, y, yaw, lift [m, rad]
     """
 
     color: np.ndarray
@@ -93,8 +95,12 @@ class Demonstrations:
     are solved. Imported ones that do not count, and those without an action, are left out
     (`left_out` says how many).
 
+    Corrected episodes (`warp_deform.episodes.corrected`) count whether they are solved or not.
+    Their transitions are the states that have a label, with the label for an action; their goal is
+    the one that the teacher went for, not their end.
+
     Args:
-        folder: what `warp-deform demo` wrote
+        folder: what `warp-deform demo` or `warp-deform correct` wrote
         task: the task that must be in it
         count: demonstrations to learn from; None takes all but the spare ones
         seed: which ones, see `choose`
@@ -166,8 +172,14 @@ class Demonstrations:
             yield episode_name(seed), episode.actions
 
     def lengths(self) -> list[int]:
-        """Actions of every demonstration."""
+        """Actions, or labels, of every demonstration."""
         return [len(episode.actions) for episode in self._episodes]
+
+    @property
+    def corrected(self) -> int:
+        """How many of them are corrected episodes."""
+        names = (self._index[episode_name(seed)]["demonstrator"] for seed in self.seeds)
+        return sum(map(is_corrected, names))
 
     @property
     def state_size(self) -> int:
@@ -225,6 +237,8 @@ def _counts(entry: Mapping[str, Any]) -> bool:
     """Whether an episode, as the index has it, is a demonstration."""
     if entry["actions"] == 0:
         return False
+    if is_corrected(entry["demonstrator"]):
+        return True  # what is learnt from it is the teacher's
     if entry["demonstrator"] != _IMPORTED or entry["task"] in _IMPORTED_SOLVED:
         return bool(entry["success"])
     least = _IMPORTED_ABOVE.get(entry["task"])
@@ -238,9 +252,33 @@ def _open(reader: EpisodeReader, seed: int, path: Path) -> _Rows:
         if rows.dtype.names != _COLUMNS or rows.ndim != 1 or len(rows) < 2:
             raise ValueError("something else under this name")
     except (OSError, ValueError, EOFError):  # not made yet, or cut short by a full disk
-        _write(_rows(reader.read(seed)), path)
+        _write(_rows(_learnt(reader.read(seed), what=reader.path(seed))), path)
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     return _Rows(path, np.array(rows["action"][:-1]), np.array(rows["ground_truth"]))
+
+
+def _learnt(episode: Episode, *, what: Path) -> Episode:
+    """An episode as it is learnt from; of a corrected one the states with labels, then its goal.
+
+    Raises:
+        InputError: there is no label.
+    """
+    if not is_corrected(episode.info.demonstrator):
+        return episode
+    labels = labels_of(episode.info, what=what)
+    steps = [
+        replace(step, action=label)
+        for step, label in zip(episode.steps, labels, strict=False)
+        if label is not None
+    ]
+    if not steps:
+        raise InputError(f"{what} holds no label; remove it")
+    end = episode.steps[-1]
+    if episode.goal is not None:
+        half = len(end.ground_truth) // 2  # in the second one stands the goal's state
+        truth = np.concatenate([end.ground_truth[half:], end.ground_truth[half:]])
+        end = replace(end, color=episode.goal.color, height=episode.goal.height, ground_truth=truth)
+    return replace(episode, steps=(*steps, end))
 
 
 def _rows(episode: Episode) -> np.ndarray:

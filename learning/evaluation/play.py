@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,14 +12,14 @@ from warp_deform.envs.wrappers import stage_at
 from warp_deform.episodes import Goal
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.task import Stage
-from warp_deform.worlds.loop import SOLVED, EpisodeRun, play
+from warp_deform.worlds.loop import SOLVED, Act, EpisodeRun, play
 from warp_deform.worlds.worlds import Worlds
 
 from ..policy.policy import ImagePolicy, Policy, RetryingPolicy, StatePolicy
 from .failures import bag_opening, failure
 from .protocol import Protocol
 
-__all__ = ["Measures", "PlayedEpisode", "goal_distance", "play_policy"]
+__all__ = ["Measures", "PlayedEpisode", "acting", "goal_distance", "play_policy"]
 
 
 @dataclass(frozen=True)
@@ -68,30 +68,7 @@ def play_policy(
         goals: by seed, see `protocol.goals_of`; None: every seed constructs its own
         watch: called with a slot, what is seen there, and the action chosen
     """
-    stages: dict[int, Stage | None] = {}
-    players: dict[int, Policy] = {}
-
-    def act(
-        worlds: Worlds, runs: Mapping[int, EpisodeRun[Measures]]
-    ) -> dict[int, np.ndarray | None]:
-        """What the policy does in every slot, one picture at a time: no neighbour changes a bit."""
-        chosen: dict[int, np.ndarray | None] = {}
-        for slot, run in runs.items():
-            if not run.actions:
-                players[slot] = _player(policy, protocol)
-            if _failed_motion(run, protocol):
-                chosen[slot] = None
-                continue
-            seen = _observe(worlds, slot, state=isinstance(policy, StatePolicy))
-            action = players[slot].act(seen, rng=run.rng)
-            if protocol.stage_rule == "privileged":
-                before = stages.get(slot) if run.actions else None
-                stage = stages[slot] = stage_at(worlds, slot, action[:6], before)
-                action[6] = stage.lift
-            if watch is not None:
-                watch(slot, seen, action)
-            chosen[slot] = action
-        return chosen
+    act = acting(policy, protocol, watch=watch)
 
     def measure(worlds: Worlds, slot: int) -> Measures:
         episode, distance = worlds.episodes[slot], None
@@ -118,7 +95,44 @@ def play_policy(
         yield slot, played, run
 
 
-def _failed_motion(run: EpisodeRun[Measures], protocol: Protocol) -> bool:
+def acting(
+    policy: ImagePolicy | StatePolicy,
+    protocol: Protocol,
+    *,
+    watch: Callable[[int, Mapping[str, np.ndarray], np.ndarray], None] | None = None,
+) -> Act[Any]:
+    """Who acts by a policy in `worlds.loop.play`, as a protocol has it.
+
+    Args:
+        watch: called with a slot, what is seen there, and the action chosen
+    """
+    stages: dict[int, Stage | None] = {}
+    players: dict[int, Policy] = {}
+
+    def act(worlds: Worlds, runs: Mapping[int, EpisodeRun[Any]]) -> dict[int, np.ndarray | None]:
+        """What the policy does in every slot, one picture at a time: no neighbour changes a bit."""
+        chosen: dict[int, np.ndarray | None] = {}
+        for slot, run in runs.items():
+            if not run.actions:
+                players[slot] = _player(policy, protocol)
+            if _failed_motion(run, protocol):
+                chosen[slot] = None
+                continue
+            seen = _observe(worlds, slot, state=isinstance(policy, StatePolicy))
+            action = players[slot].act(seen, rng=run.rng)
+            if protocol.stage_rule == "privileged":
+                before = stages.get(slot) if run.actions else None
+                stage = stages[slot] = stage_at(worlds, slot, action[:6], before)
+                action[6] = stage.lift
+            if watch is not None:
+                watch(slot, seen, action)
+            chosen[slot] = action
+        return chosen
+
+    return act
+
+
+def _failed_motion(run: EpisodeRun[Any], protocol: Protocol) -> bool:
     """Whether an episode is over for an action that the arm could not carry out."""
     unreachable = run.outcomes[-1:] == [Outcome.UNREACHABLE.value]
     return protocol.motions_must_succeed and unreachable

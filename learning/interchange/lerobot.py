@@ -28,6 +28,7 @@ import pyarrow.parquet as pq
 
 from warp_deform import __version__
 from warp_deform.episodes import Episode, EpisodeReader
+from warp_deform.episodes.corrected import refuse_corrected
 from warp_deform.errors import InputError
 from warp_deform.support.progress import progress_bar
 
@@ -117,6 +118,7 @@ def export_lerobot(source: Path, target: Path) -> ConversionReport:
     """
     began = time.perf_counter()
     reader = EpisodeReader(source)
+    refuse_corrected(reader.infos(), folder=source, advice="this format has no place for labels")
     description = {"source": str(Path(source).resolve()), "to": "lerobot", "version": __version__}
     with new_folder(target, description=description) as folder:
         with progress_bar("lerobot", len(reader)) as advance, _Dataset(folder) as dataset:

@@ -21,6 +21,7 @@ import numpy as np
 
 from warp_deform import __version__
 from warp_deform.episodes import Episode, EpisodeReader, Step
+from warp_deform.episodes.corrected import refuse_corrected
 from warp_deform.errors import InputError
 from warp_deform.support.extras import install_extra
 from warp_deform.support.progress import progress_bar
@@ -57,6 +58,7 @@ def export_robomimic(source: Path, target: Path) -> ConversionReport:
     if target.suffix not in (".hdf5", ".h5"):
         raise InputError(f"{target} must end with .hdf5: robomimic keeps a dataset in one file")
     reader = EpisodeReader(source)
+    refuse_corrected(reader.infos(), folder=source, advice="this format has no place for labels")
     task = reader.info(reader.seeds[0]).task
     total = 0
     first: dict[str, tuple[int, ...]] = {}

@@ -31,6 +31,7 @@ from warp_deform.episodes import (
     combine_hashes,
     rebuild_index,
 )
+from warp_deform.episodes.corrected import refuse_corrected
 from warp_deform.episodes.enclosed import ENCLOSED
 from warp_deform.errors import InputError
 from warp_deform.planning import SearchConfig, lookahead_for, search
@@ -159,6 +160,7 @@ def seeds_by_task(source: Path, infos: Sequence[EpisodeInfo]) -> dict[tuple[str,
     Raises:
         InputError: they are no demonstrations.
     """
+    refuse_corrected(infos, folder=source, advice="refine demonstrations before correcting")
     groups: dict[tuple[str, str], list[int]] = {}
     for info in infos:
         if info.demonstrator == CONSTRUCTED:

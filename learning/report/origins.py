@@ -30,6 +30,7 @@ def origin(run: RunResult) -> dict[str, Any]:
         "variant": run.variant,
         "seed": run.seed,
         "steps": info["trained_steps"],
+        "labels": settings.get("labels"),
         "training_cpu_seconds": info.get("training_cpu_seconds") or None,
         "trained_by": settings.get("revisions"),
         "evaluated_by": info.get("revision"),

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from warp_deform.episodes.corrected import is_corrected
 from warp_deform.errors import InputError
 
 from ..runs.folder import RunFolder
@@ -93,9 +94,14 @@ def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
         parts.append(f"goals {info['goals']}")
     if info["robot"] != "ur5":
         parts.append(info["robot"])
-    names = settings["demonstrators"]
-    if names != ["scripted"]:
+    names = [name for name in settings["demonstrators"] if not is_corrected(name)]
+    if names and names != ["scripted"]:
         parts.append(f"{' and '.join(names)} demonstrations")
+    if settings.get("corrected"):
+        by = [name for name in settings["demonstrators"] if is_corrected(name)]
+        parts.append(f"{settings['corrected']} episodes {' and '.join(by)}")
+    if settings.get("start"):
+        parts.append("begun with trained weights")
     return ", ".join(parts)
 
 

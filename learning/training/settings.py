@@ -77,6 +77,9 @@ class TrainSettings(TrainMethod, _Trained):
 
     exact: bool = False
     """Use the original's operations, which are several times slower; see docs/learning.md."""
+    start: Annotated[Path | None, arg(metavar="RUN")] = None
+    """Begin with the weights of this run, those that `eval` chose or the last ones, instead of
+    random ones. Its agent must be the same."""
     hold_out: Annotated[int, arg(metavar="N"), COUNT_OR_NONE] = 0
     """Number of further demonstrations that are not learnt from. The snapshot with the lowest loss
     on them is used until `eval` chooses one."""

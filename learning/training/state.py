@@ -157,9 +157,13 @@ def claim(
     data: Demonstrations,
     *,
     processes: int,
+    start: str | None,
     write: bool,
 ) -> str:
     """Write the run's settings into its folder (if `write`); returns their digest.
+
+    Args:
+        start: digest of the weights that training begins with, None for random ones
 
     Raises:
         InputError: the folder holds another run.
@@ -178,6 +182,7 @@ def claim(
         "device": config.device,
         "demonstrations": dict(zip(map(str, data.seeds), data.seals, strict=True)),
         "versions": versions(),
+        **({} if start is None else {"start": start}),  # as runs had it before there was a choice
     }
     text = json.dumps(deciding, sort_keys=True)
     key = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -200,6 +205,8 @@ def claim(
     described = {
         "data": str(config.data),
         "left_out": data.left_out,
+        "labels": sum(data.lengths()),
+        "corrected": data.corrected,
         "demonstrators": names,
         "revisions": [asdict(running_revision())],
     }
@@ -213,7 +220,7 @@ def _compare(run: RunFolder, wanted: Mapping[str, Any], stored: Mapping[str, Any
         raise InputError(
             f"{run.path} is a shared policy, not trained further; choose another --out"
         )
-    for name, value in wanted.items():
+    for name, value in {"start": None, **wanted}.items():
         before = stored.get(name)
         if before == value:
             continue

@@ -33,13 +33,14 @@ from ..data.dataset import Demonstrations
 from ..models.gt_state import GtStateConfig
 from ..models.precision import has_bfloat16_units
 from ..models.transporter import PRESETS, Transporter
-from ..policy.policy import AGENTS, Agent, AgentDescription, make_agent
+from ..policy.policy import AGENTS, Agent, AgentDescription
 from ..runs.folder import RunFolder
 from ..runs.log import TrainingLog, load_tensorboard
 from .config import TrainConfig
 from .held_out import HeldOut
 from .processes import join_processes
 from .schedules import Schedule
+from .start import begin
 from .state import Trained, claim, on_cpu, state_steps
 from .validation import Validation
 
@@ -54,6 +55,9 @@ class TrainReport:
     """What was trained.
 
     Attributes:
+        demos: episodes that were learned from
+        corrected: how many of these are corrected episodes
+        labels: actions of demonstrations, and labels of corrected episodes, that were learned from
         left_out: recordings of the folder that are no demonstrations, see `dataset.Demonstrations`
         steps: taken in all, of planned_steps
         snapshots: the steps of which there are snapshots
@@ -71,6 +75,8 @@ class TrainReport:
     agent: str
     preset: str
     demos: int
+    corrected: int
+    labels: int
     left_out: int
     seed: int
     steps: int
@@ -112,14 +118,17 @@ def train(config: TrainConfig) -> TrainReport:
         check_lifts(data)
         plan = config.plan(len(data))
         description = _describe(config, data)
-        agent = make_agent(description, seed=config.seed).to(device)
+        agent, started = begin(config, description)
+        agent = agent.to(device)
         held_out = HeldOut(agent, data.spared(config.hold_out)) if config.hold_out else None
         validation = Validation(
             run, episodes=plan.validate, process=process, trained=data.seeds, task=config.task
         )
         if not run.settings.exists():
             _rehearse(config, data, agent, plan, device)
-        key = claim(run, config, plan, description, data, processes=world, write=rank == 0)
+        key = claim(
+            run, config, plan, description, data, processes=world, start=started, write=rank == 0
+        )
         process.wait()
 
         # Go on where a run was interrupted, perhaps while its last snapshot was validated
@@ -193,7 +202,7 @@ def train(config: TrainConfig) -> TrainReport:
                 if due:
                     advance.milestone()
         if config.untrained and rank == 0:
-            initial = dict(make_agent(description, seed=config.seed).named_parameters())
+            initial = dict(begin(config, description)[0].named_parameters())
             run.write_snapshot(0, on_cpu(initial), {"agent": asdict(description)})
         process.wait()
         steps = run.steps()
@@ -202,6 +211,8 @@ def train(config: TrainConfig) -> TrainReport:
             agent=config.agent,
             preset=config.preset,
             demos=len(data),
+            corrected=data.corrected,
+            labels=sum(data.lengths()),
             left_out=data.left_out,
             seed=config.seed,
             steps=steps[-1],

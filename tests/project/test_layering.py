@@ -50,7 +50,7 @@ FLOORS = {
         "page",
         "sweep",
         "report",
-        "training",
+        "training correction",
         "evaluation",
         "policy",
         "data",

@@ -104,6 +104,11 @@ VERBS: dict[str, Verb] = {
         "improve demonstrations by search",
         kept=f"episodes already written are complete, {_GOES_ON}",
     ),
+    "correct": Verb(
+        "learning.command.correct:correct",
+        "have a teacher label what a policy runs into",
+        kept=f"episodes already written are complete, {_GOES_ON}",
+    ),
     "bench": Verb("warp_deform.command.verbs:bench", "time the simulator, alone or beside a peer"),
     "gradcheck": Verb(
         "warp_deform.command.verbs:gradcheck", "compare derivatives with finite differences"
