@@ -48,7 +48,7 @@ FLOORS = {
     "learning": [
         "command",
         "page",
-        "sweep",
+        "sweep distillation",
         "report",
         "training correction",
         "evaluation",

@@ -109,6 +109,11 @@ VERBS: dict[str, Verb] = {
         "have a teacher label what a policy runs into",
         kept=f"episodes already written are complete, {_GOES_ON}",
     ),
+    "distill": Verb(
+        "learning.command.distill:distill",
+        "make a policy from nothing within a budget",
+        kept=f"what is done is kept, {_GOES_ON}",
+    ),
     "bench": Verb("warp_deform.command.verbs:bench", "time the simulator, alone or beside a peer"),
     "gradcheck": Verb(
         "warp_deform.command.verbs:gradcheck", "compare derivatives with finite differences"

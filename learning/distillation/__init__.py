@@ -1,0 +1,1 @@
+"""From nothing to a policy within a budget: demonstrations, training, corrections, choice, test."""
