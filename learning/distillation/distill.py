@@ -55,18 +55,25 @@ _FIRST_SHARE = 0.4
 class DistillConfig(DistillSettings):
     """The settings of a distillation, checked."""
 
-    agent: AgentName | str = "auto"  # type: ignore[assignment]
     progress: bool = True
     """Tell of it on stderr, see `warp_deform.support.progress`."""
 
     def __post_init__(self) -> None:
-        goal = find_task(self.task).goal_conditioned
-        if self.agent == "auto":
-            object.__setattr__(self, "agent", "goal-split" if goal else "transporter")
-        AgentDescription(task=self.task, agent=self.agent, config={})  # refuses what does not fit
+        AgentDescription(task=self.task, agent=self.learner, config={})  # refuses a misfit
         demonstrator(self.teacher)
         if not 0 < self.minutes < float("inf"):
             raise InputError(f"minutes is {self.minutes}; it must be a positive number")
+        if self.episodes < 1 or self.seed < 0:
+            raise InputError(
+                f"episodes is {self.episodes} and seed {self.seed}; they must be 1 and 0 or more"
+            )
+
+    @property
+    def learner(self) -> AgentName:
+        """The agent that is trained."""
+        if self.agent == "auto":
+            return "goal-split" if find_task(self.task).goal_conditioned else "transporter"
+        return self.agent
 
 
 def distill(config: DistillConfig) -> dict[str, Any]:
@@ -75,9 +82,8 @@ def distill(config: DistillConfig) -> dict[str, Any]:
     Returns `task`, `agent`, `teacher`, `seed`, `minutes` (the budget), `cpu_minutes` (of all but
     the test), `test_cpu_minutes`, `plan`, `stages` (`stage`, `cpu_seconds` and what it came to, in
     order), `demos`, `corrected` (episodes), `labels` (what the last training learned from), `run`
-    (its folder), `selected` (step of the snapshot), `test` (see `evaluation.summary.summarise`),
-    `measure` and `published` (the paper's best agent with 1,000 demonstrations is not meant here:
-    that of the same agent and number, mostly None).
+    (its folder), `selected` (step of the snapshot), `test` (see `evaluation.summary.summarise`) and
+    `measure` (what the paper's table shows for the task).
 
     Raises:
         InputError: the settings do not fit, the budget is too small, or the folder holds another
@@ -108,7 +114,7 @@ def distill(config: DistillConfig) -> dict[str, Any]:
     last = stages.done["last training"]
     return {
         "task": config.task,
-        "agent": config.agent,
+        "agent": config.learner,
         "teacher": config.teacher,
         "seed": config.seed,
         "minutes": config.minutes,
@@ -244,7 +250,7 @@ def _training(
     )
     return TrainConfig(
         task=config.task,
-        agent=cast(AgentName, config.agent),
+        agent=config.learner,
         data=data,
         out=out,
         preset="fast",
@@ -279,7 +285,7 @@ def _test(config: DistillConfig, plan: Plan, run: Path, stages: Stages) -> dict[
             workers=1,
             progress=config.progress,
         )
-        return {key: report[key] for key in ("selected", "test", "measure", "published")}
+        return {key: report[key] for key in ("selected", "test", "measure")}
 
     evaluated: dict[str, Any] = stages(TEST, tested, what=f"{config.episodes} test episodes")
     return evaluated
@@ -292,7 +298,7 @@ def _claim(out: Path, config: DistillConfig) -> dict[str, Any]:
         InputError: the folder holds something else.
     """
     path = out / "distill.json"
-    settings = asdict(config)
+    settings = {**asdict(config), "agent": config.learner}
     for name in ("out", "progress", "plan"):
         del settings[name]
     wanted = {"settings": settings, "versions": versions()}

@@ -98,7 +98,7 @@ def make_plan(minutes: float, costs: Costs, *, max_actions: int) -> Plan:
         >>> costs = Costs(start=30, demonstration=0.4, action=0.08, step=0.28)
         >>> plan = make_plan(60, costs, max_actions=20)
         >>> plan.demos, plan.round_steps, plan.round_episodes, plan.last_steps
-        (40, (1397, 1397, 1397), (64, 64, 64), 2798)
+        (40, (1401, 1401, 1401), (64, 64, 64), 2804)
         >>> plan.snapshots, plan.validation
         (4, 29)
     """

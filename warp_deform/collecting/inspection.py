@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..episodes import Episode, EpisodeReader, Step, combine_hashes
+from ..episodes import Episode, EpisodeReader, Step, combine_hashes, episode_name
+from ..episodes.corrected import is_corrected, labels_of
 from ..episodes.enclosed import ENCLOSED, enclosed_count
 from ..errors import InputError
 from ..rendering.pixels import SHAPE, TABLE_GRID, PixelGrid
@@ -25,6 +26,8 @@ _MIN_ROW_HEIGHT = 12 * _LINE
 _PAPER, _INK, _FAINT = (255, 255, 255), (25, 25, 25), (115, 115, 115)
 _GOOD, _BAD = (20, 120, 40), (200, 30, 30)
 _PICK, _ARROW = (255, 255, 255), (255, 225, 0)
+_LABEL, _LABEL_INK = (255, 90, 255), (160, 20, 160)
+"""What a teacher would have done, in the picture and beside it."""
 _SUBPIXEL_BITS = 4
 
 
@@ -121,8 +124,13 @@ def statistics(folder: Path) -> dict[str, Any]:
 def _draw_row(episode: Episode, t: int, *, top: float, scale: int) -> np.ndarray:
     step = episode.steps[t]
     color = _enlarge(step.color, scale)
+    label = None
     if step.action is not None:
         _draw_action(color, step.action, _grid(episode.info.task))
+        if is_corrected(episode.info.demonstrator):
+            label = labels_of(episode.info, what=episode_name(episode.info.seed))[t]
+    if label is not None:
+        _draw_action(color, label, _grid(episode.info.task), pick=_LABEL, arrow=_LABEL)
     panels = [color, _false_color(_enlarge(step.height, scale), top)]
     if episode.goal is not None:
         panels += [
@@ -132,7 +140,11 @@ def _draw_row(episode: Episode, t: int, *, top: float, scale: int) -> np.ndarray
     rows, columns = color.shape[:2]
     width = _GAP + _CAPTION_WIDTH + len(panels) * (columns + _GAP)
     canvas = np.full((max(rows, _MIN_ROW_HEIGHT) + _GAP, width, 3), _PAPER, np.uint8)
-    for line, (text, ink) in enumerate(_caption(step, t, last=episode.info.actions)):
+    caption = _caption(step, t, last=episode.info.actions)
+    if label is not None:
+        x, y, _, to_x, to_y, *_ = label
+        caption.append((f"teacher {x:.3f} {y:+.3f}, {to_x:.3f} {to_y:+.3f} m", _LABEL_INK))
+    for line, (text, ink) in enumerate(caption):
         _write(canvas, text, x=_GAP, y=(line + 1) * _LINE, ink=ink)
     for index, panel in enumerate(panels):
         left = _GAP + _CAPTION_WIDTH + index * (columns + _GAP)
@@ -183,7 +195,14 @@ def _grid(task: str) -> PixelGrid:
     return find_task(task).grid if is_known(task) else TABLE_GRID
 
 
-def _draw_action(color: np.ndarray, action: np.ndarray, grid: PixelGrid) -> None:
+def _draw_action(
+    color: np.ndarray,
+    action: np.ndarray,
+    grid: PixelGrid,
+    *,
+    pick: tuple[int, int, int] = _PICK,
+    arrow: tuple[int, int, int] = _ARROW,
+) -> None:
     """Draw pick, place and their yaws onto an image, (H, W, 3), that shows the workspace."""
     import cv2
 
@@ -195,19 +214,19 @@ def _draw_action(color: np.ndarray, action: np.ndarray, grid: PixelGrid) -> None
         fixed = fixed.clip(-(2**20), 2**20)  # far outside of the picture; OpenCV takes 32 bits
         return round(fixed[0]), round(fixed[1])
 
-    pick, place = to_pixel(action[0:2]), to_pixel(action[3:5])
-    length = math.dist(pick, place) / 2**_SUBPIXEL_BITS
+    start, end_point = to_pixel(action[0:2]), to_pixel(action[3:5])
+    length = math.dist(start, end_point) / 2**_SUBPIXEL_BITS
     # Twice, dark and wide below bright and narrow: the marks show on every background.
     for ink, width in ((_INK, 3), (None, 1)):
         style = {"thickness": width, "lineType": cv2.LINE_AA, "shift": _SUBPIXEL_BITS}
         for end, yaw in ((action[0:2], action[2]), (action[3:5], action[5])):
             stroke = 0.02 * np.array([math.cos(yaw), math.sin(yaw)])
-            cv2.line(color, to_pixel(end - stroke), to_pixel(end + stroke), ink or _PICK, **style)
-        cv2.circle(color, pick, 5 << _SUBPIXEL_BITS, ink or _PICK, **style)
-        arrow = {"thickness": width, "line_type": cv2.LINE_AA, "shift": _SUBPIXEL_BITS}
+            cv2.line(color, to_pixel(end - stroke), to_pixel(end + stroke), ink or pick, **style)
+        cv2.circle(color, start, 5 << _SUBPIXEL_BITS, ink or pick, **style)
+        head = {"thickness": width, "line_type": cv2.LINE_AA, "shift": _SUBPIXEL_BITS}
         if length > 0:
             tip = min(0.5, 9.0 / length)
-            cv2.arrowedLine(color, pick, place, ink or _ARROW, tipLength=tip, **arrow)
+            cv2.arrowedLine(color, start, end_point, ink or arrow, tipLength=tip, **head)
 
 
 def _enlarge(image: np.ndarray, scale: int) -> np.ndarray:

@@ -50,6 +50,7 @@ NEEDED = {
     "convert": ["d", "o", "--from", "deformable-ravens"],
     "train": [LINE, "--agent", "gt-mlp", "--data", "d", "--out", "r"], "eval": ["r"],
     "sweep": ["grid.toml"], "refine": ["d", "--out", "o"], "play": [LINE], "view": ["d"],
+    "correct": ["r", "--out", "o", "--teacher", "mpc"], "distill": [LINE, "--out", "o"],
 }  # fmt: skip
 
 

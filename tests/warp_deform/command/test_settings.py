@@ -13,7 +13,9 @@ from fixtures.places import ROOT
 
 from hardware.command.franka import RunOptions
 from hardware.rig.config import RigConfig
-from learning.command import refine, verbs
+from learning.command import correct, distill, refine, verbs
+from learning.correction.correct import CorrectConfig
+from learning.distillation.distill import DistillConfig
 from learning.evaluation import run as evaluation
 from learning.evaluation.settings import EvalSettings
 from learning.policy.policy import AGENTS
@@ -54,6 +56,7 @@ CHANGED: dict[str, tuple[list[str], Any]] = {
     "no_augment": ([], True),
     "exact": ([], True),
     "hold_out": (["8"], 8),
+    "start": (["before"], Path("before")),
     "threads": (["9"], 9),
     "tensorboard": ([], True),
 }
@@ -67,6 +70,8 @@ CHANGED: dict[str, tuple[list[str], Any]] = {
         (RunOptions, RigConfig),
         (verbs.EvalOptions, EvalSettings),
         (refine.RefineOptions, RefineConfig),
+        (correct.CorrectOptions, CorrectConfig),
+        (distill.DistillOptions, DistillConfig),
         (own_verbs.DemoOptions, CollectConfig),
         (own_verbs.GradcheckOptions, GradcheckConfig),
     ],
