@@ -19,6 +19,7 @@ import fcntl
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -47,6 +48,7 @@ __all__ = ["DistillConfig", "distill"]
 
 _TIMED_STEPS = 50
 """Steps by which the cost of one is measured: a line of the log."""
+_LOCK = "distill.lock"
 _FIRST_SHARE = 0.4
 """When the last training keeps its first snapshot, if it keeps several."""
 
@@ -203,12 +205,12 @@ def _learn(config: DistillConfig, plan: Plan, out: Path, stages: Stages, data: P
         folder, of = out / "rounds" / str(number), f"round {number} of {len(rounds)}"
         run, corrected = folder / "run", folder / "corrected"
         training = _training(config, data, run, steps=steps, start=before)
-        stages(f"training {number}", lambda t=training: _trained(t), what=f"{of}, {steps} steps")
+        stages(f"training {number}", partial(_trained, training), what=f"{of}, {steps} steps")
         by = CorrectConfig(
             run=run, data=data, out=corrected, teacher=config.teacher, episodes=episodes, workers=1
         )
         what = f"{of}, {episodes} episodes to correct"
-        said = stages(f"correction {number}", lambda c=by: _corrected(c), what=what)
+        said = stages(f"correction {number}", partial(_corrected, by), what=what)
         if not said["corrected"]:
             raise WarpDeformError(
                 f"{config.teacher} labels none of {episodes} episodes; choose another --teacher"
@@ -224,7 +226,7 @@ def _learn(config: DistillConfig, plan: Plan, out: Path, stages: Stages, data: P
         validate=plan.validation,
         start=before,
     )
-    stages("last training", lambda: _trained(training), what=what)
+    stages("last training", partial(_trained, training), what=what)
     return last
 
 
@@ -301,7 +303,7 @@ def _claim(out: Path, config: DistillConfig) -> dict[str, Any]:
     settings = {**asdict(config), "agent": config.learner}
     for name in ("out", "progress", "plan"):
         del settings[name]
-    wanted = {"settings": settings, "versions": versions()}
+    wanted: dict[str, Any] = {"settings": settings, "versions": versions()}
     if config.plan is not None:
         wanted["planned"] = asdict(read_plan(config.plan))
     wanted = json.loads(json.dumps(wanted))
@@ -313,9 +315,10 @@ def _claim(out: Path, config: DistillConfig) -> dict[str, Any]:
     stored = read_json(path)
     for key in ("settings", "versions", "planned"):
         if stored.get(key) != wanted.get(key):
-            name = _first_difference(stored.get(key), wanted.get(key))
-            raise InputError(f"{out} holds a distillation with another {name or key}; choose "
-                             "another --out")  # fmt: skip
+            what = _first_difference(stored.get(key), wanted.get(key)) or key
+            raise InputError(
+                f"{out} holds a distillation with another {what}; choose another --out"
+            )
     return stored
 
 
@@ -323,9 +326,6 @@ def _first_difference(a: Any, b: Any) -> str | None:
     if not (isinstance(a, dict) and isinstance(b, dict)):
         return None
     return next((key for key in sorted({*a, *b}) if a.get(key) != b.get(key)), None)
-
-
-_LOCK = "distill.lock"
 
 
 @contextlib.contextmanager

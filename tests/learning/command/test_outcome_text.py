@@ -19,6 +19,9 @@ from warp_deform.command.main import main
 
 TRAINED: dict[str, Any] = {
     "task": "cable-line-notarget", "agent": "goal-split", "preset": "fast", "demos": 10,
+    "corrected": 0,
+    "labels": 27,
+    "corrected": 0, "labels": 27,
     "left_out": 0, "seed": 0, "steps": 250, "planned_steps": 4000, "patience": None, "chosen": 250,
     "validation": {250: {"n_success": 20, "n_episodes": 20, "mean_score": 1.0}},
     "snapshots": (250,),
@@ -151,3 +154,9 @@ def test_an_interruption_says_what_is_kept(
         verb in {"demo", "goals", "train", "eval", "sweep", "refine"}
     )
     assert ("episode" in said) is (verb in {"demo", "refine", "franka"})
+
+
+def test_labels_are_counted_beside_demonstrations() -> None:
+    report = {**TRAINED, "demos": 30, "corrected": 20, "labels": 300}
+    said = trained(report, out=Path("runs/line"))
+    assert "10 demonstrations and 20 corrected episodes, 300 labels in all" in said

@@ -1,0 +1,158 @@
+"""Who should demonstrate: the same agent from as many demonstrations, made in five ways.
+
+    python benchmarks/refine_then_train.py [--tasks T...] [--ways W...] [--demos N...]
+                                           [--seeds S...] [--steps N] [--work FOLDER]
+                                           [--out FILE] [--list]
+
+A cell is a task, a way, a number of demonstrations and a seed of training. Agent, steps, validation
+and test are the same in all; so are the starts, where all ways solve them. `cem` and `gradient` are
+what `warp-deform refine --accept solved` makes of the scripted demonstrations; `mpc` and `planner`
+demonstrate themselves. Each finished cell is a line of OUT, and a cell with a line is left out: the
+command goes on after an interruption. Two processes may share WORK and OUT, with different tasks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from table import tested_by
+
+from learning.refinement.refine import RefineConfig, refine
+from learning.report.read import read_runs
+from learning.sweep import Collecting, SweepConfig, run_sweep
+from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.inspection import statistics
+from warp_deform.errors import WarpDeformError
+from warp_deform.planning import SearchConfig
+from warp_deform.support.revision import running_revision
+from warp_deform.tasks.registry import task as find_task
+
+RESULTS = Path("benchmarks/results/refine_then_train.jsonl")
+TASKS = ("cable-ring", "cable-shape", "fabric-flat-notarget", "bag-items-1")
+WAYS = ("scripted", "cem", "gradient", "mpc", "planner")
+REFINED = ("cem", "gradient")
+Cell = tuple[str, str, int, int]
+"""Task, way, demonstrations, seed of training."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
+    parser.add_argument("--demos", nargs="+", type=int, default=(10,))
+    parser.add_argument("--seeds", nargs="+", type=int, default=(0,))
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--episodes", type=int, help="of the test: 200, and 100 with bags")
+    parser.add_argument("--work", type=Path, default=Path("refine-then-train"))
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--list", action="store_true", help="only name what is left")
+    options = parser.parse_args()
+    grid = product(options.seeds, options.demos, options.tasks, options.ways)
+    left = missing(
+        [(task, way, demos, seed) for seed, demos, task, way in grid], options.steps, options.out
+    )
+    if options.list:
+        print("\n".join(map(name_of, left)))
+        return
+    failed = [cell for cell in left if not fill(cell, options)]
+    if failed:
+        sys.exit(f"{len(failed)} cells failed: {', '.join(map(name_of, failed))}")
+
+
+def name_of(cell: Cell) -> str:
+    """A cell in a word."""
+    return "-".join(map(str, cell))
+
+
+def missing(cells: Sequence[Cell], steps: int, out: Path) -> list[Cell]:
+    """Cells that can be made and have no line of results; no gradient leads bags anywhere."""
+    lines = out.read_text().splitlines() if out.exists() else []
+    rows = [json.loads(line) for line in lines]
+    done = {
+        (row["task"], row["way"], row["demos"], row["seed"])
+        for row in rows
+        if row["steps"] == steps
+    }
+    return [
+        cell
+        for cell in cells
+        if cell not in done and (cell[1] != "gradient" or find_task(cell[0]).has_loss())
+    ]
+
+
+def fill(cell: Cell, options: argparse.Namespace) -> bool:
+    """Make, train, evaluate and write down one cell; whether it went well."""
+    task, way, demos, seed = cell
+    work: Path = options.work / name_of(cell)
+    try:
+        folder = demonstrate(task, way, demos, options.work / "demos")
+        grid = SweepConfig(
+            out=work,
+            tasks=(task,),
+            agents=("goal-split" if find_task(task).goal_conditioned else "transporter",),
+            demos=(demos,),
+            seeds=(seed,),
+            preset="fast",
+            steps=options.steps,
+            patience=0,
+            demonstrations=Collecting(folder=folder.parent, count=demos),
+            evaluation=tested_by(task, options.episodes),
+        )
+        if run_sweep(grid, workers=1)["failed"]:
+            return False
+    except WarpDeformError as error:
+        print(f"{name_of(cell)}: {error}", file=sys.stderr)
+        return False
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with options.out.open("a") as file:
+        row = json.dumps(row_of(cell, options.steps, folder, work / "runs")) + "\n"
+        file.write(row)
+    print(row, end="")
+    return True
+
+
+def demonstrate(task: str, way: str, demos: int, root: Path) -> Path:
+    """A folder of the task's demonstrations made in this way; what is there is kept."""
+    made = root / (way if way not in REFINED else "scripted") / str(demos) / task
+    by: Any = "scripted" if way in REFINED else way
+    collected = collect(CollectConfig(task=task, episodes=demos, out=made, demonstrator=by))
+    if collected.successes < demos:
+        raise WarpDeformError(f"{by} solves {task} too seldom for {demos} demonstrations")
+    if way not in REFINED:
+        return made
+    refined = root / way / str(demos) / task
+    search = SearchConfig(method=way)
+    refine(RefineConfig(source=made, out=refined, accept="solved", search=search))
+    return refined
+
+
+def row_of(cell: Cell, steps: int, folder: Path, runs: Path) -> dict[str, Any]:
+    """What a cell came to."""
+    (run,), _ = read_runs([runs])
+    shown, test = statistics(folder), run.info["test"]
+    return {
+        **dict(zip(("task", "way", "demos", "seed"), cell, strict=True)),
+        "agent": run.agent,
+        "steps": steps,
+        "labels": shown["steps"],
+        "demonstrated_score": shown["mean_score"],
+        "n_success": test["n_success"],
+        "n_episodes": test["n_episodes"],
+        "score": test["mean_score"],
+        "score_error": test["standard_error"],
+        "value": test["paper_value"],
+        "selected": run.info["selected"],
+        "training_cpu_s": run.info["training_cpu_seconds"],
+        "validation": {k: each["n_success"] for k, each in run.info["snapshots"].items()},
+        "commit": running_revision().commit,
+    }
+
+
+if __name__ == "__main__":
+    main()
