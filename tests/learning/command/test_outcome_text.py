@@ -19,8 +19,6 @@ from warp_deform.command.main import main
 
 TRAINED: dict[str, Any] = {
     "task": "cable-line-notarget", "agent": "goal-split", "preset": "fast", "demos": 10,
-    "corrected": 0,
-    "labels": 27,
     "corrected": 0, "labels": 27,
     "left_out": 0, "seed": 0, "steps": 250, "planned_steps": 4000, "patience": None, "chosen": 250,
     "validation": {250: {"n_success": 20, "n_episodes": 20, "mean_score": 1.0}},
@@ -151,9 +149,9 @@ def test_an_interruption_says_what_is_kept(
     said = capsys.readouterr().err
     assert said.startswith("warp-deform: interrupted") and said.count("\n") == 1
     assert ("same command goes on" in said) is (
-        verb in {"demo", "goals", "train", "eval", "sweep", "refine"}
+        verb in {"demo", "goals", "train", "eval", "sweep", "refine", "correct", "distill"}
     )
-    assert ("episode" in said) is (verb in {"demo", "refine", "franka"})
+    assert ("episode" in said) is (verb in {"demo", "refine", "correct", "franka"})
 
 
 def test_labels_are_counted_beside_demonstrations() -> None:
