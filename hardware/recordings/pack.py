@@ -81,6 +81,7 @@ def pack(
                 outcome=outcome,
                 **{name: np.zeros((0, width), np.float32) for name, width in empty.items()},
                 ground_truth=np.zeros(0, np.float32),
+                control=None,
             )
         )
     color = _triple(goal_mask)

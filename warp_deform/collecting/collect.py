@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from ..episodes import EpisodeReader, EpisodeWriter, Goal, combine_hashes, rebuild_index
@@ -20,6 +20,7 @@ from ..robots import robot as find_robot
 from ..support.progress import progress_bar
 from ..tasks.registry import task as find_task
 from ..worlds.loop import SLOTS, SOLVED, play, worlds_for
+from .control_demos import ControlChunk, attempt_control_chunk, check_control, describe_control
 from .folder import Attempt, Collection, append_attempt, check_seeds
 from .goals import load_goals
 from .recording import observe, record, task_config
@@ -45,12 +46,26 @@ class CollectConfig(CollectSettings):
     in the environments. None constructs a goal from every seed."""
 
     def __post_init__(self) -> None:
-        find_task(self.task)
+        if self.control:
+            check_control(self)
+            if self.goals is not None:
+                raise InputError("goals from a folder are for picks and places")
+        else:
+            find_task(self.task)
+            self._refuse_control()
         find_robot(self.robot)
         if self.episodes < 1:
             raise InputError(f"episodes is {self.episodes}; it must be 1 or more")
         check_seeds(self.seed, most_attempts(self.episodes))
         demonstrator(self.demonstrator)
+
+    def _refuse_control(self) -> None:
+        """Raise InputError where something is asked for that goes with control alone."""
+        for name in ("control_mode", "start", "horizon", "pictures", "evaluations"):
+            usual = next(field.default for field in fields(self) if field.name == name)
+            if getattr(self, name) != usual:
+                flag = name.replace("_", "-")
+                raise InputError(f"--{flag} goes with --control")
 
 
 @dataclass(frozen=True)
@@ -126,12 +141,21 @@ def _attempt_all(config: CollectConfig, attempts: dict[int, Attempt], workers: W
         while todo := _plan(config, attempts):
             # The first few run here, while the workers start: kernels are compiled once.
             few = todo[:SLOTS] if crew is own_process and workers.apart else todo
-            chunks = [_Chunk(config, part) for part in _split(few, crew.count)]
-            for attempt in crew.run(attempt_chunk, chunks):
+            for attempt in _attempts(config, crew, _split(few, crew.count)):
                 attempts[attempt.seed] = attempt
                 advance(attempt.success)
                 advance.note = f"{len(attempts)} attempts"
             crew = workers
+
+
+def _attempts(
+    config: CollectConfig, crew: Workers, parts: Sequence[tuple[int, ...]]
+) -> Iterator[Attempt]:
+    """Attempts of seeds, as they come."""
+    if config.control:
+        chunks = [ControlChunk(config, config.out, part) for part in parts]
+        return crew.run(attempt_control_chunk, chunks)
+    return crew.run(attempt_chunk, [_Chunk(config, part) for part in parts])
 
 
 def _plan(config: CollectConfig, attempts: Mapping[int, Attempt]) -> list[int]:
@@ -202,6 +226,14 @@ def attempt_chunk(chunk: _Chunk) -> Iterator[Attempt]:
 
 def _description(config: CollectConfig) -> dict[str, object]:
     """What all episodes of a collection have in common."""
+    if config.control:
+        return {
+            "task": config.task,
+            "robot": config.robot,
+            "demonstrator": config.demonstrator,
+            "seed": config.seed,
+            "control": describe_control(config),
+        }
     return {
         "task": config.task,
         "robot": config.robot,
@@ -217,7 +249,7 @@ def _description(config: CollectConfig) -> dict[str, object]:
 def _report(
     config: CollectConfig, successes: Sequence[int], attempts: int, seconds: float
 ) -> CollectReport:
-    infos = EpisodeReader(config.out).infos() if successes else []
+    infos = EpisodeReader(config.out, control=True).infos() if successes else []
     if infos:
         rebuild_index(config.out)
     n = max(len(infos), 1)

@@ -119,7 +119,8 @@ class Collection:
         """Attempts that need not be repeated: failures of the ledger, and files that are there."""
         recorded = {a.seed: a for line in ledger.splitlines() if (a := _parse(line))}
         known = {seed: attempt for seed, attempt in recorded.items() if not attempt.success}
-        for info in EpisodeReader(self.folder).infos() if self._has_episodes() else ():
+        reader = EpisodeReader(self.folder, control=True) if self._has_episodes() else None
+        for info in () if reader is None else reader.infos():
             known[info.seed] = Attempt(info.seed, True, info.actions, info.score, "solved")
         return known
 

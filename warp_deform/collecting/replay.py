@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from ..support.progress import progress_bar
 from ..tasks.registry import task as find_task
 from ..worlds.loop import SLOTS, EpisodeRun, play, worlds_for
 from ..worlds.worlds import Worlds
+from .control_replay import ReplayedControl, compare_control_chunk, led_task_of
+from .control_runs import LedTask
 from .goals import CONSTRUCTED, at_goal
 from .recording import recorded_task
 from .workers import Workers, worker_count
@@ -44,16 +47,19 @@ def verify(
     """
     if tolerance is not None and not 0 <= tolerance < math.inf:
         raise InputError(f"tolerance is {tolerance}; it must be a distance in metres, 0 or more")
-    reader = EpisodeReader(folder)
+    reader = EpisodeReader(folder, control=True)
     groups: dict[tuple[str, str, bool], list[int]] = {}
+    controlled: dict[LedTask, list[int]] = {}
     own = cpu_fingerprint(), versions()
     same_cpu = same_versions = True
     for seed in reader.seeds:
         info = reader.info(seed)
-        recorded_task(info)
-        groups.setdefault((info.task, info.robot, info.demonstrator == CONSTRUCTED), []).append(
-            seed
-        )
+        if info.control is not None:
+            controlled.setdefault(led_task_of(info), []).append(seed)
+        else:
+            recorded_task(info)
+            kind = info.task, info.robot, info.demonstrator == CONSTRUCTED
+            groups.setdefault(kind, []).append(seed)
         same_cpu &= info.cpu == own[0]
         same_versions &= info.versions == own[1]
     count = worker_count(workers, len(reader))
@@ -63,9 +69,17 @@ def verify(
         for kind, seeds in groups.items()
         for i in range(0, len(seeds), size)
     ]
+    control_chunks = [
+        ReplayedControl(Path(folder).resolve(), how, tuple(seeds[i : i + size]), tolerance)
+        for how, seeds in controlled.items()
+        for i in range(0, len(seeds), size)
+    ]
     comparisons = []
     with Workers(count) as crew, progress_bar("replay", len(reader)) as advance:
-        for compared in crew.run(_compare_chunk, chunks):
+        for compared in itertools.chain(
+            crew.run(_compare_chunk, chunks) if chunks else (),
+            crew.run(compare_control_chunk, control_chunks) if control_chunks else (),
+        ):
             comparisons.append(compared)
             advance()
     return {

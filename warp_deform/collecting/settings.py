@@ -15,9 +15,10 @@ from tyro.conf import Positional, arg
 from ..robots import RobotName
 from ..support.flag_range import COUNT, SEED
 
-__all__ = ["CollectSettings", "DemonstratorName"]
+__all__ = ["CollectSettings", "DemonstratorName", "LedMode"]
 
 DemonstratorName = Literal["scripted", "visible", "mpc", "planner"]
+LedMode = Literal["tip_delta_position", "tip_delta_pose"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,3 +47,18 @@ class CollectSettings:
     """Film the first two kept episodes into this MP4."""
     robot: RobotName = "ur5"
     """Which arm moves."""
+    control: bool = False
+    """Demonstrate control at 20 Hz: the tip is led step by step, in the environment
+    `WarpDeform/<Task>-Control-v1`. Swings (whip, whip-target) are searched for."""
+    control_mode: LedMode | None = None
+    """With --control: what an action means. By default `tip_delta_pose` where the yaw of a place
+    matters, else `tip_delta_position`."""
+    start: Literal["free", "held"] = "free"
+    """With --control: begin with a free tip, or with what would be moved first held."""
+    horizon: Annotated[int | None, arg(metavar="N"), COUNT] = None
+    """With --control: steps after which an attempt is given up. By default the environment's, 200
+    for tasks of the benchmark. Tasks of many picks need more."""
+    pictures: bool = False
+    """With --control: keep the picture from above of every step."""
+    evaluations: Annotated[int, arg(metavar="N"), COUNT] = 1000
+    """With --control: plans that a search for a swing simulates."""

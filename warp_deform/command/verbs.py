@@ -90,10 +90,14 @@ def list_tasks(options: ListOptions) -> Outcome:
 class DemoOptions(CollectSettings, CommandOptions):
     """Collect successful demonstrations of a task. Attempts that fail are only counted."""
 
+    verify: bool = False
+    """Then simulate all of them again, and fail with exit code 1 unless every state is the same."""
+
 
 def demo(options: DemoOptions) -> Outcome:
     """Collect demonstrations into a folder."""
-    find_task(options.task)
+    if not options.control:
+        find_task(options.task)
     from ..collecting.collect import CollectConfig, collect
 
     quiet_warp()
@@ -106,6 +110,14 @@ def demo(options: DemoOptions) -> Outcome:
             f"{report['successes']} of {options.episodes} demonstrations succeeded in "
             f"{report['attempts']} attempts; ask for fewer or try another --seed"
         )
+        if options.control and not report["successes"]:
+            failure += ", or a longer --horizon"
+    if options.verify and report["successes"]:
+        from ..collecting.replay import verify
+
+        report["mismatches"] = verify(options.out, workers=options.workers)["mismatches"]
+        if report["mismatches"]:
+            failure = f"{report['mismatches']} recorded states differ when simulated again"
     return Outcome(data=report, text=_lines(report), failure=failure)
 
 

@@ -314,6 +314,10 @@ class ControlWorlds:
             self._held[slot].let_go(self.worlds.episodes[slot], self.task)
             self._set_floor(slot)
 
+    def held(self, slot: int) -> tuple[int | None, int | None]:
+        """Particle or body that the tip of a slot holds; None twice where it holds nothing."""
+        return self._grips[slot]
+
     def _note_taken(self, slot: int) -> None:
         episode = self.worlds.episodes[slot]
         particle, body = self._grips[slot]

@@ -28,16 +28,24 @@ class SwingProblem:
         task: a name, or a `ControlTask` with a `held_particle`
         seeds: of the goals
         worlds: that run side by side, a multiple of 8
+        robot: whose reach limits the tip
 
     Raises:
         InputError: the task holds nothing from the start, or there are no seeds, or `worlds` is no
             multiple of 8.
     """
 
-    def __init__(self, task: str | ControlTask, seeds: Sequence[int], *, worlds: int = 64) -> None:
+    def __init__(
+        self,
+        task: str | ControlTask,
+        seeds: Sequence[int],
+        *,
+        worlds: int = 64,
+        robot: str = "ur5",
+    ) -> None:
         if worlds < 1 or worlds % _LANES or not len(seeds):
             raise InputError(f"worlds must be a multiple of {_LANES}, and seeds one or more")
-        self._control = ControlWorlds(task, worlds, lanes=_LANES)
+        self._control = ControlWorlds(task, worlds, robot=robot, lanes=_LANES)
         found = self._control.task
         if not isinstance(found, ControlTask) or found.held_particle is None:
             raise InputError(f"{found.name} holds nothing from the start, so it is no swing")

@@ -5,6 +5,7 @@ Demonstrations, evaluation episodes and goals share it. `EpisodeWriter` adds fil
 write into one folder, and merging two datasets is copying files. Nothing is ever unpickled.
 """
 
+from ._control_rows import CONTROL, ControlRecord, ControlRow
 from ._folder import (
     EpisodeReader,
     EpisodeWriter,
@@ -19,6 +20,7 @@ from ._provenance import (
     versions,
 )
 from ._records import (
+    CONTROL_FORMAT,
     FORMAT,
     HEIGHT_UNIT,
     MAX_HEIGHT,
@@ -29,9 +31,13 @@ from ._records import (
 )
 
 __all__ = [
+    "CONTROL",
+    "CONTROL_FORMAT",
     "FORMAT",
     "HEIGHT_UNIT",
     "MAX_HEIGHT",
+    "ControlRecord",
+    "ControlRow",
     "Episode",
     "EpisodeInfo",
     "EpisodeReader",

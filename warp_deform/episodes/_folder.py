@@ -91,13 +91,18 @@ class EpisodeReader:
     The folder is listed once, here; files are opened when asked for and checked then. Later files
     are seen by a new reader.
 
+    Args:
+        control: whether episodes of control at a fixed rate are read; else they are refused, as
+            most programs take picks and places.
+
     Raises:
         InputError: the folder is missing or has no episodes, or a Parquet file in it is not named
             like an episode; nothing is skipped silently.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, control: bool = False) -> None:
         self._folder = Path(folder)
+        self._control = control
         self._seeds = _list_seeds(self._folder)
         if not self._seeds:
             raise InputError(
@@ -161,6 +166,12 @@ class EpisodeReader:
         if file.info.seed != seed:
             file.close()
             raise InputError(f"{path} holds the episode of seed {file.info.seed}; rename it")
+        if file.info.control is not None and not self._control:
+            file.close()
+            raise InputError(
+                f"{path} holds control at a fixed rate, where picks and places are needed; "
+                "`warp-deform replay` and `convert --to lerobot` take it"
+            )
         return file
 
 
@@ -174,7 +185,7 @@ def rebuild_index(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: see `EpisodeReader`.
     """
-    reader = EpisodeReader(folder)
+    reader = EpisodeReader(folder, control=True)
     index = _index(reader)
     _publish(reader.folder / _INDEX, _index_text(index), overwrite=True)
     return index
@@ -186,7 +197,7 @@ def read_index(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: see `EpisodeReader`.
     """
-    reader = EpisodeReader(folder)
+    reader = EpisodeReader(folder, control=True)
     index = _index(reader)
     text = _index_text(index)
     try:

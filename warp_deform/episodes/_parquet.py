@@ -25,6 +25,7 @@ import pyarrow.parquet as pq
 
 from ..errors import InputError
 from . import _png
+from ._control_rows import ControlRow
 from ._provenance import HASH_BYTES, digest
 from ._records import (
     MAX_SIDE,
@@ -35,7 +36,6 @@ from ._records import (
     check_episode,
     check_step,
     goal_targets,
-    image_size,
     info_from_json,
     info_to_json,
 )
@@ -69,6 +69,16 @@ _SCHEMA = pa.schema(
         pa.field("goal_height", pa.binary()),
     ]
 )
+_CONTROL_SCHEMA = pa.schema(
+    [
+        *(field.with_nullable(field.name in ("color", "height") or field.nullable)
+          for field in _SCHEMA),
+        pa.field("tip", _WIDE_LIST, nullable=False),
+        pa.field("holding", pa.bool_(), nullable=False),
+        pa.field("reward", pa.float64(), nullable=False),
+    ]
+)  # fmt: skip
+"""Of control at a fixed rate: heights are null, and so are pictures that were not asked for."""
 
 
 def encode(episode: Episode) -> bytes:
@@ -82,7 +92,7 @@ def encode(episode: Episode) -> bytes:
     sink = io.BytesIO()
     writer = pq.ParquetWriter(
         sink,
-        _SCHEMA,
+        _schema_of(episode.info),
         compression="none",  # the images are compressed already
         use_dictionary=False,
         write_statistics=False,
@@ -95,7 +105,7 @@ def encode(episode: Episode) -> bytes:
         with sink.getbuffer() as written:
             groups.append([start, end - start, digest(written[start:end]).hex()])
         start = end
-    height, width = image_size(episode.steps[0].color, what="color")
+    height, width = episode.steps[0].color.shape[:2]
     layout = {"height": height, "width": width, "groups": groups}
     writer.add_key_value_metadata({_INFO_KEY: info, _LAYOUT_KEY: json.dumps(layout)})
     writer.close()
@@ -107,8 +117,8 @@ def encode(episode: Episode) -> bytes:
 def _step_to_batch(t: int, step: Step, goal: Goal | None) -> pa.RecordBatch:
     columns = {
         "step": pa.array([t], pa.int32()),
-        "color": _binary(_png.color_to_png(step.color)),
-        "height": _binary(_png.height_to_png(step.height, what=f"row {t}: height")),
+        "color": _color(step.color),
+        "height": _height(step.height, what=f"row {t}: height"),
         "action": _floats(step.action, _WIDE_LIST),
         "score": pa.array([step.score], pa.float64()),
         "success": pa.array([bool(step.success)]),
@@ -117,15 +127,31 @@ def _step_to_batch(t: int, step: Step, goal: Goal | None) -> pa.RecordBatch:
         "state_hash": pa.array([step.state_hash], pa.string()),
         "outcome": pa.array([step.outcome], pa.string()),
         **{name: _floats(getattr(step, name), _NARROW_LIST) for name in _FLOAT_COLUMNS},
-        "goal_color": _binary(None if goal is None else _png.color_to_png(goal.color)),
-        "goal_height": _binary(
-            None if goal is None else _png.height_to_png(goal.height, what="goal: height")
-        ),
+        "goal_color": _color(None if goal is None else goal.color),
+        "goal_height": _height(None if goal is None else goal.height, what="goal: height"),
     }
-    return pa.record_batch([columns[name] for name in _SCHEMA.names], schema=_SCHEMA)
+    schema = _SCHEMA
+    if step.control is not None:
+        schema = _CONTROL_SCHEMA
+        columns["tip"] = _floats(step.control.tip, _WIDE_LIST)
+        columns["holding"] = pa.array([bool(step.control.holding)])
+        columns["reward"] = pa.array([step.control.reward], pa.float64())
+    return pa.record_batch([columns[name] for name in schema.names], schema=schema)
 
 
-def _binary(data: bytes | None) -> pa.Array:
+def _schema_of(info: EpisodeInfo) -> pa.Schema:
+    return _SCHEMA if info.control is None else _CONTROL_SCHEMA
+
+
+def _color(picture: np.ndarray | None) -> pa.Array:
+    """A cell; null for no picture, or one of 0 x 0."""
+    data = None if picture is None or not picture.size else _png.color_to_png(picture)
+    return pa.array([data], pa.binary())
+
+
+def _height(picture: np.ndarray | None, *, what: str) -> pa.Array:
+    """The same of a height map."""
+    data = None if picture is None or not picture.size else _png.height_to_png(picture, what=what)
     return pa.array([data], pa.binary())
 
 
@@ -234,7 +260,8 @@ class EpisodeFile:
             self.info = info_from_json(entries.get(_INFO_KEY, b""))
         except InputError as error:
             raise self._fail(str(error)) from error
-        if not schema.equals(_SCHEMA):
+        self._control, self._schema = self.info.control, _schema_of(self.info)
+        if not schema.equals(self._schema):
             raise self._fail("its columns are not those of an episode")
         self._read_layout(entries.get(_LAYOUT_KEY, b""))
 
@@ -245,7 +272,8 @@ class EpisodeFile:
             self._groups = [(int(a), int(n), bytes.fromhex(d)) for a, n, d in layout["groups"]]
         except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             raise self._fail("its layout record is malformed") from error
-        if not all(1 <= side <= MAX_SIDE for side in self._image_size):
+        least = 0 if self._control is not None and not self._control.pictures else 1
+        if not all(least <= side <= MAX_SIDE for side in self._image_size):
             raise self._fail(f"its images have {self._image_size} pixels")
         ends = [len(_MAGIC), *(start + length for start, length, _ in self._groups)]
         contiguous = [start for start, _, _ in self._groups] + [self._end] == ends
@@ -274,19 +302,19 @@ class EpisodeFile:
             batch.validate(full=True)
         except _MALFORMED as error:
             raise self._fail(f"row {t} is malformed ({type(error).__name__})") from error
-        if batch.num_rows != 1 or not batch.schema.equals(_SCHEMA):
+        if batch.num_rows != 1 or not batch.schema.equals(self._schema):
             raise self._fail(f"row {t} is malformed")
         return batch
 
     def _step(self, t: int, batch: pa.RecordBatch) -> Step:
-        size, what = self._image_size, f"row {t}"
+        what, control = f"row {t}", self._control
         color, height = batch["color"][0].as_py(), batch["height"][0].as_py()
         try:
             if batch["step"][0].as_py() != t:
                 raise InputError(f"{what} says that it is row {batch['step'][0].as_py()}")
             step = Step(
-                color=_png.png_to_color(color, size=size, what=f"{what}: color"),
-                height=_png.png_to_height(height, size=size, what=f"{what}: height"),
+                color=self._decoded_color(color, what=f"{what}: color"),
+                height=self._decoded_height(height, what=f"{what}: height"),
                 action=_array(batch, "action", columns=0),
                 **{
                     name: batch[name][0].as_py()
@@ -300,29 +328,49 @@ class EpisodeFile:
                     )
                 },
                 **{name: _array(batch, name, columns=n) for name, n in _FLOAT_COLUMNS.items()},
+                control=None if control is None else _control_row(batch),
             )
-            check_step(step, t=t, size=size, last=t == self.info.actions)
+            last = t == self.info.actions
+            check_step(step, t=t, size=self._image_size, last=last, control=control)
         except InputError as error:
             raise self._fail(str(error)) from error
         return step
 
     def _goal(self, batch: pa.RecordBatch) -> Goal | None:
-        record, size = self.info.goal, self._image_size
+        record, control = self.info.goal, self._control
         color, height = batch["goal_color"][0].as_py(), batch["goal_height"][0].as_py()
         if record is None and color is None and height is None:
             return None
-        if record is None or color is None or height is None:
+        seen = control is None or control.pictures
+        if record is None or (color is None) == seen or (height is None) != (control is not None):
             raise self._fail("its goal is not whole")
         try:
             return Goal(
-                color=_png.png_to_color(color, size=size, what="goal: color"),
-                height=_png.png_to_height(height, size=size, what="goal: height"),
+                color=self._decoded_color(color, what="goal: color"),
+                height=self._decoded_height(height, what="goal: height"),
                 targets=goal_targets(record),
                 kind=record["kind"],
                 seed=record["seed"],
             )
         except InputError as error:
             raise self._fail(str(error)) from error
+
+    def _decoded_color(self, data: bytes | None, *, what: str) -> np.ndarray:
+        """A picture; of 0 x 0 where there are none."""
+        if data is None:  # the row's check says whether it may be missing
+            return np.zeros((0, 0, 3), np.uint8)
+        return _png.png_to_color(data, size=self._image_size, what=what)
+
+    def _decoded_height(self, data: bytes | None, *, what: str) -> np.ndarray:
+        """A height map; of 0 x 0 in control at a fixed rate, which has none."""
+        if data is None:
+            return np.zeros((0, 0), np.float32)
+        return _png.png_to_height(data, size=self._image_size, what=what)
+
+
+def _control_row(batch: pa.RecordBatch) -> ControlRow:
+    holding, reward = batch["holding"][0].as_py(), batch["reward"][0].as_py()
+    return ControlRow(_array(batch, "tip", columns=0), holding, reward)
 
 
 def _array(batch: pa.RecordBatch, name: str, *, columns: int) -> Any:

@@ -13,9 +13,12 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ._control_rows import ControlRecord, ControlRow
 
 FORMAT = 1
-"""Version of the file format that this package writes and reads."""
+"""Version of the file format of picks and places."""
+CONTROL_FORMAT = 2
+"""Version of the file format of control at a fixed rate; this package reads both."""
 HEIGHT_UNIT = 1e-5
 """Height of one grey level [m]: 0.01 mm."""
 MAX_HEIGHT = 65535 * HEIGHT_UNIT
@@ -60,6 +63,10 @@ class Step:
     """Body velocities as Newton holds them, (B, 6) float32."""
     ground_truth: np.ndarray
     """The task's ground-truth vector, (D,) float32."""
+    control: ControlRow | None = None
+    """Tip, what it holds, and reward, in episodes of control at a fixed rate. Their actions are
+    (A,), with numbers from -1 to 1; they have no height maps, and pictures of 0 x 0 where none were
+    asked for."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +106,12 @@ class EpisodeInfo:
     extra: dict[str, Any]
     """Whatever else the producer records, JSON types."""
     format: int = FORMAT
-    """Version of the file format."""
+    """Version of the file format: `FORMAT`, or `CONTROL_FORMAT`."""
+
+    @property
+    def control(self) -> ControlRecord | None:
+        """How the tip was led, in an episode of control at a fixed rate; else None."""
+        return ControlRecord.of(self.extra) if self.format == CONTROL_FORMAT else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,23 +147,36 @@ def check_episode(episode: Episode) -> None:
             f"the episode has {rows} rows for {episode.info.actions} actions; "
             "it needs one row per action and one for the final observation"
         )
-    size = image_size(episode.steps[0].color, what="row 0: color")
+    control = episode.info.control
+    size = image_size(episode.steps[0].color, what="row 0: color", control=control)
     for t, step in enumerate(episode.steps):
-        check_step(step, t=t, size=size, last=t == rows - 1)
+        check_step(step, t=t, size=size, last=t == rows - 1, control=control)
     if episode.goal is not None:
-        _check_images(episode.goal.color, episode.goal.height, size=size, what="goal")
+        tall = size if control is None else (0, 0)
+        _check_images(episode.goal.color, episode.goal.height, size, tall, what="goal")
 
 
-def check_step(step: Step, *, t: int, size: tuple[int, int], last: bool) -> None:
+def check_step(
+    step: Step, *, t: int, size: tuple[int, int], last: bool, control: ControlRecord | None
+) -> None:
     """Raise InputError unless the step fits into row t of images of `size` (H, W)."""
     what = f"row {t}"
-    _check_images(step.color, step.height, size=size, what=what)
+    _check_images(step.color, step.height, size, size if control is None else (0, 0), what=what)
+    if (control is None) != (step.control is None):
+        raise InputError(f"{what}: a tip belongs to episodes of control, and only to them")
+    if step.control is not None:
+        _check_array(step.control.tip, (4,), np.float64, what=f"{what}: tip")
+        if not np.isfinite([*step.control.tip, step.control.reward]).all():
+            raise InputError(f"{what}: the tip and the reward must be finite numbers")
     if (step.action is None) != last or (step.outcome is None) != last:
         raise InputError(f"{what}: action and outcome must be None in the last row and only there")
     if step.action is not None:
-        _check_array(step.action, (7,), np.float64, what=f"{what}: action")
+        width = 7 if control is None else len(control.names)
+        _check_array(step.action, (width,), np.float64, what=f"{what}: action")
         if not np.isfinite(step.action).all():
             raise InputError(f"{what}: action {step.action.tolist()} is not finite")
+        if control is not None and (np.abs(step.action) > 1).any():
+            raise InputError(f"{what}: action {step.action.tolist()} is not within -1 to 1")
     for name, columns in (("particle_q", 3), ("particle_qd", 3), ("body_q", 7), ("body_qd", 6)):
         _check_array(getattr(step, name), (-1, columns), np.float32, what=f"{what}: {name}")
     _check_array(step.ground_truth, (-1,), np.float32, what=f"{what}: ground_truth")
@@ -162,20 +187,30 @@ def check_step(step: Step, *, t: int, size: tuple[int, int], last: bool) -> None
         raise InputError(f"{what}: state_hash {step.state_hash!r} is not lower-case hexadecimal")
 
 
-def image_size(color: np.ndarray, *, what: str) -> tuple[int, int]:
-    """Return (H, W) of a colour image, each from 1 to 4096."""
+def image_size(color: np.ndarray, *, what: str, control: ControlRecord | None) -> tuple[int, int]:
+    """Return (H, W) of a colour image, each from 1 to 4096; 0, 0 of control without pictures."""
     _check_array(color, (-1, -1, 3), np.uint8, what=what)
     rows, columns = color.shape[:2]
+    if control is not None and not control.pictures:
+        if (rows, columns) != (0, 0):
+            raise InputError(f"{what} is {rows} x {columns}, in an episode without pictures")
+        return 0, 0
     if not (1 <= rows <= MAX_SIDE and 1 <= columns <= MAX_SIDE):
         raise InputError(f"{what} is {rows} x {columns}; each side must be 1 to {MAX_SIDE} pixels")
     return rows, columns
 
 
 def _check_images(
-    color: np.ndarray, height: np.ndarray, *, size: tuple[int, int], what: str
+    color: np.ndarray,
+    height: np.ndarray,
+    size: tuple[int, int],
+    tall: tuple[int, int],
+    *,
+    what: str,
 ) -> None:
+    """Check a colour image of `size` and a height map of the size `tall`."""
     _check_array(color, (*size, 3), np.uint8, what=f"{what}: color")
-    _check_array(height, size, np.float32, what=f"{what}: height")
+    _check_array(height, tall, np.float32, what=f"{what}: height")
 
 
 def _check_array(array: np.ndarray, shape: tuple[int, ...], dtype: type, *, what: str) -> None:
@@ -216,11 +251,11 @@ def info_from_json(text: str | bytes) -> EpisodeInfo:
         raise InputError("its metadata is not JSON") from error
     if not isinstance(record, dict) or type(record.get("format")) is not int:
         raise InputError("its metadata names no format version")
-    if record["format"] != FORMAT:
-        advice = "upgrade warp-deform" if record["format"] > FORMAT else "collect it again"
+    if record["format"] not in (FORMAT, CONTROL_FORMAT):
+        advice = "upgrade warp-deform" if record["format"] > CONTROL_FORMAT else "collect it again"
         raise InputError(
-            f"it has format version {record['format']}, and this release reads version {FORMAT}: "
-            f"{advice}"
+            f"it has format version {record['format']}, and this release reads versions {FORMAT} "
+            f"and {CONTROL_FORMAT}: {advice}"
         )
     names = {field.name for field in dataclasses.fields(EpisodeInfo)}
     if names != record.keys():
@@ -246,7 +281,9 @@ def info_from_json(text: str | bytes) -> EpisodeInfo:
     if record["goal"] is not None:
         _check_type(record, "goal", dict)
         goal_targets(record["goal"])
-    return EpisodeInfo(**record)
+    info = EpisodeInfo(**record)
+    _ = info.control  # it has to be whole
+    return info
 
 
 def goal_targets(record: dict[str, Any]) -> np.ndarray:

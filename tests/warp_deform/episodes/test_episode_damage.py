@@ -147,9 +147,9 @@ def test_episode_that_another_program_has_rewritten(
 
 def test_format_of_a_future_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(_records, "FORMAT", 2)
-        EpisodeWriter(tmp_path).write(with_info(make_episode(), format=2))
-    with pytest.raises(InputError, match=r"format version 2.*upgrade warp-deform"):
+        patch.setattr(_records, "FORMAT", 3)
+        EpisodeWriter(tmp_path).write(with_info(make_episode(), format=3))
+    with pytest.raises(InputError, match=r"format version 3.*upgrade warp-deform"):
         EpisodeReader(tmp_path).infos()
 
 

@@ -1,0 +1,176 @@
+"""Demonstrations of control at a fixed rate: who demonstrates a task, and attempts of seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..control.control_task import ControlTask
+from ..control.control_worlds import ControlWorlds
+from ..control.plan_search import optimize
+from ..control.registry import control_task
+from ..control.swing_problem import SwingProblem
+from ..control.tip_demonstrator import LED_MODES, TipDemonstrator
+from ..episodes import EpisodeWriter
+from ..errors import InputError
+from ..tasks.task import Task
+from ..worlds.loop import SOLVED
+from .control_runs import (
+    Act,
+    ControlRun,
+    LedTask,
+    control_worlds,
+    led,
+    record_control,
+    without_idle_end,
+)
+from .folder import Attempt, append_attempt
+from .recording import task_config
+from .settings import CollectSettings
+
+__all__ = [
+    "ControlChunk",
+    "attempt_control_chunk",
+    "check_control",
+    "describe_control",
+    "replay_acts",
+]
+
+SEARCHED = "cem"
+"""Who demonstrates swings: the search of `warp_deform.control.optimize`."""
+_WORLDS = 32
+"""Plans that are simulated side by side in a search; their number changes no bit."""
+
+
+def check_control(settings: CollectSettings) -> None:
+    """Raise InputError unless the task can be demonstrated at a fixed rate as is asked for."""
+    task = control_task(settings.task)
+    if settings.demonstrator not in ("scripted", "visible"):
+        raise InputError(
+            f"with --control the demonstrator is scripted or visible, not {settings.demonstrator}"
+        )
+    if settings.video is not None:
+        raise InputError("--video films picks and places; leave it out with --control")
+    if settings.horizon is not None and settings.horizon < 1:
+        raise InputError(f"horizon is {settings.horizon}; it must be 1 control step or more")
+    if settings.evaluations < 1:
+        raise InputError(f"evaluations is {settings.evaluations}; it must be 1 or more")
+    if _is_swing(task):
+        fixed = {"control_mode": (None, LED_MODES[0]), "horizon": (None,), "start": ("free",)}
+        for name, allowed in fixed.items():
+            if getattr(settings, name) not in allowed:
+                flag = name.replace("_", "-")
+                raise InputError(f"{task.name} is a swing, which has no choice of --{flag}")
+        if settings.demonstrator != "scripted":
+            raise InputError(f"{task.name} is a swing: a search demonstrates it, nobody else")
+
+
+def describe_control(settings: CollectSettings) -> dict[str, Any]:
+    """What all episodes of a collection have in common, beyond task, robot and seed."""
+    how, task = _led_task(settings), control_task(settings.task)
+    return {
+        "mode": how.mode,
+        "start": how.start,
+        "horizon": how.horizon,
+        "pictures": settings.pictures,
+        "config": task_config(task),
+        **({"evaluations": settings.evaluations} if _is_swing(task) else {}),
+    }
+
+
+@dataclass(frozen=True)
+class ControlChunk:
+    """Seeds for one process."""
+
+    settings: CollectSettings
+    out: Path
+    seeds: tuple[int, ...]
+
+
+def attempt_control_chunk(chunk: ControlChunk) -> Iterator[Attempt]:
+    """Attempt seeds; a success is a file, and every attempt a line of the ledger, at once."""
+    settings = chunk.settings
+    writer = EpisodeWriter(chunk.out, overwrite=True)  # by the same episode, if at all
+    how = _led_task(settings)
+    control = control_worlds(how)
+    start, act, name = _demonstrator(control, settings)
+    played = led(control, chunk.seeds, start=start, act=act, pictures=settings.pictures)
+    for slot, run in played:
+        success = run.ended == SOLVED
+        if success:
+            kept = without_idle_end(run)
+            writer.write(
+                record_control(control, slot, kept, demonstrator=name, pictures=settings.pictures)
+            )
+        score = run.rows[-1].score if run.rows else 0.0
+        attempt = Attempt(run.seed, success, len(run.actions), score, run.ended or "")
+        append_attempt(chunk.out, attempt)
+        yield attempt
+
+
+def _led_task(settings: CollectSettings) -> LedTask:
+    task = control_task(settings.task)
+    turns = task.place_yaws > 1
+    mode = settings.control_mode or LED_MODES[turns]
+    return LedTask(type(task), settings.robot, mode, start=settings.start, horizon=settings.horizon)
+
+
+def _is_swing(task: Task) -> bool:
+    return isinstance(task, ControlTask) and task.held_particle is not None
+
+
+def _demonstrator(
+    control: ControlWorlds, settings: CollectSettings
+) -> tuple[Callable[[Mapping[int, ControlRun]], None], Act, str]:
+    """What is done at the start of runs, who acts in them, and the name of that."""
+    if _is_swing(control.task):
+        plans = _Plans(settings)
+        return plans.start, plans.act, SEARCHED
+    tips = TipDemonstrator(control, settings.demonstrator)
+    return (
+        lambda runs: tips.start(list(runs)),
+        lambda runs: tips.act(list(runs)),
+        settings.demonstrator,
+    )
+
+
+class _Plans:
+    """Searches a plan for every seed, and goes through it.
+
+    Every search is of one goal and by its own seed, so that a plan depends on nothing else.
+    """
+
+    def __init__(self, settings: CollectSettings) -> None:
+        self._settings = settings
+        self._actions: dict[int, np.ndarray] = {}
+
+    def start(self, runs: Mapping[int, ControlRun]) -> None:
+        for run in runs.values():
+            self._actions[run.seed] = self._found(run.seed)
+
+    def act(self, runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+        return {slot: self._actions[run.seed][len(run.actions)] for slot, run in runs.items()}
+
+    def _found(self, seed: int) -> np.ndarray:
+        problem = SwingProblem(
+            self._settings.task, [seed], worlds=_WORLDS, robot=self._settings.robot
+        )
+        found = optimize(problem, SEARCHED, evaluations=self._settings.evaluations, seed=seed)
+        return np.asarray(problem.actions(found.numbers[0]), np.float32)
+
+
+def replay_acts(actions: Mapping[int, Sequence[np.ndarray]]) -> Act:
+    """Who takes recorded actions (A,), by seed, one after the other; then the episode ends."""
+
+    def act(runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+        chosen: dict[int, np.ndarray | None] = {}
+        for slot, run in runs.items():
+            rest = actions[run.seed][len(run.actions) :]
+            chosen[slot] = rest[0] if len(rest) else None
+        return chosen
+
+    return act
