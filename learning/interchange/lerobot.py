@@ -1,10 +1,10 @@
 """Episodes as a LeRobotDataset v3.0, written with pyarrow alone.
 
 A frame is an observation and the action taken from it; colour is a PNG inside of the frame and
-heights are float32 metres, so nothing is lost but digits of the action beyond float32. Frames have
-no common rate, because an action takes as long as it takes: their time is their number, at one
-frame a second. Names outside of `observation.` reach no LeRobot policy by default; among them is
-the simulator's ground truth.
+heights are float32 metres, so nothing is lost but digits of the action beyond float32. Frames of
+picks and places have no common rate, because an action takes as long as it takes: their time is
+their number, at one frame a second. Names outside of `observation.` reach no LeRobot policy by
+default; among them is the simulator's ground truth. Control is at its own rate, 20 frames a second.
 
 What LeRobot has no place for stands in `meta/warp_deform.parquet`, one row per episode: its whole
 metadata and the final observation, after the last action.
@@ -17,96 +17,34 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from warp_deform import __version__
-from warp_deform.episodes import Episode, EpisodeReader
+from warp_deform.episodes import ControlRecord, Episode, EpisodeReader
 from warp_deform.episodes.corrected import refuse_corrected
 from warp_deform.errors import InputError
 from warp_deform.support.progress import progress_bar
 
 from .conversion import ConversionReport, new_folder, size_of
+from .lerobot_card import card
+from .lerobot_columns import IMAGE, MAP, Feature, as_png, columns, feature_of, kind_of
 from .running_statistics import RunningStatistics
 
-__all__ = ["ACTION_NAMES", "SIDECAR", "export_lerobot"]
+__all__ = ["SIDECAR", "export_lerobot"]
 
-ACTION_NAMES = ("pick_x", "pick_y", "pick_yaw", "place_x", "place_y", "place_yaw", "lift")
-"""Components of an action [m, rad]."""
 SIDECAR = "meta/warp_deform.parquet"
 """Metadata and final observation of every episode."""
 
-_FPS = 1
 _FILE_MB = 100
 _FILES_A_CHUNK = 1000
 _PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _EPISODES_A_BATCH = 100
-_IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-_MAP = pa.list_(pa.list_(pa.float32()))
-
-
-@dataclass(frozen=True)
-class _Feature:
-    """A column: LeRobot's dtype, shape of a frame's value, names of its components or axes."""
-
-    dtype: str
-    shape: tuple[int, ...]
-    names: tuple[str, ...]
-
-    @property
-    def arrow(self) -> pa.DataType:
-        if self.dtype == "image":
-            return _IMAGE
-        number = pa.bool_() if self.dtype == "bool" else getattr(pa, self.dtype)()
-        if len(self.shape) == 2:
-            return _MAP
-        return number if self.shape == (1,) else pa.list_(number, self.shape[0])
-
-    @property
-    def hugging_face(self) -> dict[str, Any]:
-        """The column's type as the library `datasets` writes it."""
-        if self.dtype == "image":
-            return {"_type": "Image"}
-        if len(self.shape) == 2:
-            return {"shape": list(self.shape), "dtype": self.dtype, "_type": "Array2D"}
-        value = {"dtype": self.dtype, "_type": "Value"}
-        if self.shape == (1,):
-            return value
-        return {"feature": value, "length": self.shape[0], "_type": "Sequence"}
-
-    def column(self, values: np.ndarray) -> pa.Array:
-        """Arrow's column of the frames' values (T, *shape)."""
-        if self.dtype == "image":
-            return pa.array([{"bytes": _png(image), "path": None} for image in values], _IMAGE)
-        flat = pa.array(np.ascontiguousarray(values).ravel())
-        if len(self.shape) == 2:
-            frames, rows, columns = values.shape
-            for count, length in ((frames * rows, columns), (frames, rows)):
-                offsets = pa.array(np.arange(count + 1, dtype=np.int32) * length)
-                flat = pa.ListArray.from_arrays(offsets, flat)
-            return flat
-        if self.shape == (1,):
-            return flat
-        return pa.FixedSizeListArray.from_arrays(flat, self.shape[0])
-
-    def reduced(self, values: np.ndarray) -> np.ndarray:
-        """Values (n, ...) over which the statistics go, colours in [0, 1]."""
-        if self.dtype == "image":
-            return values.reshape(-1, 3) / 255.0
-        return values.reshape(-1, 1) if len(self.shape) == 2 else values.reshape(len(values), -1)
-
-    @property
-    def statistic_shape(self) -> tuple[int, ...]:
-        """LeRobot's shape of a mean: per channel, per component; one for a whole height map."""
-        if self.dtype == "image":
-            return (3, 1, 1)
-        return (1, 1) if len(self.shape) == 2 else self.shape
 
 
 def export_lerobot(source: Path, target: Path) -> ConversionReport:
@@ -117,7 +55,7 @@ def export_lerobot(source: Path, target: Path) -> ConversionReport:
             `target` exists.
     """
     began = time.perf_counter()
-    reader = EpisodeReader(source)
+    reader = EpisodeReader(source, control=True)
     refuse_corrected(reader.infos(), folder=source, advice="this format has no place for labels")
     description = {"source": str(Path(source).resolve()), "to": "lerobot", "version": __version__}
     with new_folder(target, description=description) as folder:
@@ -144,8 +82,9 @@ class _Dataset:
         self.tasks: list[str] = []
         self.frames = 0
         self._episodes = 0
-        self._robot = ""
-        self._features: dict[str, _Feature] = {}
+        self._kind: tuple[object, ...] = ()
+        self._control: ControlRecord | None = None
+        self._features: dict[str, Feature] = {}
         self._statistics: dict[str, RunningStatistics] = {}
         self._file = -1
         self._open = contextlib.ExitStack()
@@ -167,26 +106,24 @@ class _Dataset:
 
     def add(self, episode: Episode) -> None:
         """Append an episode."""
-        values = _values(episode, start=self.frames, number=self._episodes)
-        features = {name: _feature(name, array) for name, array in values.items()}
-        robot = episode.info.robot
+        control, kind = episode.info.control, kind_of(episode)
+        values = columns(episode, start=self.frames, number=self._episodes, fps=_fps(control))
+        features = {name: feature_of(name, array, control) for name, array in values.items()}
+        quantiles = control is not None
         if not self._features:
-            self._features, self._robot = features, robot
-            self._statistics = {
-                name: RunningStatistics(feature.statistic_shape)
-                for name, feature in features.items()
-            }
-        if (features, robot) != (self._features, self._robot):
+            self._features, self._kind, self._control = features, kind, control
+            self._statistics = _statistics(features, quantiles)
+        if (features, kind) != (self._features, self._kind):
             raise InputError(
-                f"the episode of seed {episode.info.seed} differs in images, goal, ground truth or "
-                "robot from the first one; convert episodes of one task and robot at a time"
+                f"the episode of seed {episode.info.seed} differs in images, goal, ground truth, "
+                "robot or control from the first one; convert episodes of one task and robot at a "
+                "time"
             )
-        if episode.info.task not in self.tasks:
-            self.tasks.append(episode.info.task)
-        values["task_index"][:] = self.tasks.index(episode.info.task)
-        own = {
-            name: RunningStatistics(feature.statistic_shape) for name, feature in features.items()
-        }
+        task = episode.info.task if control is None else control.instruction
+        if task not in self.tasks:
+            self.tasks.append(task)
+        values["task_index"][:] = self.tasks.index(task)
+        own = _statistics(features, quantiles)
         for name, feature in features.items():
             for statistics in (own[name], self._statistics[name]):
                 statistics.add(feature.reduced(values[name]), frames=episode.info.actions)
@@ -225,10 +162,10 @@ class _Dataset:
 
     def _describe(self, episode: Episode, statistics: dict[str, RunningStatistics]) -> None:
         """Note an episode's row of the metadata, and its row of the sidecar."""
-        last = episode.steps[-1]
+        last, control = episode.steps[-1], episode.info.control
         row: dict[str, Any] = {
             "episode_index": self._episodes,
-            "tasks": [episode.info.task],
+            "tasks": [episode.info.task if control is None else control.instruction],
             "length": episode.info.actions,
             "data/chunk_index": self._file // _FILES_A_CHUNK,
             "data/file_index": self._file % _FILES_A_CHUNK,
@@ -245,7 +182,7 @@ class _Dataset:
                 "episode_index": self._episodes,
                 "seed": episode.info.seed,
                 "info": json.dumps(asdict(episode.info), sort_keys=True),
-                "final_color": {"bytes": _png(last.color), "path": None},
+                "final_color": _picture(last.color),
                 "final_height": last.height.tolist(),
                 "final_success": last.success,
                 "final_score": last.score,
@@ -270,14 +207,14 @@ class _Dataset:
         features = {name: asdict(feature) for name, feature in self._features.items()}
         info = {
             "codebase_version": "v3.0",
-            "robot_type": self._robot,
+            "robot_type": self._kind[0],
             "total_episodes": self._episodes,
             "total_frames": self.frames,
             "total_tasks": len(self.tasks),
             "chunks_size": _FILES_A_CHUNK,
             "data_files_size_in_mb": _FILE_MB,
             "video_files_size_in_mb": 200,
-            "fps": _FPS,
+            "fps": _fps(self._control),
             "splits": {"train": f"0:{self._episodes}"},
             "data_path": f"data/{_PATH}",
             "video_path": None,
@@ -288,6 +225,9 @@ class _Dataset:
         meta.joinpath("info.json").write_text(json.dumps(info, indent=4) + "\n")
         meta.joinpath("stats.json").write_text(json.dumps(statistics, indent=4) + "\n")
         pq.write_table(_task_table(self.tasks), meta / "tasks.parquet")
+        if self._control is not None:
+            text = card(self._control, features, self.tasks, info)
+            self._folder.joinpath("README.md").write_text(text)
 
 
 _SIDECAR_SCHEMA = pa.schema(
@@ -295,72 +235,40 @@ _SIDECAR_SCHEMA = pa.schema(
         ("episode_index", pa.int64()),
         ("seed", pa.int64()),
         ("info", pa.string()),
-        ("final_color", _IMAGE),
-        ("final_height", _MAP),
+        ("final_color", IMAGE),
+        ("final_height", MAP),
         ("final_success", pa.bool_()),
         ("final_score", pa.float64()),
     ]
 )
 
 
+def _fps(control: ControlRecord | None) -> int:
+    """Frames a second: 1 of picks and places, which have no duration of their own.
+
+    Raises:
+        InputError: the rate of control is no whole number, which LeRobot asks for.
+    """
+    if control is None:
+        return 1
+    if control.rate != int(control.rate):
+        raise InputError(f"LeRobot counts whole frames a second, and these are at {control.rate}")
+    return int(control.rate)
+
+
+def _statistics(features: dict[str, Feature], quantiles: bool) -> dict[str, RunningStatistics]:
+    return {
+        name: RunningStatistics(feature.statistic_shape, quantiles=quantiles)
+        for name, feature in features.items()
+    }
+
+
+def _picture(color: np.ndarray) -> dict[str, Any] | None:
+    return {"bytes": as_png(color), "path": None} if color.size else None
+
+
 def _numbered(file: int) -> str:
     return _PATH.format(chunk_index=file // _FILES_A_CHUNK, file_index=file % _FILES_A_CHUNK)
-
-
-def _values(episode: Episode, *, start: int, number: int) -> dict[str, np.ndarray]:
-    """Every column's values (T, ...) of an episode with T actions, `start` frames before it."""
-    count = episode.info.actions
-    if count == 0:
-        raise InputError(
-            f"the episode of seed {episode.info.seed} has no action, and a frame of LeRobot needs "
-            "one; convert demonstrations"
-        )
-    before, after = episode.steps[:-1], episode.steps[1:]
-    done = np.arange(count) == count - 1
-    scores = np.array([step.score for step in episode.steps])
-    values = {
-        "observation.images.color": np.stack([step.color for step in before]),
-        "observation.height": np.stack([step.height for step in before]),
-        "action": np.stack([step.action for step in before if step.action is not None]).astype(
-            np.float32
-        ),
-        "next.reward": np.diff(scores).astype(np.float32),
-        "next.done": done,
-        "next.success": np.array([step.success for step in after]),
-    }
-    if episode.goal is not None:
-        values["observation.images.goal"] = np.stack([episode.goal.color] * count)
-        values["observation.goal_height"] = np.stack([episode.goal.height] * count)
-    if episode.steps[0].ground_truth.size:
-        values["ground_truth"] = np.stack([step.ground_truth for step in before])
-    frames = np.arange(count, dtype=np.int64)
-    return values | {
-        "timestamp": (frames / _FPS).astype(np.float32),
-        "frame_index": frames,
-        "episode_index": np.full(count, number, np.int64),
-        "index": start + frames,
-        "task_index": np.zeros(count, np.int64),
-    }
-
-
-def _feature(name: str, values: np.ndarray) -> _Feature:
-    shape = values.shape[1:] or (1,)
-    if len(shape) == 3:
-        return _Feature("image", shape, ("height", "width", "channels"))
-    if len(shape) == 2:
-        return _Feature(str(values.dtype), shape, ("height", "width"))
-    if name == "action":
-        return _Feature(str(values.dtype), shape, ACTION_NAMES)
-    plain = (name,) if shape == (1,) else tuple(f"{name}_{i}" for i in range(shape[0]))
-    return _Feature(str(values.dtype), shape, plain)
-
-
-def _png(color: np.ndarray) -> bytes:
-    done, data = cv2.imencode(".png", cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
-    if not done:
-        raise RuntimeError(f"OpenCV cannot encode a picture of shape {color.shape}")
-    encoded: bytes = data.tobytes()
-    return encoded
 
 
 def _task_table(tasks: list[str]) -> pa.Table:

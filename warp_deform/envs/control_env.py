@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..control.control_worlds import ControlStep, ControlWorlds, Release, Start
 from ..control.modes import CONTROL_MODES, ControlConfig, ControlMode
+from ..control.numbers import control_numbers
 from ..errors import InputError
 from ..support.checked import real_array
 from ..tasks.task import Task
@@ -79,15 +80,15 @@ class ControlNumbers:
         """The entries of a slot."""
         episode = self._control.worlds.episodes[slot]
         snapshot = episode.snapshot
-        return {
-            "tip": episode.tip,
-            "holding": np.array([float(self._control.holding(slot))]),
-            "particle_q": snapshot.particle_q - episode.tip[:3],
-            "particle_qd": snapshot.particle_qd,
-            "body_q": snapshot.body_q,
-            "goal": episode.layout.targets,
-            "time": np.array([self._control.steps[slot] / self._control.horizon]),
-        }
+        return control_numbers(
+            tip=episode.tip,
+            holding=self._control.holding(slot),
+            particle_q=snapshot.particle_q,
+            particle_qd=snapshot.particle_qd,
+            body_q=snapshot.body_q,
+            goal=episode.layout.targets,
+            time=self._control.steps[slot] / self._control.horizon,
+        )
 
 
 class ControlEnv(gymnasium.Env[Any, np.ndarray]):

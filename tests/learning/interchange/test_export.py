@@ -19,7 +19,8 @@ from fixtures.episode_samples import make_episode, with_info, with_step
 
 from learning.interchange import conversion, lerobot
 from learning.interchange.conversion import ConversionReport, new_folder
-from learning.interchange.lerobot import ACTION_NAMES, SIDECAR, export_lerobot
+from learning.interchange.lerobot import SIDECAR, export_lerobot
+from learning.interchange.lerobot_columns import ACTION_NAMES
 from learning.interchange.robomimic import STATE_PARTS, export_robomimic
 from learning.interchange.running_statistics import RunningStatistics
 from warp_deform.command.main import main
