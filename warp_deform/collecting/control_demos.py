@@ -14,7 +14,7 @@ from ..control.control_worlds import ControlWorlds
 from ..control.plan_search import optimize
 from ..control.registry import control_task
 from ..control.swing_problem import SwingProblem
-from ..control.tip_demonstrator import LED_MODES, TipDemonstrator
+from ..control.tip_demonstrator import LED_MODES, TipDemonstrator, usual_mode
 from ..episodes import EpisodeWriter
 from ..errors import InputError
 from ..tasks.task import Task
@@ -114,8 +114,7 @@ def attempt_control_chunk(chunk: ControlChunk) -> Iterator[Attempt]:
 
 def _led_task(settings: CollectSettings) -> LedTask:
     task = control_task(settings.task)
-    turns = task.place_yaws > 1
-    mode = settings.control_mode or LED_MODES[turns]
+    mode = settings.control_mode or usual_mode(task)
     return LedTask(type(task), settings.robot, mode, start=settings.start, horizon=settings.horizon)
 
 

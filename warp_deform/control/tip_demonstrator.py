@@ -14,12 +14,13 @@ from ..objects.cloth import Cloth
 from ..planning.demonstrators import demonstrator
 from ..robots.primitive import Grasp, Motion, PrimitiveConfig, Stage, approach, carry, find_grasp
 from ..support.quaternion import quat_from_yaw
+from ..tasks.task import Task
 from ..worlds.acting import snapped
 from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 from ..worlds.loop import EpisodeRun
 from .control_worlds import ControlWorlds
 
-__all__ = ["LED_MODES", "TipDemonstrator"]
+__all__ = ["LED_MODES", "TipDemonstrator", "usual_mode"]
 
 LED_MODES = ("tip_delta_position", "tip_delta_pose")
 """Control modes in which a demonstrator leads a tip."""
@@ -31,6 +32,11 @@ _DWELL = 0.1
 """Wait between lowering and letting go [s]."""
 _STEP = 1e-6
 """Of a control step, that a stretch may be longer than a whole number of them."""
+
+
+def usual_mode(task: Task) -> str:
+    """The control mode in which a task is demonstrated, unless another one is asked for."""
+    return LED_MODES[task.place_yaws > 1]
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,6 @@ import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["ControlRecord", "ControlRow"]
-
 CONTROL = "control"
 """Where an episode's `extra` keeps its `ControlRecord`."""
 _MOST_TARGETS = 100_000
