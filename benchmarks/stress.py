@@ -54,15 +54,20 @@ class Tally:
     broken: list[str] = field(default_factory=list)
 
 
-def stress(task: str, *, actions: int, seed: int = 0, count: int = 16) -> Tally:
-    """Act `actions` times on `count` worlds of a task and look at every state."""
+def stress(
+    task: str, *, actions: int, seed: int = 0, count: int = 16, started: Worlds | None = None
+) -> Tally:
+    """Act `actions` times on `count` worlds of a task and look at every state.
+
+    If `started` is given, its first `count` slots are acted on, each at a start already.
+    """
     rng = np.random.default_rng([seed, *task.encode()])
-    worlds = Worlds(task, count)
+    worlds = Worlds(task, count) if started is None else started
     tally = Tally(task)
     fresh = seed
     begin = time.perf_counter()
     slots = list(range(count))
-    waiting = slots
+    waiting = slots if started is None else []
     while tally.actions < actions:
         if waiting:
             worlds.reset({slot: fresh + k for k, slot in enumerate(waiting)})

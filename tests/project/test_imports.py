@@ -30,12 +30,12 @@ import json, sys, time
 start = time.process_time()
 import warp_deform, learning, hardware
 imported = time.process_time() - start
-heavy = sorted({"torch", "warp", "newton"} & set(sys.modules))
+heavy = sorted({"torch", "warp", "newton", "scipy"} & set(sys.modules))
 from warp_deform.command.main import main
 code = main(["list", "--json"])
 listed = time.process_time() - start
 print(json.dumps({"imported": imported, "listed": listed, "heavy": heavy, "code": code,
-                  "heavy_list": sorted({"torch", "newton"} & set(sys.modules))}))
+                  "heavy_list": sorted({"torch", "newton", "scipy"} & set(sys.modules))}))
 """
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -89,11 +90,14 @@ class Import(NamedTuple):
     lazy: bool
 
 
+@cache
 def imports(source: str, module: str, *, is_package: bool) -> list[Import]:
     """Every import of `source`, relative ones resolved against its own dotted name `module`."""
     package = module.split(".") if is_package else module.split(".")[:-1]
 
     def visit(node: ast.AST, lazy: bool) -> Iterator[Import]:
+        if isinstance(node, ast.expr):  # holds no statement
+            return
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             lazy = True
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -160,6 +164,7 @@ def test_imports_for_annotations_alone_stand_last_in_one_block(path: Path) -> No
     )
 
 
+@cache
 def modules(package: str) -> dict[str, set[str]]:
     """By dotted name, the modules of `package` that each of them imports, lazily or not."""
     paths = {}

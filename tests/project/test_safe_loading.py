@@ -33,14 +33,14 @@ ALLOWED = {"learning/interchange/_pickle_process.py": ["line 0: imports pickle"]
 
 def unsafe(source: str) -> list[str]:
     """What in `source` could run code from data, one line each."""
-    tree = ast.parse(source)
-    return [f"line {line}: {what}" for line, what in _findings(tree, _aliases(tree))]
+    nodes = list(ast.walk(ast.parse(source)))
+    return [f"line {line}: {what}" for line, what in _findings(nodes, _aliases(nodes))]
 
 
-def _aliases(tree: ast.AST) -> dict[str, str]:
+def _aliases(nodes: list[ast.AST]) -> dict[str, str]:
     """Local name -> full dotted name, for everything imported anywhere in the file."""
     names: dict[str, str] = {}
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             for alias in node.names:
                 names[alias.asname or alias.name.split(".")[0]] = (
@@ -52,11 +52,11 @@ def _aliases(tree: ast.AST) -> dict[str, str]:
     return names
 
 
-def _findings(tree: ast.AST, names: dict[str, str]) -> Iterator[tuple[int, str]]:
+def _findings(nodes: list[ast.AST], names: dict[str, str]) -> Iterator[tuple[int, str]]:
     for full in names.values():
         if full.split(".")[0] in UNSAFE_MODULES:
             yield 0, f"imports {full}"
-    for node in ast.walk(tree):
+    for node in nodes:
         if not isinstance(node, ast.Call):
             continue
         spelled = ast.unparse(node.func)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..objects.bag import Bag, BagConfig, BagShell, bag_shell
 from ..objects.box import Box
@@ -69,6 +68,8 @@ class BagTask(Task):
 
     def drop(self, rng: np.random.Generator, x: float, y: float) -> np.ndarray:
         """Positions (P, 3) of a bag that is about to fall, its opening up, a little tilted."""
+        from scipy.spatial.transform import Rotation  # slow to import
+
         turn = Rotation.from_euler("xyz", rng.normal(0.0, _TILT, 3))
         return turn.apply(_shell(self.bag).vertices) + np.array([x, y, DROP])
 

@@ -244,7 +244,7 @@ def test_random_and_adversarial_actions_break_nothing(name: str) -> None:
     actions, count = (16, 8) if is_bag(name) else (32, 16) if "fabric" in name else (200, 16)
     if name in CROWDED:
         actions = 8
-    tally = stress().stress(name, actions=actions, seed=5, count=count)
+    tally = stress().stress(name, actions=actions, seed=5, count=count, started=started(name))
     assert tally.broken == []
     assert sum(tally.outcomes.values()) == tally.actions == actions
     assert set(tally.outcomes) <= {outcome.value for outcome in Outcome}
