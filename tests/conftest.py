@@ -94,9 +94,9 @@ def ready_panda(emulator, connection):
     return connection
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """The folder of a run that took seconds, see `short_runs`."""
+    """The folder of a run that took seconds, see `short_runs`; nobody changes it."""
     from fixtures.short_runs import train_shortly
 
     return train_shortly(tmp_path_factory.mktemp("trained"))

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from .paper_results import partial_credit
 from .play import PlayedEpisode
@@ -83,5 +82,7 @@ def wilson(successes: int, n: int) -> tuple[float, float]:
         >>> [round(bound, 1) for bound in wilson(15, 20)]
         [53.1, 88.8]
     """
+    from scipy.stats import binomtest  # slow to import
+
     interval = binomtest(successes, n).proportion_ci(method="wilson")
     return 100 * float(interval.low), 100 * float(interval.high)
