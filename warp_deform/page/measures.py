@@ -18,15 +18,16 @@ def covered_mask(color: np.ndarray) -> np.ndarray:
     return np.asarray(packed != values[counts.argmax()])
 
 
-def measures(episode: RunningEpisode) -> dict[str, float]:
-    """Measures of a state by name; none for tasks without a goal.
+def measures(task: Task, episode: RunningEpisode) -> dict[str, float]:
+    """Measures of a state by name: the task's own, and of goals how much of them is met.
 
     `overlap` is the intersection over union of what the picture and the goal's picture show.
     """
-    if episode.goal is None:
-        return {}
-    seen, wanted = episode.snapshot.images.color, episode.goal.color
-    return {"overlap": mask_iou(covered_mask(seen), covered_mask(wanted))}
+    told = task.measures(episode.layout, episode.snapshot)
+    if episode.goal is not None:
+        seen, wanted = episode.snapshot.images.color, episode.goal.color
+        told = {"overlap": mask_iou(covered_mask(seen), covered_mask(wanted)), **told}
+    return told
 
 
 def score_meaning(task: Task) -> str:

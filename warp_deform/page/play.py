@@ -26,21 +26,14 @@ from ..worlds.state import WorldState
 from ..worlds.worlds import Worlds
 from .access import StaticFile
 from .contest import Contest, Standing
-from .drawing import (
-    FRAMES_A_SECOND,
-    arm_arrays,
-    clip,
-    drawable_arrays,
-    grid_head,
-    link_matrices,
-    pictures,
-)
-from .fault import where_it_broke
+from .drawing import FRAMES_A_SECOND, arm_arrays, clip, grid_head, link_matrices
+from .fault import Fault, where_it_broke
 from .guidance import at_work, has_gradients, play_alone, pull_of_place, sight_message
 from .keeping import HUMAN, KeptEpisodes
-from .measures import measures, score_meaning
+from .measures import score_meaning
 from .players import Player, demonstrators
 from .server import Post
+from .telling import scene_arrays, state_head, state_pictures, why_over
 from .wire import Job, Verbs, pack
 
 __all__ = ["PlaySession"]
@@ -88,9 +81,11 @@ class PlaySession:
         self.players = demonstrators(players)
         self.contest = Contest()
         self._version = 0
-        self._fault = ""
+        self._fault: Fault | None = None
         self._arm, self._parts = arm_arrays(self.worlds.robot)
-        self._links(self.worlds.robot.home_q)  # loads torch before anybody waits for it
+        link_matrices(
+            self.worlds.robot, self.worlds.robot.home_q[None]
+        )  # loads torch before anybody waits for it
         self.reset(self._free(0) if seed is None else seed)
 
     # What the episode is
@@ -130,37 +125,15 @@ class PlaySession:
     @property
     def over(self) -> str:
         """Why nothing more is to be done, empty while something is."""
-        worlds, episode = self.worlds, self.worlds.episodes[0]
-        if not episode.physics_ok:
-            return "the physics broke"
-        if worlds.solved(0):
-            return "solved"
-        if episode.ended:
-            return "over without success"
-        if len(episode.history) >= worlds.task.max_actions:
-            return f"not solved in {worlds.task.max_actions} actions"
-        return ""
+        return why_over(self.worlds)
 
     def head(self) -> dict[str, Any]:
         """What the page tells of the present state, as JSON."""
-        worlds, episode = self.worlds, self.worlds.episodes[0]
-        ok = episode.physics_ok
         return {
+            **state_head(self.worlds, self._fault, self.run.outcomes),
             "version": self._version,
-            "seed": episode.seed,
-            "score": float(worlds.score(0)),
-            "measures": measures(episode) if ok else {},
-            "solved": worlds.solved(0),
-            "over": self.over,
-            "physics": ""
-            if ok
-            else "; ".join(filter(None, [*map(str, episode.problems), self._fault])),
             "actions": len(self.run.actions),
-            "most": worlds.task.max_actions,
-            "outcomes": list(self.run.outcomes),
             "acted": list(self.acted),
-            "seconds": float(episode.sim_seconds),
-            "hash": worlds.hash(0),
             "kept": self.kept.count if self.kept else 0,
         }
 
@@ -189,33 +162,9 @@ class PlaySession:
 
     def scene(self) -> bytes:
         """The message that shows the present state whole."""
-        episode = self.worlds.episodes[0]
-        snapshot = episode.snapshot
-        q, body = snapshot.particle_q, snapshot.body_q
-        if not (np.isfinite(q).all() and np.isfinite(body).all()):
-            q, body = (
-                self.past[-1].episode.snapshot.particle_q,
-                self.past[-1].episode.snapshot.body_q,
-            )
-        arrays = {
-            **drawable_arrays(episode.drawables),
-            "q": q.astype(np.float32),
-            "body": body.astype(np.float32),
-            "links": self._links(episode.posture),
-            **self._pictures(),
-        }
+        last = self.past[-1].episode.snapshot if self.past else None
+        arrays = {**scene_arrays(self.worlds, last), **state_pictures(self.worlds)}
         return pack("scene", arrays, **self.head())
-
-    def _pictures(self) -> dict[str, np.ndarray]:
-        episode = self.worlds.episodes[0]
-        goal = episode.goal.color if episode.goal is not None else None
-        if not episode.physics_ok:
-            return pictures(goal=goal)
-        images = episode.snapshot.images
-        return pictures(images.color, images.height, goal)
-
-    def _links(self, q: np.ndarray) -> np.ndarray:
-        return link_matrices(self.worlds.robot, np.reshape(q, (1, -1)))
 
     # What it does
 
@@ -279,7 +228,7 @@ class PlaySession:
             worlds.restore(0, before)
             raise InputError("the arm cannot reach there with its tip down; nothing has moved")
         self.past.append(before)
-        self._fault = ""
+        self._fault = None
         self.run.actions.append(np.array(action, dtype=float))
         self.run.outcomes.append(report.outcome.value)
         self.acted.append(who)
@@ -295,7 +244,7 @@ class PlaySession:
             self._fault = where_it_broke(drawables, arrays["q"], 1.0 / FRAMES_A_SECOND)
         return pack(
             "clip",
-            {**arrays, **self._pictures()},
+            {**arrays, **state_pictures(worlds)},
             **self.head(),
             end=seconds,
             action=[float(each) for each in action],

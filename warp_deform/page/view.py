@@ -20,17 +20,11 @@ from ..tasks.registry import task as find_task
 from ..worlds.state import WorldState
 from ..worlds.worlds import Worlds
 from .access import StaticFile
-from .drawing import (
-    FRAMES_A_SECOND,
-    arm_arrays,
-    clip,
-    drawable_arrays,
-    grid_head,
-    link_matrices,
-    pictures,
-)
+from .drawing import FRAMES_A_SECOND, arm_arrays, clip, grid_head, pictures
+from .fault import Fault, where_it_broke
 from .server import Post
 from .sources import Shown, Source
+from .telling import scene_arrays, state_head, state_pictures
 from .wire import Job, Verbs, pack
 
 __all__ = ["ViewSession"]
@@ -45,11 +39,15 @@ class _Replay:
 
     Attributes:
         done: actions that were carried out
+        outcome: of the last of them
+        fault: where it broke the physics
         state: after them
     """
 
     def __init__(self, worlds: Worlds, shown: Shown) -> None:
         self.worlds, self.shown, self.done = worlds, shown, 0
+        self.outcome: str | None = None
+        self.fault: Fault | None = None
         goals = {} if shown.goal is None else {0: shown.goal}
         worlds.reset({0: shown.seed}, goals=goals)
         self.state: WorldState = worlds.state(0)
@@ -62,34 +60,17 @@ class _Replay:
 
     def head(self) -> dict[str, Any]:
         """What is told of the present state."""
-        worlds, episode = self.worlds, self.worlds.episodes[0]
+        outcomes = [] if self.outcome is None else [self.outcome]
         return {
+            **state_head(self.worlds, self.fault, outcomes),
             "t": self.done,
             "last": self.done == len(self.shown.actions),
             "same": self.same,
-            "score": float(worlds.score(0)),
-            "solved": worlds.solved(0),
-            "physics": "; ".join(map(str, episode.problems)),
-            "seconds": float(episode.sim_seconds),
-        }
-
-    def scene(self) -> dict[str, np.ndarray]:
-        """Arrays that show the state at the start."""
-        episode, robot = self.worlds.episodes[0], self.worlds.robot
-        return {
-            **drawable_arrays(episode.drawables),
-            "q": episode.snapshot.particle_q.astype(np.float32),
-            "body": episode.snapshot.body_q.astype(np.float32),
-            "links": link_matrices(robot, episode.posture[None]),
-            **self.pictures(),
         }
 
     def pictures(self) -> dict[str, np.ndarray]:
         """The observation, and the goal where there is one."""
-        episode = self.worlds.episodes[0]
-        goal = episode.goal.color if episode.goal is not None else None
-        color = episode.snapshot.images.color if episode.physics_ok else None
-        return pictures(color, None, goal)
+        return state_pictures(self.worlds, height=False)
 
     def step(self) -> tuple[dict[str, np.ndarray], float] | None:
         """Carry out the next action; its motion, None where nothing moved."""
@@ -100,7 +81,11 @@ class _Replay:
         self.outcome = report.outcome.value
         self.done += 1
         self.state = self.worlds.state(0)
-        return clip(self.worlds.robot, report, waiting, self.worlds.episodes[0].snapshot)
+        episode = self.worlds.episodes[0]
+        moved = clip(self.worlds.robot, report, waiting, episode.snapshot)
+        if moved is not None and not episode.physics_ok:
+            self.fault = where_it_broke(episode.drawables, moved[0]["q"], 1.0 / FRAMES_A_SECOND)
+        return moved
 
 
 class ViewSession:
@@ -177,7 +162,8 @@ class ViewSession:
             "bounds": BOUNDS[:2],
             "instruction": worlds.task.instruction,
         }
-        return [pack("scene", {**replay.scene(), **arm}, **about, **furniture, **replay.head())]
+        arrays = {**scene_arrays(worlds), **replay.pictures(), **arm}
+        return [pack("scene", arrays, **about, **furniture, **replay.head())]
 
     def _begin(self, key: int, side: int, shown: Shown) -> _Replay:
         task = find_task(shown.task)
@@ -204,7 +190,7 @@ class ViewSession:
         if not 0 <= t < len(replay.shown.actions):
             raise InputError(f"the episode has {len(replay.shown.actions)} actions")
         moved = replay.step()
-        head = {"key": key, "side": side, "outcome": replay.outcome, **replay.head()}
+        head = {"key": key, "side": side, **replay.head()}
         if moved is None:
             return [pack("still", replay.pictures(), **head)]
         arrays, end = moved

@@ -130,9 +130,17 @@ class FabricCover(Task):
 
     def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """Share of the cube's face that is hidden, less its distance from the fabric's centre."""
+        return self._hidden(snapshot) - self._distance(snapshot)
+
+    def measures(self, layout: Layout, snapshot: Snapshot) -> dict[str, float]:
+        """Coverage: share of the cube's face that is hidden."""
+        return {"coverage": self._hidden(snapshot)}
+
+    def _hidden(self, snapshot: Snapshot) -> float:
+        """Share of the cube's face that no pixel from above shows."""
         seen = np.count_nonzero(snapshot.images.segmentation == snapshot.segments[0][0])
         face = np.prod(self.cube.parts[0].size[:2]) / PIXEL_SIZE**2
-        return 1.0 - min(1.0, seen / face) - self._distance(snapshot)
+        return float(1.0 - min(1.0, seen / face))
 
     def loss(
         self, layout: Layout, snapshot: Snapshot, particle_q: Tensor, body_q: Tensor

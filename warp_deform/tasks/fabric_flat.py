@@ -125,6 +125,10 @@ class FabricFlat(Task):
         """Intersection over union of the fabric's pixels and the square's."""
         return mask_iou(self._mask(layout, snapshot), self._target(layout))
 
+    def measures(self, layout: Layout, snapshot: Snapshot) -> dict[str, float]:
+        """Overlap and coverage of the fabric's pixels and the square's."""
+        return {"overlap": self.iou(layout, snapshot), "coverage": self.score(layout, snapshot)}
+
     def demonstrate(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
     ) -> Action | None:

@@ -273,6 +273,10 @@ class Task(abc.ABC):
         """How good a state is to go on from; `mpc` takes the action whose outcome has the most."""
         return self.score(layout, snapshot)
 
+    def measures(self, layout: Layout, snapshot: Snapshot) -> dict[str, float]:
+        """What else is told of a state beside its score, by name; nothing depends on it."""
+        return {}
+
     @classmethod
     def has_loss(cls) -> bool:
         """Whether the task defines `loss` or `losses`."""

@@ -149,6 +149,8 @@ def test_a_guard_that_fires_is_told_and_undone(fresh, monkeypatch):
         patch.setattr(solver, "config", strict)
         (shown,) = act(fresh, action)
     assert "near x" in shown["physics"]
+    particles = np.linalg.norm(shown["q"] - np.array(shown["fault"]), axis=-1)
+    assert particles.min() < 0.01  # at the middle of a link
     assert "stretch" in shown["physics"] and shown["over"] == "the physics broke"
     assert shown["score"] == 0.0 and not shown["solved"] and "color" not in shown
     with pytest.raises(InputError, match="over"):
@@ -157,7 +159,7 @@ def test_a_guard_that_fires_is_told_and_undone(fresh, monkeypatch):
         KeptEpisodes.keep(None, fresh.worlds, fresh.run, fresh.acted)
     assert [unpack(message)["kind"] for message in fresh.greet()][:2] == ["hello", "scene"]
     (scene,) = ask(fresh, "undo")
-    assert (scene["hash"], scene["physics"]) == (before, "")
+    assert (scene["hash"], scene["physics"], scene["fault"]) == (before, "", None)
     assert len(fresh.run.rows) == 1
     (shown,) = act(fresh, action)
     assert not shown["physics"] and len(fresh.run.rows) == 2

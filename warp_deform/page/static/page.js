@@ -161,6 +161,7 @@ function worked(message) {
 async function settle(state) {
   shown = state;
   tell(state, hello);
+  blame(state.fault);
   mark();
   $("goal-box").hidden = !state.goal;
   if (state.goal) { goal = await paint("goal", state.goal); ghost(); }
@@ -168,6 +169,14 @@ async function settle(state) {
   if (!state.color) return;
   const picture = await decode(state.color);
   if (shown === state && !playback.playing) { top.still(picture); refresh(); }
+}
+
+/** Show where a guard of the physics fired, or nothing. */
+function blame(at) {
+  top.fault = at ? at.slice(0, 2) : null;
+  scene?.mark(at);
+  document.body.dataset.fault = at ? at.join(" ") : "";
+  refresh();
 }
 
 let goal = null;
@@ -184,6 +193,7 @@ function showFrame(clip, frame) {
   top.still(null);
   top.put(state);
   if (scene) scene.put(state);
+  if (top.fault) blame(null);
   refresh();
 }
 

@@ -87,6 +87,7 @@ class Scene {
     this.halo = put(new T.Mesh(new T.SphereGeometry(1, 20, 14), glow(0xedc948, {opacity: 0.75})));
     this.way = put(arrow(0xedc948));
     this.pull = put(arrow(0xff5759));
+    this.fault = put(new T.Mesh(new T.SphereGeometry(0.022, 24, 16), glow(0xff2020, {opacity: 0.6})));
     this.sheets = {};
   }
 
@@ -303,6 +304,13 @@ class Scene {
   gradient(from, to) {
     this.pull.visible = Boolean(from);
     if (from) point(this.pull, from, to, 0.03);
+    this.dirty = true;
+  }
+
+  /** Where a guard of the physics fired [x, y, z]; null hides it. */
+  mark(at) {
+    this.fault.visible = Boolean(at);
+    if (at) this.fault.position.set(...at);
     this.dirty = true;
   }
 

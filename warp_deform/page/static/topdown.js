@@ -7,7 +7,7 @@ export const decode = (bytes, type = "image/png") => createImageBitmap(new Blob(
 
 export class TopDown {
   constructor(canvas) {
-    Object.assign(this, {canvas, picture: null, layers: {}, grasp: null, planned: null, pull: null, moving: null});
+    Object.assign(this, {canvas, picture: null, layers: {}, grasp: null, planned: null, pull: null, fault: null, moving: null});
     this.context = canvas.getContext("2d");
   }
 
@@ -51,6 +51,7 @@ export class TopDown {
     for (const layer of Object.values(this.layers)) c.drawImage(layer, 0, 0, width, height);
     if (this.grasp) this.drawGrasp(c);
     if (this.planned) this.drawPlan(c);
+    if (this.fault) this.drawFault(c);
     if (this.pull) line(c, this.pixel(...this.pull[0]), this.pixel(...this.pull[1]), "#ff5759");
   }
 
@@ -91,6 +92,13 @@ export class TopDown {
     const p = 3 * this.grasp.particle;
     c.strokeStyle = "#edc948"; c.lineWidth = 3;
     c.beginPath(); c.arc(...this.pixel(this.q[p], this.q[p + 1]), 0.009 / this.grid.pixel * SCALE, 0, 7); c.stroke();
+  }
+
+  /** Where a guard of the physics fired. */
+  drawFault(c) {
+    const [x, y] = this.pixel(...this.fault);
+    c.strokeStyle = "#ff3030"; c.lineWidth = 5;
+    c.beginPath(); c.arc(x, y, 22, 0, 7); c.moveTo(x - 34, y); c.lineTo(x + 34, y); c.moveTo(x, y - 34); c.lineTo(x, y + 34); c.stroke();
   }
 
   drawPlan(c) {

@@ -84,6 +84,8 @@ class Pane {
 
   async settle(state) {
     this.tell(state);
+    this.top.fault = state.fault ? state.fault.slice(0, 2) : null;
+    this.scene?.mark(state.fault);
     this.scene?.plan(null);
     if (!state.color) return;
     const picture = await decode(state.color);
