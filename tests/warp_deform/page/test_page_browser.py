@@ -6,6 +6,9 @@ to: the same seed gives the same bits.
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from warp_deform.page.sources import EpisodeSource
 from warp_deform.page.view import ViewSession
 from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.worlds.worlds import Worlds
+from warp_deform.xpbd.guards import GuardLimits
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +123,86 @@ def test_playback_pauses_scrubs_and_changes_no_state(server, tab):
     assert len(set(places)) == 3
     tab.wait(actions=1)
     assert tab.data("hash") == state == session.worlds.hash(0)
+
+
+def test_slow_motion_lasts_longer_and_changes_no_state(server, tab):
+    """Half of a motion, at a quarter of the speed and at 4 times."""
+    page = tab.page
+    page.click("#step")
+    tab.wait(actions=1, playing=False)
+    state, middle, lasts = tab.data("hash"), float(tab.data("end")) / 2, {}
+    for speed in ("4", "0.25"):
+        page.select_option("#speed", speed)
+        page.locator("#time").fill("0.5")
+        begun = time.perf_counter()
+        page.keyboard.press("p")
+        while float(tab.data("time")) < middle + 0.2:
+            assert time.perf_counter() - begun < 60
+        lasts[speed] = (time.perf_counter() - begun) / (float(tab.data("time")) - middle)
+    assert lasts["0.25"] > 3.5  # wall seconds for one of the motion's: never faster than asked
+    assert lasts["0.25"] > 2 * lasts["4"]
+    page.locator("#time").fill("1")
+    assert tab.data("hash") == state == server.session.worlds.hash(0)
+
+
+def test_the_keyboard_alone_suffices(server, tab):
+    page, session = tab.page, server.session
+    for key in ("ArrowUp", "ArrowUp", "ArrowRight", "Shift+ArrowLeft", "Enter"):
+        page.keyboard.press(key)
+    page.keyboard.press("q")
+    for key in ("ArrowDown", "ArrowDown", "ArrowDown", "Space"):
+        page.keyboard.press(key)
+    tab.wait(actions=1, playing=False)
+    done = session.run.actions[0]  # away is -x, right is +y, as the view stands at first
+    assert done[:2] == pytest.approx([0.5 - 0.02, 0.008], abs=1e-6)
+    assert done[3:6] == pytest.approx([0.5 + 0.01, 0.008, np.pi / 12], abs=1e-6)
+    page.keyboard.press("u")
+    tab.wait(actions=0)
+    for _ in range(40):  # to a button, by Tab
+        page.keyboard.press("Tab")
+        if page.locator("#step:focus").count():
+            break
+    page.keyboard.press("Enter")
+    tab.wait(actions=1, playing=False)
+    assert session.acted == ["scripted"]
+
+
+def test_a_guard_that_fires_is_marked_where_it_fired(server, tab, monkeypatch):
+    session, page = server.session, tab.page
+    solver = session.worlds.solver
+    with monkeypatch.context() as patch:
+        strict = replace(solver.config, limits=GuardLimits(stretch=1.0001))
+        patch.setattr(solver, "config", strict)
+        page.click("#step")
+        tab.wait(over="the physics broke", playing=False)
+    x, y, z = map(float, tab.data("fault").split())
+    assert 0.25 < x < 0.75 and abs(y) < 0.5 and -0.01 < z < 0.5
+    assert f"near x {x:.3f}" in page.locator("#physics").inner_text()
+    marked = page.locator("#top").screenshot()
+    page.click("#undo")
+    tab.wait(actions=0, fault="")
+    assert page.locator("#top").screenshot() != marked
+    assert page.locator("#physics").is_hidden()
+
+
+def test_a_lost_connection_is_taken_up_again_and_a_new_start_is_told(server, browser):
+    with serve_page(server.session) as first:
+        server.session.reset(0)
+        tab = Tab(browser, first.access.address)
+        tab.wait(actions=0)
+        tab.page.click("#step")
+        tab.wait(actions=1, playing=False)
+        state = tab.data("hash")
+        first.cut()
+        tab.wait(connection="lost")
+        tab.wait(connection="open", actions=1, hash=state)
+        port = first.access.port
+    tab.wait(connection="lost")
+    assert "not connected" in tab.page.locator("#note").inner_text()
+    with serve_page(server.session, port=port):  # with another token
+        tab.wait(connection="gone")
+        assert "open the one" in tab.page.locator("#note").inner_text()
+    tab.page.close()
 
 
 def test_what_is_kept_can_be_replayed_and_the_second_tab_sees_it(server, browser, tab):

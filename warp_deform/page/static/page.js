@@ -249,7 +249,7 @@ function hint() {
   if (playback.playing) return "";
   if (shown?.over) return `${shown.over}: undo, or go on to the next`;
   if (hand.pick) return "click where it goes; Q and E turn, Esc lets go";
-  return scene ? "click or drag what to pick; drag beside it to look around, scroll to come nearer" : "click what to pick, or drag it";
+  return scene ? "click or drag what to pick (or arrows and Enter); drag beside it to look around, scroll to come nearer" : "click what to pick, or drag it; or arrows and Enter";
 }
 
 function setLift(value) { lift = value; offerLifts(hello.lifts, lift, setLift); }
@@ -273,6 +273,12 @@ $("turn").oninput = () => hand.setTurn($("turn").value * Math.PI / 180);
 document.addEventListener("visibilitychange", () => { if (document.hidden && playback.playing) playback.finish(); });
 document.addEventListener("keydown", event => {
   if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT)$/.test(event.target.tagName) && event.target.type !== "range") return;
+  const {tagName} = event.target, arrow = event.key.startsWith("Arrow"), press = event.key === "Enter" || event.key === " ";
+  if (hello && !(tagName === "INPUT" && arrow) && !(/^(INPUT|BUTTON)$/.test(tagName) && press) && hand.key(event.key, event.shiftKey, hello.bounds)) {
+    event.preventDefault();
+    if (arrow) $("scene").focus({preventScroll: true}); // or Enter would press the button that was pressed last
+    return;
+  }
   const turn = event.shiftKey ? Math.PI / 36 : Math.PI / 12;
   const keys = {
     q: () => hand.setTurn(hand.turn + turn), e: () => hand.setTurn(hand.turn - turn), escape: () => hand.drop(),

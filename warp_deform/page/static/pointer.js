@@ -1,5 +1,6 @@
 // Mouse, pen and keys: pick and place by two clicks or by a drag, in either view; the ring turns.
 
+const STEP = 0.01, FINE = 0.002; // m: a press of an arrow key, and with Shift
 const STILL = 5; // px: a press that moves less is a click
 
 export class Hand {
@@ -9,7 +10,7 @@ export class Hand {
    * `begin()` the same of a press; `inside(xy)` says whether a point is on the table; `look(xy)` asks what the tip would take there.
    */
   constructor({scene, top, ready, begin, inside, say, act, look}) {
-    Object.assign(this, {scene, top, ready, begin, inside, say, act, look, pick: null, turn: 0, from: null, mode: ""});
+    Object.assign(this, {scene, top, ready, begin, inside, say, act, look, pick: null, turn: 0, from: null, mode: "", cursor: null});
     if (scene) this.listen(scene.canvas, event => scene.meant(event), event => scene.onTable(event), event => scene.onKnob(event), scene.orbit);
     this.listen(top.canvas, event => ({xy: top.at(event), thing: true}), event => top.at(event), event => top.onKnob(event), null);
   }
@@ -32,6 +33,7 @@ export class Hand {
     canvas.addEventListener("pointermove", event => {
       const moved = this.start && Math.hypot(event.clientX - this.start[0], event.clientY - this.start[1]) > STILL;
       const here = onTable(event);
+      if (this.cursor) { this.cursor = null; if (!this.pick) this.say(null); } // the pointer takes over
       if (this.mode === "turn" && here) this.setTurn(Math.atan2(here[1] - this.pick[1], here[0] - this.pick[0]));
       else if (this.mode === "drag" && moved && here) this.say({pick: this.from, place: here, turn: this.turn});
       else if (!event.buttons && this.ready()) {
@@ -67,6 +69,26 @@ export class Hand {
   drop() {
     this.pick = null;
     this.say(null);
+  }
+
+  /**
+   * A key: arrows move the point that Enter or the space bar picks, and then places. Arrows go as the 3-D
+   * view shows them; without one as the picture does. Returns whether it was one of these.
+   */
+  key(name, fine, bounds) {
+    const [right, up] = this.scene ? this.scene.axes() : [[1, 0], [0, -1]];
+    const way = {ArrowRight: right, ArrowLeft: right.map(x => -x), ArrowUp: up, ArrowDown: up.map(x => -x)}[name];
+    if (way) {
+      if (!this.ready()) return true;
+      const from = this.cursor || this.pick || bounds.map(([low, high]) => (low + high) / 2);
+      this.cursor = from.map((x, k) => Math.min(Math.max(x + way[k] * (fine ? FINE : STEP), bounds[k][0]), bounds[k][1]));
+      if (this.pick) this.say({pick: this.pick, place: this.cursor, turn: this.turn});
+      else { this.say({pick: this.cursor, place: null, turn: this.turn}); this.look(this.cursor); }
+    } else if (name === "Enter" || name === " ") {
+      if (!this.cursor || !this.begin()) return true;
+      if (this.pick) this.carry(this.pick, this.cursor); else this.choose(this.cursor);
+    } else return false;
+    return true;
   }
 
   setTurn(angle) {

@@ -268,6 +268,13 @@ class Scene {
     return {xy: this.onTable(event), thing: false};
   }
 
+  /** Which ways along the table go to the right and away, as the view stands: two of its four. */
+  axes() {
+    const away = this.orbit.target.clone().sub(this.camera.position), snap = (x, y) => Math.abs(x) > Math.abs(y) ? [Math.sign(x), 0] : [0, Math.sign(y)];
+    const up = snap(away.x, away.y);
+    return [[up[1], -up[0]], up];
+  }
+
   onKnob(event) {
     this.aim(event);
     const at = this.knob.getWorldPosition(new T.Vector3());
