@@ -15,7 +15,7 @@ from warp_deform.worlds.worlds import Worlds
 from ..evaluation.play import PlayedEpisode, play_policy
 from ..evaluation.protocol import Protocol, goals_for, goals_of
 from ..evaluation.snapshot import read_played
-from ..policy.policy import load_policy
+from ..policy.policy import ImagePolicy, StatePolicy, load_policy
 from ..runs.folder import RunFolder, read_json
 
 __all__ = ["EvaluationSource"]
@@ -28,6 +28,8 @@ class EvaluationSource:
         InputError: this is no run, nothing of it was evaluated, or a file is damaged.
     """
 
+    at_once = 1
+
     def __init__(self, path: Path) -> None:
         self.title = str(path)
         self._run = RunFolder(path)
@@ -38,6 +40,9 @@ class EvaluationSource:
         if not self._played:
             raise InputError(f"{path} holds no evaluation; `warp-deform eval {path}` makes one")
         self._settings = self._run.read_settings()
+        self._shown: dict[int, tuple[Shown, np.ndarray | None]] = {}
+        self._worlds: dict[str, Worlds] = {}
+        self._policy: tuple[int, ImagePolicy | StatePolicy] | None = None
 
     def entries(self) -> list[Entry]:
         """See `Source.entries`."""
@@ -58,8 +63,11 @@ class EvaluationSource:
         ]
 
     def thumbnail(self, key: int) -> np.ndarray | None:
-        """None: an evaluation keeps no pictures."""
-        return None
+        """See `Source.thumbnail`: an evaluation keeps no pictures, so the episode is played."""
+        try:
+            return self._play(key)[1]
+        except InputError:  # who opens it is told why
+            return None
 
     def show(self, key: int) -> Shown:
         """See `Source.show`.
@@ -67,14 +75,29 @@ class EvaluationSource:
         Raises:
             InputError: the episode comes out differently here.
         """
+        return self._play(key)[0]
+
+    def _play(self, key: int) -> tuple[Shown, np.ndarray | None]:
+        """An episode, and how it ended, where that can be drawn."""
+        if key not in self._shown:
+            self._shown[key] = self._play_again(key)
+        return self._shown[key]
+
+    def _play_again(self, key: int) -> tuple[Shown, np.ndarray | None]:
         record, played = self._played[key]
-        policy = load_policy(self._run.snapshot(record["step"]))
+        if self._policy is None or self._policy[0] != record["step"]:
+            self._policy = record["step"], load_policy(self._run.snapshot(record["step"]))
+        policy = self._policy[1]
         task = policy.description.task
         protocol = _protocol(record["protocol"], played.seed)
         folder = goals_for(self._run, task, protocol)
         goals = None if folder is None else goals_of(folder, protocol, [played.seed])
-        worlds = Worlds(task, 1, robot=protocol.robot)
+        if protocol.robot not in self._worlds:
+            self._worlds[protocol.robot] = Worlds(task, 1, robot=protocol.robot)
+        worlds = self._worlds[protocol.robot]
         [(_, again, run)] = play_policy(policy, worlds, protocol, [played.seed], goals)
+        ended = worlds.episodes[0]
+        picture = ended.snapshot.images.color.copy() if ended.physics_ok else None
         if (again.success, again.actions, again.score) != (
             played.success,
             played.actions,
@@ -84,7 +107,7 @@ class EvaluationSource:
                 f"seed {played.seed} comes out differently here ({again.actions} actions, score "
                 f"{again.score:.3f}) than it was evaluated: another version or processor"
             )
-        return Shown(
+        shown = Shown(
             task=task,
             robot=protocol.robot,
             seed=played.seed,
@@ -92,6 +115,7 @@ class EvaluationSource:
             actions=run.actions,
             outcomes=run.outcomes,
         )
+        return shown, picture
 
 
 def _protocol(described: dict[str, Any], seed: int) -> Protocol:

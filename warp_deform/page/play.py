@@ -130,9 +130,10 @@ class PlaySession:
     def head(self) -> dict[str, Any]:
         """What the page tells of the present state, as JSON."""
         return {
-            **state_head(self.worlds, self._fault, self.run.outcomes),
+            **state_head(self.worlds, self._fault),
             "version": self._version,
             "actions": len(self.run.actions),
+            "outcomes": list(self.run.outcomes),
             "acted": list(self.acted),
             "kept": self.kept.count if self.kept else 0,
         }

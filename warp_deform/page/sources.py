@@ -69,6 +69,8 @@ class Source(Protocol):
     """Where episodes come from."""
 
     title: str
+    at_once: int
+    """Pictures that a page asks for at a time: few where each takes long."""
 
     def entries(self) -> list[Entry]:
         """All episodes, damaged ones among them."""
@@ -89,6 +91,8 @@ class EpisodeSource:
     Raises:
         InputError: there is none.
     """
+
+    at_once = 24
 
     def __init__(self, folder: Path, *, kind: Callable[[Episode], str] | None = None) -> None:
         self.title = str(folder)

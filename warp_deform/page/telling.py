@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,12 +29,11 @@ def why_over(worlds: Worlds) -> str:
     return ""
 
 
-def state_head(worlds: Worlds, fault: Fault | None, outcomes: Sequence[str]) -> dict[str, Any]:
+def state_head(worlds: Worlds, fault: Fault | None) -> dict[str, Any]:
     """What is told of slot 0, as JSON.
 
     Args:
         fault: where its physics broke, as far as that is known
-        outcomes: of the actions so far
     """
     episode = worlds.episodes[0]
     ok = episode.physics_ok
@@ -49,7 +47,6 @@ def state_head(worlds: Worlds, fault: Fault | None, outcomes: Sequence[str]) -> 
         "physics": "; ".join(problems),
         "fault": list(fault.at) if fault and not ok else None,
         "most": worlds.task.max_actions,
-        "outcomes": list(outcomes),
         "seconds": float(episode.sim_seconds),
         "hash": worlds.hash(0),
     }

@@ -60,12 +60,12 @@ class _Replay:
 
     def head(self) -> dict[str, Any]:
         """What is told of the present state."""
-        outcomes = [] if self.outcome is None else [self.outcome]
         return {
-            **state_head(self.worlds, self.fault, outcomes),
+            **state_head(self.worlds, self.fault),
             "t": self.done,
             "last": self.done == len(self.shown.actions),
             "same": self.same,
+            "outcome": self.outcome,
         }
 
     def pictures(self) -> dict[str, np.ndarray]:
@@ -108,7 +108,15 @@ class ViewSession:
     def greet(self) -> list[bytes]:
         """See `Session.greet`."""
         entries = [asdict(entry) for entry in self.entries]
-        return [pack("hello", title=self.source.title, frames=FRAMES_A_SECOND, entries=entries)]
+        return [
+            pack(
+                "hello",
+                title=self.source.title,
+                at_once=self.source.at_once,
+                frames=FRAMES_A_SECOND,
+                entries=entries,
+            )
+        ]
 
     def do(self, job: Job, post: Post) -> None:
         """See `Session.do`."""

@@ -17,6 +17,12 @@ from warp_deform.page.view import ViewSession
 from warp_deform.page.wire import Job, unpack
 
 
+def ask(session, do, **values):
+    heard = []
+    session.do(Job(do, values), lambda message, everyone=True: heard.append(unpack(message)))
+    return heard
+
+
 def test_an_evaluation_is_listed_and_played_again(run):
     with pytest.raises(InputError, match="holds no evaluation"):
         EvaluationSource(run.path)
@@ -25,12 +31,14 @@ def test_an_evaluation_is_listed_and_played_again(run):
     assert {entry.group.split(",")[0] for entry in session.entries} == {"test", "validation"}
     entry = next(entry for entry in session.entries if entry.group.startswith("test"))
     assert entry.success or entry.kind
-    heard = []
-    session.do(
-        Job("open", {"key": entry.key, "side": 0}),
-        lambda message, everyone=True: heard.append(unpack(message)),
-    )
-    assert heard[0]["count"] == entry.actions and heard[0]["same"] is None
+    (drawn,) = ask(session, "thumbnails", keys=[entry.key])
+    assert bytes(drawn[str(entry.key)][:4]) == b"\x89PNG" and session.source.at_once == 1
+    (opened,) = ask(session, "open", key=entry.key, side=0)
+    assert opened["count"] == entry.actions and opened["same"] is None
+    while not opened["last"]:
+        (opened,) = ask(session, "clip", key=entry.key, side=0, t=opened["t"])
+    if entry.actions:  # its picture is that of how it ended
+        assert bytes(opened["color"]) == bytes(drawn[str(entry.key)])
     [file] = [f for f in run.evaluations.glob("*.json") if "test" in f.name]
     record = json.loads(file.read_text())
     record["episodes"][0]["score"] += 0.25

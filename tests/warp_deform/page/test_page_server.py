@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 from fixtures.page_server import hear, serve_page
@@ -185,3 +190,42 @@ def test_only_so_many_tabs(server):
 def test_a_port_that_is_taken_is_told(server):
     with pytest.raises(InputError, match=f"port {server.access.port} of 127.0.0.1 cannot be used"):
         listen(server.access.port)
+
+
+DEAF = """
+import sys
+from websockets.sync.client import connect
+with connect(sys.argv[1], origin=sys.argv[2], compression=None, max_size=2**26) as tab:
+    print("hears", flush=True)
+    for message in tab:
+        pass
+"""
+
+
+def test_a_stopped_browser_costs_no_memory(server, tab):
+    """A client that is stopped by a signal, while 80 MB are sent: the server keeps few of them."""
+    address = server.access.address.replace("http", "ws", 1) + "ws"
+    client = subprocess.Popen(
+        [sys.executable, "-c", DEAF, address, server.access.origins[0]],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert client.stdout.readline() == "hears\n"
+        for _ in range(8):  # what a first message needs once
+            say(tab, do="big")
+            hear(tab, "clip")
+        client.send_signal(signal.SIGSTOP)
+        before, most = resident(), 0
+        for _ in range(80):
+            say(tab, do="big")
+            hear(tab, "clip")
+            most = max(most, resident())
+        assert most - before < 50 * 2**20
+    finally:
+        client.kill()
+        client.wait()
+
+
+def resident() -> int:
+    """Memory of this process [bytes]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

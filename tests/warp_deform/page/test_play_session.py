@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -246,3 +249,37 @@ def test_the_gradient_points_where_less_is_left_to_do():
     at["pick"] = [0.3, -0.45] if abs(action[1] + 0.45) > 0.1 else [0.3, 0.45]
     [told] = [m for m in ask(session, "gradient", **at) if m["kind"] == "gradient"]
     assert told["to"] is None and "nothing" in told["says"]
+
+
+def test_a_hundred_actions_take_no_more_memory_than_twenty(fresh):
+    """Actions of several episodes and undone ones: what is kept is the running episode's alone."""
+
+    def act_on(count):
+        for number in range(count):
+            if fresh.over or number % 10 == 9:
+                fresh.reset(number % 3)
+            ask(fresh, "demonstrate", who="scripted", whole=False)
+            if number % 3 == 0:
+                ask(fresh, "undo")
+
+    act_on(20)
+    gc.collect()
+    before = resident()
+    act_on(100)
+    gc.collect()
+    assert resident() - before < 15 * 2**20
+
+
+def resident() -> int:
+    """Memory of this process [bytes]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def test_fabrics_tell_overlap_and_coverage():
+    session = PlaySession("fabric-flat", seed=0)
+    before = session.head()
+    assert before["measures"]["coverage"] == before["score"] > before["measures"]["overlap"] > 0
+    (*_, shown, _) = ask(session, "demonstrate", who="scripted", whole=False)
+    assert shown["outcomes"] == ["placed"] and shown["seconds"] > before["seconds"]
+    assert set(shown["measures"]) == {"overlap", "coverage"}
+    assert shown["measures"]["coverage"] == shown["score"]

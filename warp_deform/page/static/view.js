@@ -146,12 +146,15 @@ function hear(message) {
     clip: () => pane.add(message, hello.frames),
     still: () => pane.add(message, hello.frames),
     pictures: () => pane.show(message),
-    note: () => { for (const each of panes) each.asking = false; note(message.text); },
+    note: () => { for (const each of panes) each.asking = false; fetching = false; note(message.text); },
   })[message.kind](message);
 }
 
 function greet(message) {
   hello = message;
+  asked.clear(); // what was on its way is lost
+  wanted.clear();
+  fetching = false;
   $("title").textContent = hello.title.split("/").filter(Boolean).at(-1);
   $("title").title = hello.title;
   document.title = `${$("title").textContent} · warp-deform`;
@@ -188,21 +191,27 @@ function list() {
 
 // pictures are asked for when their place comes into view
 const wanted = new Set();
+let fetching = false;
 const seen = new IntersectionObserver(entries => {
   for (const {isIntersecting, target} of entries) {
     const key = Number(target.dataset.key);
     if (!isIntersecting) continue;
     if (pictures.has(key)) place(key); else if (!asked.has(key)) { asked.add(key); wanted.add(key); }
   }
-  const keys = [...wanted].slice(0, 24);
-  if (keys.length) { keys.forEach(key => wanted.delete(key)); send({do: "thumbnails", keys}); }
 }, {rootMargin: "200px"});
+
+/** Ask for pictures, but not while somebody waits for a motion: some of them take a while. */
+function fetchPictures() {
+  if (fetching || !wanted.size || hello.at_once < 2 && open().some(pane => pane.asking || pane.playback.playing)) return;
+  const keys = [...wanted].slice(0, hello.at_once);
+  fetching = send({do: "thumbnails", keys});
+  if (fetching) keys.forEach(key => wanted.delete(key));
+}
 
 async function draw(message) {
   for (const [name] of message.arrays) { pictures.set(Number(name), await decode(message[name])); place(Number(name)); }
   document.body.dataset.pictures = pictures.size;
-  const keys = [...wanted].slice(0, 24);
-  if (keys.length) { keys.forEach(key => wanted.delete(key)); send({do: "thumbnails", keys}); }
+  fetching = false;
 }
 
 function place(key) {
@@ -239,6 +248,7 @@ function loop(now) {
     if (!pane.steps) pane.ask();
   }
   before = now;
+  fetchPictures();
   const longest = open().map(pane => pane.playback).filter(playback => playback.clip).sort((a, b) => b.length - a.length)[0];
   $("pause").disabled = $("time").disabled = !longest;
   $("pause").textContent = open().some(pane => pane.playback.playing) ? "Pause" : "Play";
