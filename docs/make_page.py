@@ -1,16 +1,22 @@
-"""Makes the moving picture of the page: a policy shows where it looks, and moves the block.
+"""Makes the pictures of the pages.
 
     python docs/make_page.py docs/images/page.webp
+    python docs/make_page.py docs/images/operator_page.webp
 
-The page is driven in headless Chromium, where the processor draws it. The picture loops.
+The first moves: a policy shows where it looks, and moves the block. The second is what an operator
+of the arm is asked. The pages are driven in headless Chromium, where the processor draws them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +32,11 @@ LOOK_SECONDS, LAST_SECONDS, QUALITY = 1.2, 1.5, 55
 SIZE = (405, 720)  # rows and columns [pixels]
 
 
-def main(path: Path) -> None:
-    """Let the policy play an episode and write what the page looks like."""
-    command = [sys.executable, "-m", "warp_deform", "play", TASK, "--seed", str(SEED)]
+@contextlib.contextmanager
+def opened(*arguments: str) -> Iterator[Any]:
+    """The page of a command, in a browser."""
     server = subprocess.Popen(
-        [*command, "--policy", str(POLICY)], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "warp_deform", *arguments], stderr=subprocess.PIPE, text=True
     )
     assert server.stderr is not None
     address = next(found[0] for line in server.stderr if (found := re.search(r"http://\S+", line)))
@@ -38,10 +44,27 @@ def main(path: Path) -> None:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
         page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.goto(address)
-        frames = play(page)
+        yield page
         browser.close()
-    server.terminate()
+    server.send_signal(signal.SIGINT)
     server.wait()
+
+
+def operator(path: Path) -> None:
+    """Write what the operator of a simulated arm is asked first."""
+    with tempfile.TemporaryDirectory() as folder:
+        rig = ["--robot", "sim", "--agent", "scripted", "--seed", "3", "--out", f"{folder}/episode"]
+        with opened("franka", "run", *rig, "--page") as page:
+            wait(page, "[data-ready='true']")
+            picture = shot(page, (540, 960))
+    if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_WEBP_QUALITY, 75]):
+        sys.exit(f"{path} cannot be written")
+
+
+def main(path: Path) -> None:
+    """Let the policy play an episode and write what the page looks like."""
+    with opened("play", TASK, "--seed", str(SEED), "--policy", str(POLICY)) as page:
+        frames = play(page)
     film = cv2.Animation()
     film.frames = frames
     film.durations = np.full(len(frames), 1000 // FPS, np.int32)
@@ -79,12 +102,13 @@ def wait(page: Any, state: str) -> None:
     page.locator(f"body{state}").wait_for(state="attached", timeout=120_000)
 
 
-def shot(page: Any) -> np.ndarray:
+def shot(page: Any, size: tuple[int, int] = SIZE) -> np.ndarray:
     """What the page shows, smaller (H, W, 3) uint8 BGR."""
     page.wait_for_timeout(60)
     picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
-    return cv2.resize(picture, SIZE[::-1], interpolation=cv2.INTER_AREA)
+    return cv2.resize(picture, size[::-1], interpolation=cv2.INTER_AREA)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    out = Path(sys.argv[1])
+    (operator if "operator" in out.name else main)(out)

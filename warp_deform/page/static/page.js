@@ -162,6 +162,7 @@ async function settle(state) {
   shown = state;
   tell(state, hello);
   blame(state.fault);
+  if (state.sight) { forget(); moving = null; } // what somebody meant to do is done
   mark();
   $("goal-box").hidden = !state.goal;
   if (state.goal) { goal = await paint("goal", state.goal); ghost(); }
