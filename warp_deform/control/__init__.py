@@ -10,6 +10,7 @@ _HOME = {
     "ControlConfig": ".modes",
     "ControlWorlds": ".control_worlds",
     "METHODS": ".plan_search",
+    "EpisodeProblem": ".episode_problem",
     "SwingProblem": ".swing_problem",
     "optimize": ".plan_search",
 }

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..tasks.task import Layout, Task
+from ..tasks.task import Action, Layout, Snapshot, Task
 from .modes import ControlConfig
 
 __all__ = ["ControlTask", "horizon_of"]
@@ -29,6 +29,21 @@ class ControlTask(Task):
     """Whether an episode ends when it is solved, or only when its steps are used up."""
     held_particle: ClassVar[int | None] = None
     """What the tip holds from the start, by any `start`; None: as `start` says."""
+    held_body: ClassVar[int | None] = None
+    """The same where it is a body; at most one of the two is given."""
+    keeps_hold: ClassVar[bool] = False
+    """Whether the tip never lets go of it, whatever an action says of `hold`."""
+
+    first_actions: ClassVar[int] = 0
+    """Picks and places that have made the start, see `first_action`."""
+
+    def first_action(self, snapshot: Snapshot, rng: np.random.Generator) -> Action:
+        """One of the picks and places that make the start."""
+        raise TypeError(f"{self.name} starts as it was laid out")
+
+    def starts_like(self, layout: Layout, snapshot: Snapshot) -> bool:
+        """Whether an episode may start as these have left it; others are drawn again, counted."""
+        return not self.solved(layout, snapshot)
 
     def plan_to_goal(self, rng: np.random.Generator) -> np.ndarray | None:
         """Actions (T, 3), each of a length below 1, whose outcome is the goal; None: the layout's.
@@ -36,6 +51,10 @@ class ControlTask(Task):
         A plan that a guard ends, or whose outcome is no goal (`is_goal`), is drawn again.
         """
         return None
+
+    def plan_for(self, layout: Layout, rng: np.random.Generator) -> np.ndarray | None:
+        """The same, of an episode that starts like `layout`."""
+        return self.plan_to_goal(rng)
 
     def is_goal(self, particle_q: np.ndarray) -> bool:
         """Whether the state that a plan has led to, particles (P, 3) [m], is a goal to pursue."""

@@ -26,6 +26,7 @@ from ..worlds.tip_control import TipControl
 from ..worlds.worlds import Worlds
 from ..xpbd.config import SolverConfig
 from .control_task import ControlTask, horizon_of
+from .disturbed_starts import disturb
 from .held_history import HeldHistory
 from .limits import TipLimits
 from .modes import CONTROL_MODES, ControlConfig, TipTargets
@@ -123,8 +124,9 @@ class ControlWorlds:
         """Control steps of every episode so far (W,)."""
         self._solved = np.zeros(count, int)
         self._last = np.zeros((count, self.targets.width))
-        self._held = [HeldHistory() for _ in range(count)]
-        self._grips: list[tuple[int | None, int | None]] = [_NOTHING] * count
+        self._carried = [HeldHistory() for _ in range(count)]
+        self.grips: list[tuple[int | None, int | None]] = [_NOTHING] * count
+        """The particle or body that every tip holds."""
 
     @property
     def task(self) -> Task:
@@ -148,13 +150,14 @@ class ControlWorlds:
         self.worlds.reset(seeds, goals=goals)
         slots = list(seeds)
         if isinstance(self.task, ControlTask):
+            disturb(self.worlds, self.task, slots)
             self._goals_by_plans(self.task, slots)
         grasps: Mapping[int, Grasp] = {}
-        if self.start == "held" and self._held_particle is None:
+        if self.start == "held" and self._held == _NOTHING:
             grasps = self._scripted_grasps(slots)
         self._begin(slots, grasps)
         for slot in slots:
-            self._held[slot] = HeldHistory()
+            self._carried[slot] = HeldHistory()
             if self.holding(slot):
                 self._note_taken(slot)
         self.steps[slots] = self._solved[slots] = 0
@@ -162,25 +165,31 @@ class ControlWorlds:
         self.rewards.start(slots)
 
     @property
-    def _held_particle(self) -> int | None:
-        return self.task.held_particle if isinstance(self.task, ControlTask) else None
+    def _held(self) -> tuple[int | None, int | None]:
+        """The particle or body that the tip holds from the start."""
+        if not isinstance(self.task, ControlTask):
+            return _NOTHING
+        return self.task.held_particle, self.task.held_body
 
     def _begin(self, slots: Sequence[int], grasps: Mapping[int, Grasp]) -> None:
         """Take slots under control, with what they hold from the start."""
         self.worlds.solver.config = self._led_config
         self.control.begin(slots)
-        particle = self._held_particle
+        particle, body = self._held
         for slot in slots:
-            episode = self.worlds.episodes[slot]
-            self._grips[slot] = _NOTHING
+            episode, solver = self.worlds.episodes[slot], self.worlds.solver
+            self.grips[slot] = particle, body
             if particle is not None:
-                self._grips[slot] = (particle, None)
-                place = self.worlds.solver.particle_q(slot)[particle].astype(float)
+                place = solver.particle_q(slot)[particle].astype(float)
                 episode.tip = np.append(place, 0.0)
                 self.control.loop.hold(slot, particle=particle)
+            elif body is not None:
+                pose = solver.body_q(slot)[body].astype(float)
+                episode.tip = np.append(pose[:3], 0.0)
+                self.control.loop.hold(slot, body=body, tip=pose[:3])
             elif slot in grasps:
                 grasp, tip = grasps[slot], episode.tip
-                self._grips[slot] = (grasp.particle, grasp.body)
+                self.grips[slot] = (grasp.particle, grasp.body)
                 self.control.loop.hold(
                     slot, particle=grasp.particle, body=grasp.body, tip=tip[:3],
                     rotation=quat_from_yaw(float(tip[3])),
@@ -223,7 +232,10 @@ class ControlWorlds:
         before = {slot: self.worlds.state(slot) for slot in slots}
         waiting = list(slots)
         for _ in range(_DRAWS):
-            plans = {slot: task.plan_to_goal(rngs[slot]) for slot in waiting}
+            plans = {
+                slot: task.plan_for(self.worlds.episodes[slot].layout, rngs[slot])
+                for slot in waiting
+            }
             led = {slot: plan for slot, plan in plans.items() if plan is not None}
             if not led:
                 return
@@ -264,6 +276,18 @@ class ControlWorlds:
         """
         slots = list(actions)
         rows = np.array([actions[slot] for slot in slots], dtype=float)
+        self.lead(slots, rows)
+        for slot in slots:
+            self.worlds.look(slot)
+            self._carried[slot].follow(self.worlds.episodes[slot], self.task)
+        return self._judged(slots, rows)
+
+    def lead(self, slots: Sequence[int], rows: np.ndarray) -> None:
+        """Run one control step without a look at what came of it: for searches.
+
+        Args:
+            rows: actions (n, width) of the slots
+        """
         for slot, row in zip(slots, rows, strict=True):
             self._take_or_let_go(slot, bool(row[-1] > 0))
         knots = self.targets.follow(slots, rows)
@@ -275,10 +299,7 @@ class ControlWorlds:
             episode.sim_seconds += self.control.loop.seconds
             # these are of all control so far
             episode.problems = fired.get(slot, ()) or episode.problems
-            self.worlds.look(slot)
-            self._held[slot].follow(episode, self.task)
-        self.steps[slots] += 1
-        return self._judged(slots, rows)
+        self.steps[list(slots)] += 1
 
     def _judged(self, slots: list[int], rows: np.ndarray) -> dict[int, ControlStep]:
         rewards = self.rewards.take(slots)
@@ -301,31 +322,33 @@ class ControlWorlds:
         return done
 
     def _take_or_let_go(self, slot: int, hold: bool) -> None:
+        if isinstance(self.task, ControlTask) and self.task.keeps_hold:
+            return
         holds = self.holding(slot)
         if hold and not holds:
             grasp = self.control.hold(slot)
             if grasp is not None:
-                self._grips[slot] = (grasp.particle, grasp.body)
+                self.grips[slot] = (grasp.particle, grasp.body)
                 self._note_taken(slot)
                 self._set_floor(slot)
         elif holds and not hold:
             self.control.let_go(slot, release=self.release)
-            self._grips[slot] = _NOTHING
-            self._held[slot].let_go(self.worlds.episodes[slot], self.task)
+            self.grips[slot] = _NOTHING
+            self._carried[slot].let_go(self.worlds.episodes[slot], self.task)
             self._set_floor(slot)
 
     def held(self, slot: int) -> tuple[int | None, int | None]:
         """Particle or body that the tip of a slot holds; None twice where it holds nothing."""
-        return self._grips[slot]
+        return self.grips[slot]
 
     def _note_taken(self, slot: int) -> None:
         episode = self.worlds.episodes[slot]
-        particle, body = self._grips[slot]
-        self._held[slot].take(episode, particle=particle, body=body)
+        particle, body = self.grips[slot]
+        self._carried[slot].take(episode, particle=particle, body=body)
 
     def _set_floor(self, slot: int) -> None:
         """How low the tip may go now: where what it holds lies on the table."""
-        particle, body = self._grips[slot]
+        particle, body = self.grips[slot]
         episode, solver = self.worlds.episodes[slot], self.worlds.solver
         floor = _FREE_FLOOR
         if particle is not None:

@@ -75,9 +75,13 @@ class FoldFabric1(ControlTask):
         """A flat fabric; targets (100, 3): its vertices once it is folded."""
         x, y = rng.normal((0.5, 0.0), _SHIFT)
         sheet = cloth_sheet(self.fabric, (x, y), yaw=rng.uniform(-np.pi, np.pi))
+        goal = self.folded(sheet)
+        return Layout(particle_q=sheet, body_q=np.zeros((0, 7)), targets=goal, calm=True)
+
+    def folded(self, sheet: np.ndarray) -> np.ndarray:
+        """The goal (100, 3) [m] of a flat sheet."""
         half = float(np.linalg.norm(sheet[-1] - sheet[_CORNER])) / 2
-        folded = fold_corner(sheet, _CORNER, half, 2 * self.fabric.radius)
-        return Layout(particle_q=sheet, body_q=np.zeros((0, 7)), targets=folded, calm=True)
+        return fold_corner(sheet, _CORNER, half, 2 * self.fabric.radius)
 
     def losses(
         self,

@@ -7,13 +7,20 @@ from ..tasks.registry import task_of
 from ..tasks.task import Task
 from .control_task import ControlTask
 from .fold_fabric import FoldFabric1
+from .fold_fabric_3 import FoldFabric3
+from .gather import Gather
+from .push_cable import PushCable
+from .unfold_fabric import UnfoldFabric1, UnfoldFabric3
 from .whip import Whip, WhipTarget
 
 __all__ = ["control_task"]  # `warp_deform.control` has `CONTROL_TASKS`
 
 CONTROL_TASKS: dict[str, type[ControlTask]] = {
-    cls.name: cls for cls in (Whip, WhipTarget, FoldFabric1)
-}
+    cls.name: cls
+    for cls in (
+        Whip, WhipTarget, PushCable, FoldFabric1, FoldFabric3, UnfoldFabric1, UnfoldFabric3, Gather
+    )
+}  # fmt: skip
 
 
 def control_task(task: str | Task) -> Task:

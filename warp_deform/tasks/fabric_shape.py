@@ -10,7 +10,7 @@ import numpy as np
 from ..rendering.pixels import SHAPE, pixel_to_world
 from .target_shapes import to_world
 
-__all__ = ["fold_corner", "square_corners", "square_mask"]
+__all__ = ["fold_corner", "fold_over", "square_corners", "square_mask"]
 
 _UNIT_SQUARE = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
 _PIXELS = pixel_to_world(np.moveaxis(np.indices(SHAPE), 0, -1))
@@ -49,4 +49,27 @@ def fold_corner(points: np.ndarray, corner: int, depth: float, gap: float) -> np
     over = np.maximum(depth - (xy - xy[corner]) @ inwards, 0.0)  # [m] beyond the fold line
     points[:, :2] += 2 * over[:, None] * inwards
     points[:, 2] += np.minimum(2 * over, gap)
+    return points
+
+
+def fold_over(points: np.ndarray, pick: np.ndarray, place: np.ndarray, gap: float) -> np.ndarray:
+    """A sheet, folded before or not, with all of it beyond a line turned over onto the rest.
+
+    Layers that are turned over lie above all others, in falling order.
+
+    Args:
+        points: of the sheet (P, 3) [m]
+        pick: a point (2 or 3,) that comes to lie on `place`; the line is halfway between them
+        gap: between two layers [m], less where the sheet bends
+    """
+    points = np.array(points, dtype=float)
+    way = np.subtract(place, pick)[:2]
+    length = np.linalg.norm(way)
+    over = np.maximum(length / 2 - (points[:, :2] - pick[:2]) @ way / length, 0.0)
+    turned = over > 0
+    points[:, :2] += 2 * over[:, None] * way / length
+    if turned.any() and not turned.all():
+        z = points[turned, 2]
+        above = points[~turned, 2].max() + gap + z.max() - z
+        points[turned, 2] = z + np.minimum(2 * over[turned], above - z)
     return points

@@ -14,7 +14,10 @@ __all__ = ["control_id", "env_id", "register_environments", "register_task"]
 
 CONTROL_VERSION = 1
 """Of the ids of control: rises with any change of its physics, observation or reward."""
-CONTROL_ALONE = ("whip", "whip-target", "fold-fabric-1")
+CONTROL_ALONE = (
+    "whip", "whip-target", "push-cable", "fold-fabric-1", "fold-fabric-3", "unfold-fabric-1",
+    "unfold-fabric-3", "gather",
+)  # fmt: skip
 """Tasks that are only for control; they stand in `warp_deform.control.registry`."""
 
 Registered = TypeVar("Registered", bound="type[Task]")

@@ -351,6 +351,8 @@ class SolverData(PackedWorlds):
     def set_bodies(self, world: int, body_q: np.ndarray, body_qd: np.ndarray | None = None) -> None:
         """Set poses (B, 7) and twists (B, 6: linear at the centre of mass, angular) of a world."""
         rows = self.body_rows(world)
+        if rows.start == rows.stop:  # as of most cables and fabrics, which are looked at often
+            return np.zeros((0, 7), self.number), np.zeros((0, 6), self.number)
         com = self.topologies[self.world_topology[world]].body_com
         views = self.views
         quat = np.asarray(body_q)[:, 3:]
@@ -365,6 +367,8 @@ class SolverData(PackedWorlds):
     def body_poses(self, world: int) -> tuple[np.ndarray, np.ndarray]:
         """Poses (B, 7) of the bodies' frames and twists (B, 6) of one world."""
         rows = self.body_rows(world)
+        if rows.start == rows.stop:  # as of most cables and fabrics, which are looked at often
+            return np.zeros((0, 7), self.number), np.zeros((0, 6), self.number)
         com = self.topologies[self.world_topology[world]].body_com
         views = self.views
         pose = self.frame_poses(views["bodies.x"][rows], views["bodies.q"][rows], com)

@@ -1,0 +1,166 @@
+"""Ports of published tasks: starts, scores by their sources, bits in any company, and cheats."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from warp_deform.control import CONTROL_TASKS, ControlWorlds, EpisodeProblem
+from warp_deform.control.plan_players import carry_rows
+from warp_deform.control.push_cable import push_actions
+from warp_deform.control.registry import control_task
+from warp_deform.errors import InputError
+from warp_deform.tasks.fabric_shape import fold_over
+from warp_deform.tasks.registration import CONTROL_ALONE
+
+
+class State:
+    """A snapshot of nothing but points."""
+
+    def __init__(self, particle_q: np.ndarray, body_q: np.ndarray, objects: tuple = ()) -> None:
+        self.particle_q, self.body_q, self.objects = particle_q, body_q, objects
+
+
+def start(name: str, seed: int = 0):
+    """Task and start of a seed, as laid out."""
+    task = control_task(name)
+    layout = task.sample(np.random.default_rng(seed), None)
+    return task, layout, State(layout.particle_q, layout.body_q)
+
+
+def test_ids_and_tasks_are_the_same() -> None:
+    assert set(CONTROL_ALONE) == set(CONTROL_TASKS)
+
+
+def test_the_cost_of_gather_is_its_sources() -> None:
+    task, layout, state = start("gather")
+    unit = 0.02 / task.cable.spacing
+    rope, boxes = unit * layout.particle_q, unit * layout.body_q[:, :3]
+    pairs = sum(np.linalg.norm(boxes[i] - boxes[j]) for i, j in ((0, 1), (1, 2), (0, 2)))
+    away = np.linalg.norm(rope[:, None] - boxes, axis=2)
+    assert task.cost(layout, state) == pytest.approx(pairs + 0.1 * away.min(axis=0).sum(), abs=1e-4)
+    # an end 4 cm too near to a box costs 4, in the source's metres
+    state.particle_q = state.particle_q.copy()
+    state.particle_q[-1] = layout.body_q[1, :3] + [0.06 / unit, 0.0, 0.0]
+    assert task.cost(layout, state) - 100 * 0.04 < pairs + 0.1 * away.min(axis=0).sum()
+    assert task.score(layout, state) < 0.02 < 0.3 < task.score(layout, start("gather")[2])
+
+
+@pytest.mark.parametrize("name", ["push-cable", "gather"])
+def test_losses_are_batched_and_have_slopes(name: str) -> None:
+    task, layout, _ = start(name)
+    other = task.sample(np.random.default_rng(1), None)
+    rng = np.random.default_rng(2)
+    q = torch.tensor(np.stack([layout.particle_q, other.particle_q]))
+    q = q + torch.tensor(rng.normal(0, 1e-3, q.shape))
+    body_q = torch.tensor(np.stack([layout.body_q, other.body_q]))
+    both = task.losses([layout, other], [], q, body_q)
+    for k, each in enumerate((layout, other)):
+        alone = task.losses([each], [], q[k : k + 1], body_q[k : k + 1])
+        assert torch.equal(alone[0], both[k])
+    beads = [0, 15, -1]
+    part = q[:1, beads].clone().requires_grad_()
+
+    def loss(points: torch.Tensor) -> torch.Tensor:
+        moved = q[:1].index_copy(1, torch.tensor([0, 15, q.shape[1] - 1]), points)
+        return task.losses([layout], [], moved, body_q[:1])
+
+    assert torch.autograd.gradcheck(loss, part, atol=1e-4)
+
+
+def test_a_fold_keeps_lengths_and_stacks_layers() -> None:
+    sheet = np.zeros((25, 3))
+    sheet[:, 0], sheet[:, 1] = (
+        np.tile(np.linspace(0, 0.2, 5), 5),
+        np.repeat(np.linspace(0, 0.2, 5), 5),
+    )
+    folded = fold_over(sheet, sheet[0], sheet[24], 0.01)
+    assert folded[0, :2] == pytest.approx(sheet[24, :2]) and np.array_equal(folded[24], sheet[24])
+    twice = fold_over(folded, folded[4], folded[24], 0.01)
+    assert twice[4, :2] == pytest.approx(sheet[24, :2], abs=1e-9)
+    assert twice[:, 2].max() >= folded[:, 2].max()
+
+
+def test_pushes_go_where_they_are_told_and_not_faster_than_a_tip() -> None:
+    control = control_task("push-cable").control
+    ends = np.array([[[0.5, 0.1], [0.6, 0.1]], [[0.4, -0.1], [0.4, 0.05]]])
+    moves = push_actions(np.array([0.4, 0.0]), ends, control)
+    assert moves.shape == (40, 3) and np.linalg.norm(moves, axis=1).max() <= 1
+    way = np.array([0.4, 0.0, 0.0]) + 0.05 * np.cumsum(moves, axis=0)
+    assert way[[11, 19, 31, 39], :2] == pytest.approx(ends.reshape(4, 2))
+    assert way[9, 2] == pytest.approx(0.05) and way[19, 2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_carry_ends_above_its_place_empty() -> None:
+    control = control_task("fold-fabric-3").control
+    tip, begin, end = (
+        np.array([[0.5, 0, 0.3]]),
+        np.array([[0.4, 0.2, 0.004]]),
+        np.array([[0.6, 0.0]]),
+    )
+    held = []
+    for t in range(60):
+        row = carry_rows(t, tip, begin, end, control)
+        tip = tip + 0.05 * row[:, :3]
+        held.append(row[0, 3] > 0)
+        if t == 16:
+            assert tip[0] == pytest.approx(begin[0], abs=1e-6)
+    assert tip[0] == pytest.approx([0.6, 0.0, 0.06], abs=1e-6)
+    assert sum(held) == 37 and not held[-1]
+
+
+def test_lanes_have_the_bits_of_one_a_tip_keeps_its_hold_and_a_pin_stays() -> None:
+    alone, both = (ControlWorlds("gather", count, action_penalty=0.0) for count in (1, 2))
+    alone.reset({0: 0})
+    both.reset({0: 3, 1: 0})
+    solver, start = alone.worlds.solver, alone.worlds.score(0)
+    pinned, boxes = solver.particle_q(0)[0].copy(), solver.body_q(0).copy()
+    move = np.array([-0.7, -0.5, 0.0, -1.0])
+    for _ in range(9):
+        done = alone.step({0: move})[0]
+        both.step({0: -0.5 * move, 1: move})
+    assert both.worlds.hash(1) == alone.worlds.hash(0) != both.worlds.hash(0)
+    assert np.array_equal(solver.particle_q(0)[0], pinned) and alone.holding(0)
+    assert np.abs(solver.body_q(0) - boxes)[:, :2].max() > 0.01 and not done.terminated
+    # straight to the boxes is the naive term's worst
+    for _ in range(40):
+        way = solver.body_q(0)[1, :2] - alone.worlds.episodes[0].tip[:2]
+        alone.step({0: np.array([*(0.8 * way / np.linalg.norm(way)), 0.3, -1.0])})
+        if np.linalg.norm(way) < 0.04:
+            break
+    assert alone.worlds.score(0) < 0.1 * start
+
+
+def test_a_fabric_starts_folded_covers_little_and_a_search_goes_on_from_it_to_the_bit(
+    monkeypatch,
+) -> None:
+    monkeypatch.setattr(CONTROL_TASKS["unfold-fabric-1"], "horizon", 80)
+    problem = EpisodeProblem("unfold-fabric-1", [4], worlds=8)
+    control, task = problem.control, problem.task
+    control.reset({0: 4})
+    episode = control.worlds.episodes[0]
+    assert task.coverage(episode.layout, episode.snapshot) <= 0.85
+    assert not episode.history and not control.holding(0) and not task.solved(
+        episode.layout, episode.snapshot
+    )  # fmt: skip
+    flat = State(episode.layout.targets, episode.layout.body_q, episode.snapshot.objects)
+    assert task.coverage(episode.layout, flat) > 0.98 and task.solved(episode.layout, flat)
+    # neither beside its place, nor crumpled onto one point, is it spread
+    aside = flat.particle_q + np.array([0.05, 0, 0])
+    for q in (aside, 0.1 * flat.particle_q + 0.9 * flat.particle_q[:1]):
+        assert not task.solved(episode.layout, State(q, flat.body_q, flat.objects))
+    played = problem.play([0], np.array([[[1.0, 1, 0, 0]]]))
+    alone = ControlWorlds("unfold-fabric-1", 1, action_penalty=0.0)
+    alone.reset({0: 4})
+    for action in played.actions[0]:
+        alone.step({0: action})
+    assert alone.steps[0] == 80 and alone.worlds.episodes[0].physics_ok
+    assert np.array_equal(alone.worlds.episodes[0].snapshot.particle_q, played.particle_q[0])
+
+
+def test_what_has_no_plans_is_said() -> None:
+    with pytest.raises(InputError, match="not made for control"):
+        EpisodeProblem("cable-ring", [0])
+    with pytest.raises(InputError, match="multiple of 8"):
+        EpisodeProblem("gather", [0], worlds=3)

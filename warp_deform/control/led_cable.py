@@ -1,0 +1,79 @@
+"""What ports of DLO-Lab's tasks share: a cable whose one end is led for 100 steps.
+
+Source: DLO-Lab (arXiv 2606.04206). Its rewards are exp(-cost), with costs of lengths in metres on a
+rope whose vertices are 2 cm apart. Costs here have the same formulas, of lengths told in that
+rope's metres: what is 20 mm there is one spacing here. An episode's return is the sum of the scores
+of its 100 steps.
+
+Two arms there, one here: where the source holds both ends, here one is pinned. Its two arms also
+turn the rope's ends; a tip here takes no bead round its own axis.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from ..objects.cable import Cable, CableConfig
+from ..tasks.task import Action, Layout, Snapshot, Stage
+from ..xpbd.config import SolverConfig
+from .control_task import ControlTask
+from .modes import ControlConfig
+
+if TYPE_CHECKING:
+    import newton
+    from torch import Tensor
+
+__all__ = ["CABLE", "LedCable", "pin"]
+
+_SPACING = 0.02
+"""Between two vertices of the source's ropes [m]."""
+CABLE = SolverConfig(
+    table_friction=0.35, contact_friction=0.2, damping=1.0, max_speed=8.0, margin=0.02
+)
+"""Physics of a cable that is led, as in `whip`."""
+
+
+def pin(builder: newton.ModelBuilder, cable: Cable, bead: int) -> None:
+    """Fix a bead where it is: it has no mass, so nothing moves it."""
+    builder.particle_mass[cable.particles[bead]] = 0.0
+
+
+class LedCable(ControlTask):
+    """A cable whose last bead the tip holds, and never lets go."""
+
+    stages = (Stage(lift=0.04, speed=0.15),)
+    solver = CABLE
+    objects: ClassVar[tuple[str, ...]] = ("cable",)
+    control = ControlConfig(max_speed=1.0)
+    horizon = 100
+    keeps_hold = True
+
+    cable: ClassVar[CableConfig]
+
+    def in_source(self, points: Tensor) -> Tensor:
+        """Points, or lengths, in the source's metres."""
+        return points * (_SPACING / self.cable.spacing)
+
+    def score(self, layout: Layout, snapshot: Snapshot) -> float:
+        """The source's reward of a step, exp(-cost)."""
+        return float(np.exp(-self.cost(layout, snapshot)))
+
+    def cost(self, layout: Layout, snapshot: Snapshot) -> float:
+        """The source's cost of a state: `loss`, as a number."""
+        import torch
+
+        state = (torch.from_numpy(q.astype(float)) for q in (snapshot.particle_q, snapshot.body_q))
+        with torch.no_grad():
+            return float(self.loss(layout, snapshot, *state))
+
+    def acceptable(self, layout: Layout, snapshot: Snapshot) -> bool:
+        """Any start that is not solved."""
+        return not self.solved(layout, snapshot)
+
+    def demonstrate(
+        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
+    ) -> Action | None:
+        """None: no pick and place does it."""
+        return None

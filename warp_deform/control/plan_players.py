@@ -1,0 +1,160 @@
+"""What plans of tasks made for control do, step by step: smooth motions, pushes, picks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from ..tasks.task import Layout
+from .modes import ControlConfig
+from .push_cable import push_actions
+from .smooth_plans import actions_of
+
+__all__ = ["FoldPlayer", "Player", "PushPlayer", "SmoothPlayer", "SpreadPlayer"]
+
+_FOLD_STEPS = 60
+_OVER, _DOWN, _CARRY, _WAIT, _GO = 12, 16, 48, 53, 60
+"""Step at which the tip is over a vertex, on it, at the end of a carry, calm, and up again."""
+_HOVER = 0.06
+_ARC = (0.03, 0.14)
+"""Least and greatest height of a carry, which is half as high as it is long [m]."""
+
+
+class Player(Protocol):
+    """Plays plans side by side: numbers in, actions in the mode "tip_delta_position" out."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of the free numbers of a plan."""
+
+    def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
+        """Begin plans with these numbers (n, *shape), one a world."""
+
+    def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
+        """Actions (n, 4) of a step, with the tips at (n, 3) and the particles at (n, P, 3) [m]."""
+
+
+class SmoothPlayer:
+    """Motions that change smoothly, of a tip that holds on.
+
+    Args:
+        steps: of an episode
+        knots: points in time at which the numbers are free
+    """
+
+    def __init__(self, steps: int, knots: int = 10) -> None:
+        self.steps, self.shape = steps, (knots, 3)
+
+    def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
+        """See `Player`."""
+        self._moves = actions_of(numbers, self.steps)
+
+    def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
+        """See `Player`."""
+        return np.pad(self._moves[:, step], ((0, 0), (0, 1)), constant_values=1.0)
+
+
+class PushPlayer:
+    """Straight pushes of a box; numbers are where each begins, and by how much it goes [10 cm].
+
+    They begin around the middle of the cable, as it lies at first.
+    """
+
+    def __init__(self, control: ControlConfig, pushes: int = 6) -> None:
+        self.control, self.shape = control, (pushes, 4)
+
+    def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
+        """See `Player`."""
+        self._moves = np.stack(
+            [self._actions(plan, each) for plan, each in zip(numbers, layouts, strict=True)]
+        )
+
+    def _actions(self, plan: np.ndarray, layout: Layout) -> np.ndarray:
+        begins = layout.particle_q[:, :2].mean(axis=0) + 0.1 * plan[:, :2]
+        ends = np.stack([begins, begins + 0.1 * plan[:, 2:]], axis=1)
+        return push_actions(layout.body_q[0, :2], ends, self.control)
+
+    def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
+        """See `Player`."""
+        return np.pad(self._moves[:, step], ((0, 0), (0, 1)), constant_values=1.0)
+
+
+class FoldPlayer:
+    """Picks and places of a fabric's vertices, 60 steps each, by what is seen when each begins.
+
+    Numbers are two of the vertex that is picked and two of the place, both in the frame of the flat
+    fabric, whose corners are at -1 and 1; a number beyond counts as the corner's, of places as 1.5.
+
+    Args:
+        flat: entry of the layout that holds the flat fabric (P, 3) [m], rows by columns
+        columns: of it
+    """
+
+    def __init__(self, control: ControlConfig, flat: str, columns: int, picks: int) -> None:
+        self.control, self.flat, self.columns = control, flat, columns
+        self.shape = (picks, 4)
+
+    def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
+        """See `Player`."""
+        sheets = np.stack([getattr(layout, self.flat) for layout in layouts])[..., :2]
+        across = np.linspace(-1.0, 1.0, self.columns)
+        nearest = np.abs(np.clip(numbers[..., :2], -1, 1)[..., None] - across).argmin(-1)
+        self._vertices = nearest[..., 1] * self.columns + nearest[..., 0]
+        first, along, up = (sheets[:, k] for k in (0, self.columns - 1, -self.columns))
+        middle = (along + up) / 2
+        to = np.clip(numbers[..., 2:], -1.5, 1.5)
+        sides = (along - first)[:, None] / 2, (up - first)[:, None] / 2
+        self._places = middle[:, None] + to[..., :1] * sides[0] + to[..., 1:] * sides[1]
+        self._from = np.zeros((len(numbers), 3))
+
+    def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
+        """See `Player`."""
+        k, t = divmod(step, _FOLD_STEPS)
+        if k >= self._places.shape[1]:
+            return np.tile([0.0, 0.0, 0.0, -1.0], (len(tips), 1))
+        if t == 0:
+            self._from = particle_q[np.arange(len(tips)), self._vertices[:, k]].astype(float)
+        return carry_rows(t, tips, self._from, self._places[:, k], self.control)
+
+
+class SpreadPlayer(FoldPlayer):
+    """Again and again the corner that is farthest from its place, to its place: nothing is free."""
+
+    def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
+        """See `Player`."""
+        super().begin(numbers, layouts)
+        self._flat = np.stack([getattr(layout, self.flat) for layout in layouts])
+
+    def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
+        """See `Player`."""
+        k, t = divmod(step, _FOLD_STEPS)
+        if t == 0 and k < self._places.shape[1]:
+            count = particle_q.shape[1]
+            corners = np.array([0, self.columns - 1, count - self.columns, count - 1])
+            away = np.linalg.norm((particle_q - self._flat)[:, corners, :2], axis=2)
+            self._vertices[:, k] = corners[away.argmax(axis=1)]
+            self._places[:, k] = self._flat[np.arange(len(tips)), self._vertices[:, k], :2]
+        return super().rows(step, tips, particle_q)
+
+
+def carry_rows(
+    t: int, tips: np.ndarray, begin: np.ndarray, end: np.ndarray, control: ControlConfig
+) -> np.ndarray:
+    """Actions (n, 4) of step `t` of 60 of a pick at `begin` (n, 3) and a place at `end` (n, 2)."""
+    goal = begin.copy()
+    hold = 1.0 if _DOWN <= t < _WAIT else -1.0
+    if t < _OVER:
+        goal[:, 2] = _HOVER
+    elif t >= _DOWN:
+        u = min(1.0, (t - _DOWN) / (_CARRY - _DOWN))
+        way = end - begin[:, :2]
+        high = np.clip(np.linalg.norm(way, axis=1) / 2, *_ARC)
+        goal[:, :2] += u * way
+        goal[:, 2] = begin[:, 2] + high * np.sin(np.pi * u)
+        if t >= _WAIT:
+            goal[:, 2] = _HOVER
+    way = (goal - tips) / (control.max_speed * control.seconds)
+    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1.0)
+    return np.pad(way, ((0, 0), (0, 1)), constant_values=hold)
