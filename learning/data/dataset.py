@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import os
 import secrets
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from warp_deform.episodes.corrected import is_corrected, labels_of
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
 
-__all__ = ["Demonstrations", "Transition", "choose"]
+__all__ = ["Demonstrations", "Transition", "choose", "remove_cache"]
 
 _FOLDER = "rows"
 _FORMAT = 1
@@ -73,6 +74,11 @@ def choose(seeds: tuple[int, ...], count: int, *, seed: int) -> tuple[int, ...]:
         )
     chosen = np.random.default_rng(seed).choice(np.array(seeds), count, replace=False)
     return tuple(sorted(chosen.tolist()))
+
+
+def remove_cache(folder: Path) -> None:
+    """Remove what training read of a folder; it is made again when it is needed."""
+    shutil.rmtree(Path(folder) / _FOLDER, ignore_errors=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,7 @@ from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.tasks.registry import task as find_task
 
 from ..correction.correct import CorrectConfig, correct
+from ..data.dataset import remove_cache
 from ..evaluation.run import evaluate_run
 from ..policy.policy import AgentDescription
 from ..refinement.refine import RefineConfig, refine
@@ -215,6 +216,7 @@ def _learn(config: DistillConfig, plan: Plan, out: Path, stages: Stages, data: P
             raise WarpDeformError(
                 f"{config.teacher} labels none of {episodes} episodes; choose another --teacher"
             )
+        remove_cache(data)  # a third of a megabyte a state, and the next folder holds them again
         before, data = run, corrected
     last, what = out / "run", f"last training, {plan.last_steps} steps"
     training = _training(
@@ -227,6 +229,7 @@ def _learn(config: DistillConfig, plan: Plan, out: Path, stages: Stages, data: P
         start=before,
     )
     stages("last training", partial(_trained, training), what=what)
+    remove_cache(data)
     return last
 
 

@@ -67,6 +67,7 @@ def test_every_round_learns_from_all_before_it(whole: dict[str, Any]) -> None:
     assert run.read_settings()["demonstrators"] == ["corrected by mpc", "mpc"]
     seeds = EpisodeReader(run.path.parent / "rounds" / "2" / "corrected").seeds
     assert len(seeds) == 4 and max(seeds) < 100
+    assert not list(run.path.parent.rglob("rows"))  # caches would outweigh all else
     assert whole["test"]["n_episodes"] == 1
     spent = sum(each["cpu_seconds"] for each in whole["stages"] if each["stage"] != "test")
     assert whole["cpu_minutes"] == pytest.approx(spent / 60)
