@@ -74,26 +74,28 @@ class TipLimits:
         turn = soft_clamp(library.arctan2(y, x), -_TURN, _TURN, self.turn)
         return library.stack([radius * library.cos(turn), radius * library.sin(turn), z, yaw], -1)
 
-    def kept(self, targets: np.ndarray, floors: np.ndarray) -> np.ndarray:
+    def kept(self, targets: Any, floors: Any) -> Any:
         """Targets (..., 4) as they are remembered: at most three widths beyond a limit.
 
         A target that is pushed against a limit for long would else take as long to come back.
         """
-        x, y, z, yaw = np.moveaxis(np.asarray(targets, dtype=float), -1, 0)
+        library = _library(targets)
+        x, y, z, yaw = (targets[..., k] for k in range(4))
         beyond = _WIND_UP * self.table
-        z = np.clip(z, floors - beyond, self.ceiling + beyond)
-        near, far = self._radii(np.clip(z, floors, self.ceiling))
+        # one limit after the other: torch takes no number beside an array
+        z = library.clip(library.maximum(z, floors - beyond), None, self.ceiling + beyond)
+        near, far = self._radii(library.clip(library.maximum(z, floors), None, self.ceiling))
         beyond = _WIND_UP * self.reach
-        wanted = np.hypot(x, y)
-        radius = np.clip(wanted, np.maximum(near - beyond, 1e-3), far + beyond)
+        wanted = library.hypot(x, y)
+        radius = library.clip(wanted, library.clip(near - beyond, 1e-3, None), far + beyond)
         beyond = _WIND_UP * self.turn
-        angle = np.arctan2(y, x)
-        turn = np.clip(angle, -_TURN - beyond, _TURN + beyond)
+        angle = library.arctan2(y, x)
+        turn = library.clip(angle, -_TURN - beyond, _TURN + beyond)
         same = (radius == wanted) & (turn == angle)
-        # what is within the limits keeps its bits
-        x = np.where(same, x, radius * np.cos(turn))
-        y = np.where(same, y, radius * np.sin(turn))
-        return np.stack([x, y, z, yaw], axis=-1)
+        if not same.all():  # what is within the limits keeps its bits
+            x = library.where(same, x, radius * library.cos(turn))
+            y = library.where(same, y, radius * library.sin(turn))
+        return library.stack([x, y, z, yaw], -1)
 
     def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.robot.reach_by_height
@@ -105,10 +107,11 @@ class TipLimits:
             return np.interp(z, heights, smallest), np.interp(z, heights, largest)
         import torch
 
-        grid = z.new_tensor(heights)
+        grid, near, far = (
+            torch.from_numpy(np.ascontiguousarray(values)).to(z) for values in (heights, smallest, largest)
+        )
         k = torch.searchsorted(grid, z.detach().contiguous()).clamp(1, len(heights) - 1)
         u = (z - grid[k - 1]) / (grid[k] - grid[k - 1])
-        near, far = z.new_tensor(smallest), z.new_tensor(largest)
         return near[k - 1] + u * (near[k] - near[k - 1]), far[k - 1] + u * (far[k] - far[k - 1])
 
 

@@ -2,7 +2,7 @@
 
 A `PlanProblem` has G goals, for each of which a plan is searched, and evaluates many plans at once:
 in the lanes of one simulator that is what costs least. Methods see free numbers, K x 3 a plan (see
-`smooth_plans`), and losses; none needs a derivative.
+`smooth_plans`), and losses. Those of `plan_descent` also see derivatives; those here need none.
 
 Sources: cross-entropy method: Rubinstein, "The Cross-Entropy Method for Combinatorial and
 Continuous Optimization", 1999. CMA-ES: Hansen and Ostermeier, "Completely Derandomized
@@ -11,18 +11,17 @@ Self-Adaptation in Evolution Strategies", 2001, by the package `cmaes`.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from ..errors import InputError, WarpDeformError
 from ..support.checked import COUNT, POSITIVE, check_number
 from ..support.extras import install_extra
+from .plan_descent import adam, lbfgs
+from .plan_problem import OptimizedPlans, PlanProblem, Rounds, Search
 
-__all__ = ["OptimizedPlans", "PlanProblem"]  # `warp_deform.control` has `optimize` and `METHODS`
+__all__: list[str] = []  # `warp_deform.control` is the import path of what is here
 
 _ELITE = 0.2
 """Share of the draws from which the cross-entropy method draws next."""
@@ -31,84 +30,19 @@ _KEEP = 0.2
 _SPREAD = 1.5
 """Standard deviation of the free numbers at first: as of the swings that make goals."""
 _LEAST_SPREAD = 0.02
+_SEARCHES = 0.4
+"""Share of the budget that "cem+adam" searches before it descends."""
 
 
-class PlanProblem(Protocol):
-    """Goals, and what plans for them come to."""
-
-    @property
-    def goals(self) -> int:
-        """Number of goals G."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Of the free numbers of a plan (K, 3)."""
-
-    def evaluate(self, numbers: np.ndarray) -> np.ndarray:
-        """Losses (G, N) of plans with these free numbers (G, N, K, 3); inf where a guard fires."""
-
-
-@dataclass(frozen=True, eq=False)
-class OptimizedPlans:
-    """What a search found.
-
-    Attributes:
-        numbers: free numbers of the best plans (G, K, 3)
-        losses: of these (G,); inf where every plan made a guard fire
-        evaluations: plans that were evaluated for each goal
-        cpu_seconds: process time that the search took
-        history: best losses so far (R, G) after every round
-    """
-
-    numbers: np.ndarray
-    losses: np.ndarray
-    evaluations: int
-    cpu_seconds: float
-    history: np.ndarray
-
-
-class _Search:
-    """Evaluates within the budget and keeps the best."""
-
-    def __init__(self, problem: PlanProblem, seconds: float | None, evaluations: int | None):
-        self.problem, self.seconds, self.most = problem, seconds, evaluations
-        self.numbers = np.zeros((problem.goals, *problem.shape))
-        self.losses = np.full(problem.goals, np.inf)
-        self.evaluations, self.history = 0, list[np.ndarray]()
-        self._begun = time.process_time()
-
-    @property
-    def spent(self) -> float:
-        return time.process_time() - self._begun
-
-    def goes_on(self) -> bool:
-        """Whether another round fits the budget; there is one at least."""
-        if not self.history:
-            return True
-        if self.most is not None:
-            return self.evaluations + self.evaluations // len(self.history) <= self.most
-        assert self.seconds is not None
-        return self.spent * (1 + 1 / len(self.history)) <= self.seconds
-
-    def evaluate(self, numbers: np.ndarray) -> np.ndarray:
-        losses = np.asarray(self.problem.evaluate(numbers))
-        losses = np.where(np.isfinite(losses), losses, np.inf)
-        best = losses.argmin(axis=1)
-        rows = np.arange(len(best))
-        better = losses[rows, best] < self.losses
-        self.losses[better] = losses[rows, best][better]
-        self.numbers[better] = numbers[rows, best][better]
-        self.evaluations += numbers.shape[1]
-        self.history.append(self.losses.copy())
-        return losses
-
-
-def _cem(search: _Search, rng: np.random.Generator, population: int) -> None:
+def _cem(
+    search: Search, rng: np.random.Generator, population: int, *, share: float = 1.0
+) -> None:
     """Draw around the mean of the best draws, with their spread, a goal by itself."""
     goals, shape = search.problem.goals, search.problem.shape
     mean, spread = np.zeros((goals, *shape)), np.full((goals, *shape), _SPREAD)
     elite = max(2, round(_ELITE * population))
-    while search.goes_on():
+    rounds = Rounds(search, share)
+    while rounds.goes_on():
         noise = rng.normal(size=(goals, population, *shape))
         draws = mean[:, None] + spread[:, None] * noise
         if search.history:
@@ -121,7 +55,7 @@ def _cem(search: _Search, rng: np.random.Generator, population: int) -> None:
         spread = np.maximum(found, _LEAST_SPREAD)
 
 
-def _cmaes(search: _Search, rng: np.random.Generator, population: int) -> None:
+def _cmaes(search: Search, rng: np.random.Generator, population: int) -> None:
     """One covariance matrix adaptation a goal, side by side."""
     try:
         from cmaes import CMA
@@ -135,7 +69,8 @@ def _cmaes(search: _Search, rng: np.random.Generator, population: int) -> None:
         CMA(mean=np.zeros(size), sigma=_SPREAD, population_size=population, seed=int(seed))
         for seed in seeds
     ]
-    while search.goes_on():
+    rounds = Rounds(search)
+    while rounds.goes_on():
         draws = np.array([[one.ask() for _ in range(population)] for one in each])
         losses = search.evaluate(draws.reshape(goals, population, *shape))
         # it sorts by loss, so what a guard has ended only has to be worst
@@ -144,24 +79,55 @@ def _cmaes(search: _Search, rng: np.random.Generator, population: int) -> None:
             one.tell(list(zip(points, values.tolist(), strict=True)))
 
 
-def _random(search: _Search, rng: np.random.Generator, population: int) -> None:
+def _random(search: Search, rng: np.random.Generator, population: int) -> None:
     """The best of independent draws: what a method has to beat."""
     shape = (search.problem.goals, population, *search.problem.shape)
-    while search.goes_on():
+    rounds = Rounds(search)
+    while rounds.goes_on():
         search.evaluate(rng.normal(0.0, _SPREAD, shape))
 
 
-METHODS: dict[str, Callable[[_Search, np.random.Generator, int], None]] = {
+def _drawn_once(search: Search, rng: np.random.Generator, population: int) -> None:
+    """One round of draws: from the best of them a method descends."""
+    shape = (search.problem.goals, population, *search.problem.shape)
+    search.evaluate(rng.normal(0.0, _SPREAD, shape))
+
+
+def _adam(search: Search, rng: np.random.Generator, population: int) -> None:
+    """Adam from the best of one round of draws."""
+    search.check_slopes("adam")
+    _drawn_once(search, rng, population)
+    adam(search)
+
+
+def _lbfgs(search: Search, rng: np.random.Generator, population: int) -> None:
+    """L-BFGS from the best of one round of draws."""
+    search.check_slopes("lbfgs")
+    _drawn_once(search, rng, population)
+    lbfgs(search)
+
+
+def _cem_adam(search: Search, rng: np.random.Generator, population: int) -> None:
+    """A search with part of the budget, then Adam from the best that it has found."""
+    search.check_slopes("cem+adam")
+    _cem(search, rng, population, share=_SEARCHES)
+    adam(search)
+
+
+METHODS: dict[str, Callable[[Search, np.random.Generator, int], None]] = {
     "cem": _cem,
     "cmaes": _cmaes,
     "random": _random,
+    "adam": _adam,
+    "lbfgs": _lbfgs,
+    "cem+adam": _cem_adam,
 }
 """The methods by name."""
 
 
 def optimize(
     problem: PlanProblem,
-    method: str = "cem",
+    method: str = "cem+adam",
     *,
     seconds: float | None = None,
     evaluations: int | None = None,
@@ -171,20 +137,22 @@ def optimize(
     """Search a plan for every goal of a problem.
 
         problem = SwingProblem("whip", seeds=range(32))
-        found = optimize(problem, "cem", evaluations=250)
+            found = optimize(problem, seconds=6.0)
 
     A budget in evaluations gives the same plans whenever it is run; one in seconds does not, as it
     depends on the machine. One round is made in any case.
 
     Args:
-        method: "cem", "cmaes" or "random"
+        method: "cem", "cmaes", "random"; with derivatives "adam", "lbfgs", and "cem+adam", which
+            searches with 40 % of the budget and descends with the rest
         seconds: of the process's CPU time, for all goals together
-        evaluations: plans for each goal at most
+        evaluations: plans for each goal at most; one with derivatives counts 2.5
         population: plans a round for each goal
         seed: of the draws
 
     Raises:
-        InputError: there is no such method, or not exactly one budget.
+        InputError: there is no such method, not exactly one budget, or no derivatives for a
+            method that needs them.
         WarpDeformError: the method's package is not installed.
     """
     if method not in METHODS:
@@ -197,8 +165,14 @@ def optimize(
         check_number(evaluations, "evaluations", COUNT)
     if check_number(population, "population", COUNT) < 4:
         raise InputError(f"population is {population}; a round needs 4 plans or more")
-    search = _Search(problem, seconds, evaluations)
+    search = Search(problem, seconds, evaluations)
     METHODS[method](search, np.random.default_rng(seed), population)
     return OptimizedPlans(
-        search.numbers, search.losses, search.evaluations, search.spent, np.array(search.history)
+        numbers=search.numbers,
+        losses=search.losses,
+        evaluations=search.evaluations,
+        slopes=search.slopes,
+        unusable=search.unusable,
+        cpu_seconds=search.spent,
+        history=np.array(search.history),
     )

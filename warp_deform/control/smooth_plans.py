@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import functools
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-__all__ = ["KNOTS", "actions_of", "smooth_plan"]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["KNOTS", "actions_of", "numbers_of", "smooth_plan", "tensor_actions_of"]
 
 KNOTS = 6
 """Points in time at which a plan's numbers are free; in between they are interpolated."""
@@ -17,8 +21,19 @@ def actions_of(knots: np.ndarray, steps: int) -> np.ndarray:
 
     Numbers are linear in time between the knots; u becomes u / sqrt(1 + |u|^2).
     """
-    numbers = _spread(knots.shape[-2], steps) @ knots
+    numbers = numbers_of(knots, steps)
     return np.asarray(numbers / np.sqrt(1 + (numbers**2).sum(axis=-1, keepdims=True)))
+
+
+def numbers_of(knots: np.ndarray, steps: int) -> np.ndarray:
+    """Numbers (..., T, 3), those of every step, of free numbers (..., K, 3)."""
+    return np.asarray(_spread(knots.shape[-2], steps) @ knots)
+
+
+def tensor_actions_of(knots: Tensor, steps: int) -> Tensor:
+    """`actions_of` for tensors of torch."""
+    numbers = knots.new_tensor(_spread(knots.shape[-2], steps)) @ knots
+    return numbers / (1 + (numbers**2).sum(dim=-1, keepdim=True)).sqrt()
 
 
 def smooth_plan(rng: np.random.Generator, steps: int, spread: float = 1.5) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,7 +12,12 @@ from ..rollout.rollouts import GripPath, rollout
 from .control_task import ControlTask
 from .control_worlds import ControlWorlds
 from .modes import TipTargets
-from .smooth_plans import KNOTS, actions_of
+from .smooth_plans import KNOTS, actions_of, numbers_of, tensor_actions_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..rollout.tensor_control import TensorControlLoop
 
 __all__: list[str] = []  # `warp_deform.control` is the import path of what is here
 
@@ -61,6 +67,7 @@ class SwingProblem:
         self._positions, self._velocities = np.stack(positions), np.stack(velocities)
         self._floors = np.array(floors)
         self._knot_times = self._times()
+        self._loop: TensorControlLoop | None = None
 
     def _starts(self, seeds: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray, float, object]]:
         """Positions, velocities, lowest height of the tip and layout of every seed."""
@@ -92,7 +99,7 @@ class SwingProblem:
         return KNOTS, 3
 
     def actions(self, numbers: np.ndarray) -> np.ndarray:
-        """Actions (..., T, 4) of the environment for plans (..., K, 3)."""
+        """Actions (..., T, 4) of the environment for plans (..., K, 3) of any number K."""
         moves = actions_of(numbers, self._control.horizon)
         return np.concatenate([moves, np.ones((*moves.shape[:-1], 1))], axis=-1)
 
@@ -113,17 +120,11 @@ class SwingProblem:
         return of, np.concatenate([self._ends(of[part], actions[part]) for part in parts])
 
     def _ends(self, of: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        solver, held = self._solver, self.task.held_particle
-        assert held is not None, "it was looked at before"
-        data, worlds = solver.data, list(range(len(of)))
+        solver, held, worlds = self._solver, self._held, list(range(len(of)))
+        steps = self._led(of, actions)
         places = self._positions[of, held].astype(float)
-        self._targets.floors[worlds] = self._floors[of]
-        self._targets.place(worlds, np.pad(places, ((0, 0), (0, 1))))
-        steps = [self._targets.follow(worlds, rows)[:, -1, :3] for rows in actions.swapaxes(0, 1)]
         knots = np.stack([places, *steps, steps[-1]], axis=1)
-        for w in worlds:
-            data.lane("particles.x", w)[:] = self._positions[of[w]]
-            data.lane("particles.v", w)[:] = self._velocities[of[w]]
+        self._put(of)
         seconds = self._control.horizon * self._control.control.loop.seconds
         paths = {w: GripPath(self._knot_times, knots[w], particle=held) for w in worlds}
         runs = rollout(solver, worlds, paths=paths, least=2 * seconds, most=seconds)
@@ -132,6 +133,88 @@ class SwingProblem:
         wrong = [bool(runs[w].watch.problems(w, limits)) for w in worlds]
         ends[wrong] = np.nan
         return ends
+
+    def _led(self, of: np.ndarray, actions: np.ndarray) -> list[np.ndarray]:
+        """Where the tips are told to be (n, 3) [m] at the ends of T steps."""
+        worlds = list(range(len(of)))
+        places = self._positions[of, self._held].astype(float)
+        self._targets.floors[worlds] = self._floors[of]
+        self._targets.place(worlds, np.pad(places, ((0, 0), (0, 1))))
+        return [self._targets.follow(worlds, rows)[:, -1, :3] for rows in actions.swapaxes(0, 1)]
+
+    def _put(self, of: np.ndarray) -> None:
+        """Put worlds to the starts of goals."""
+        data = self._solver.data
+        for w, goal in enumerate(of):
+            data.lane("particles.x", w)[:] = self._positions[goal]
+            data.lane("particles.v", w)[:] = self._velocities[goal]
+
+    @property
+    def _held(self) -> int:
+        assert self.task.held_particle is not None, "it was looked at before"
+        return self.task.held_particle
+
+    def refined(self, numbers: np.ndarray) -> np.ndarray:
+        """Numbers (G, T, 3), three a step, of the plans that have numbers (G, K, 3)."""
+        return numbers_of(numbers, self._control.horizon)
+
+    def slopes(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Losses (G,) of plans (G, K, 3), one a goal, and their derivatives (G, K, 3).
+
+        The losses have the bits of `evaluate`. Where a guard fires they are inf, and the
+        derivatives mean nothing.
+        """
+        room = self._control.worlds.count
+        parts = [
+            self._sloped(np.arange(first, min(first + room, len(numbers))), numbers)
+            for first in range(0, len(numbers), room)
+        ]
+        losses, slopes = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return losses, slopes
+
+    def _sloped(self, of: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        import torch
+
+        from ..rollout.tensor_control import TensorControlLoop
+
+        rate = self._control.config.rate
+        loop = self._loop = self._loop or TensorControlLoop(self._solver, rate=rate)
+        worlds = list(range(len(of)))
+        sent = np.stack(self._led(of, self.actions(numbers[of])))
+        free = torch.tensor(numbers[of], dtype=torch.float64, requires_grad=True)
+        ways = self._tensor_ways(of, tensor_actions_of(free, self._control.horizon))
+        # the values of the environment, to the bit; the derivatives of torch
+        ways = torch.from_numpy(sent) + (ways - ways.detach())
+        self._put(of)
+        loop.begin(worlds)
+        for w in worlds:
+            loop.hold(w, particle=self._held)
+        for way in ways:
+            state = loop.advance(way)
+        loop.end()
+        layouts = [self.layouts[goal] for goal in of]
+        ends = state.positions.double()
+        bodies = torch.zeros((len(of), 0, 7), dtype=torch.float64)
+        losses = self.task.losses(layouts, [], ends, bodies)
+        (slopes,) = torch.autograd.grad(losses.sum(), free)
+        out = losses.detach().numpy().copy()
+        out[[w for w in worlds if w in loop.problems]] = np.inf
+        return np.where(np.isfinite(out), out, np.inf), slopes.numpy()
+
+    def _tensor_ways(self, of: np.ndarray, moves: Tensor) -> Tensor:
+        """Targets of the tips (T, n, 3) [m] for actions (n, T, 3), as `TipTargets` makes them."""
+        import torch
+
+        config, limits = self._control.config, self._control.limits
+        floors = torch.from_numpy(self._floors[of])
+        places = torch.from_numpy(self._positions[of, self._held].astype(float))
+        asked = torch.nn.functional.pad(places, (0, 1))
+        steps = torch.nn.functional.pad(moves, (0, 1)) * (config.max_speed * config.seconds)
+        ways = []
+        for step in steps.unbind(1):
+            asked = limits.kept(asked + step, floors)
+            ways.append(asked)
+        return limits.project(torch.stack(ways), floors)[..., :3]
 
     def _losses(self, of: np.ndarray, ends: np.ndarray) -> np.ndarray:
         import torch

@@ -42,7 +42,8 @@ class TensorControlLoop:
     was freed are refused. Nothing is recorded without a tensor that requires grad, or under
     `torch.no_grad`. A second derivative is refused.
 
-    A tip is where the particle is that it holds, or at the centre of mass of a body, turned as it.
+    A tip is where the particle is that it holds, or at the centre of mass of a body, turned as it,
+    unless `hold` says where it is.
     Worlds of one topology take part together, in the order in which they were named first. One that
     has ended, while others go on, may begin again as it is then.
 
@@ -170,19 +171,38 @@ class TensorControlLoop:
         number = self.solver.data.number
         return TensorState(*(torch.from_numpy(np.array(s, dtype=number)) for s in state))
 
-    def hold(self, world: int, *, particle: int | None = None, body: int | None = None) -> None:
+    def hold(
+        self,
+        world: int,
+        *,
+        particle: int | None = None,
+        body: int | None = None,
+        tip: np.ndarray | None = None,
+        rotation: np.ndarray | None = None,
+    ) -> None:
         """Hold a particle or a body from now on, where it is.
+
+        Args:
+            tip: see `ControlLoop.hold`; what is held then follows it at a fixed distance, of which
+                there is no derivative. None: the tip is at the particle, or the centre of mass
+            rotation: of that tip (4,) quat_xyzw
 
         Raises:
             InputError: the world has not begun, holds something, or has nothing of the kind.
         """
-        rotation = None
-        if body is not None:
+        if body is not None and tip is None:
             self._launch.check_holdable(world, particle, body)
             row = self.solver.data.body_rows(world).start + body
             rotation = self.solver.data.views["bodies.q"][row].astype(float)
-        self._plain.hold(world, particle=particle, body=body, rotation=rotation)
-        self._taken.append((self.worlds.index(world), particle, body))
+        self._plain.hold(world, particle=particle, body=body, tip=tip, rotation=rotation)
+        k = self.worlds.index(world)
+        if tip is None:
+            self._taken.append((k, particle, body))
+            return
+        turn = (0.0, 0.0, 0.0, 1.0) if rotation is None else rotation
+        self._tips, self._turns = self.tips, self.turns
+        self._tips = put(self._tips, (k,), self._tips.new_tensor(np.asarray(tip, float)))
+        self._turns = put(self._turns, (k,), self._turns.new_tensor(np.asarray(turn, float)))
 
     def _place_tips(self) -> None:
         """Put tips to what has been taken hold of since the last step, for all worlds at once."""
