@@ -12,6 +12,7 @@ _HOME = {
     "METHODS": ".plan_search",
     "EpisodeProblem": ".episode_problem",
     "SwingProblem": ".swing_problem",
+    "TensorControlWorlds": ".tensor_worlds",
     "optimize": ".plan_search",
 }
 

@@ -20,6 +20,8 @@ __all__ = ["adam", "lbfgs"]
 
 _LR = 0.15
 """Adam's step size at first; it falls linearly to nothing."""
+_BETAS = (0.7, 0.95)
+"""Of its running means: short ones, for derivatives change their size a hundredfold on the way."""
 _LOST = 1e6
 """What a plan that a guard ends counts for a line search, which needs a number."""
 
@@ -33,7 +35,7 @@ def adam(search: Search) -> None:
 
     search.refine()
     plans = torch.tensor(search.numbers)
-    optimizer = torch.optim.Adam([plans], lr=_LR)
+    optimizer = torch.optim.Adam([plans], lr=_LR, betas=_BETAS)
     rounds = Rounds(search, first=not search.history)
     while rounds.goes_on():
         optimizer.param_groups[0]["lr"] = _LR * (1.0 - rounds.done)

@@ -96,6 +96,10 @@ class TensorControlWorlds(ControlWorlds):
         self._tensors = TensorControlLoop(
             self.worlds.solver, rate=self.config.rate, memory=memory
         )
+        self.beyond = torch.zeros(count, dtype=torch.float64)
+        """How far the last targets lay from where the tips were led for them (W,) [m].
+
+        What presses against a limit has no slope there: this leads it back."""
         self._starts: dict[int, _Start] = {}
         self._live = np.zeros(count, bool)
         self._asked = torch.zeros(count, 4, dtype=torch.float64)
@@ -108,6 +112,11 @@ class TensorControlWorlds(ControlWorlds):
     def holding(self, slot: int) -> bool:
         """Whether the tip of a slot holds something."""
         return self._grips[slot] != _NOTHING
+
+    @property
+    def trusted(self) -> np.ndarray:
+        """In which worlds no guard has fired (W,) bool."""
+        return np.array([self.worlds.episodes[s].physics_ok for s in range(self.worlds.count)])
 
     # -- starting
 
@@ -214,8 +223,7 @@ class TensorControlWorlds(ControlWorlds):
         self.steps[slots] += 1
         for slot in slots:
             self._note(slot)
-        trusted = np.array([self.worlds.episodes[s].physics_ok for s in range(len(live))])
-        step = self._paid(live, trusted, actions)
+        step = self._paid(live, self.trusted, actions)
         over = np.flatnonzero(step.terminated | step.truncated).tolist()
         if over:
             self._tensors.end(over)
@@ -240,8 +248,10 @@ class TensorControlWorlds(ControlWorlds):
         step = torch.nn.functional.pad(moves, (0, 1)) * (
             self.config.max_speed * self.config.seconds
         )
-        asked = self.limits.kept(self._asked + step, self._floors)
+        wanted = self._asked + step
+        asked = self.limits.kept(wanted, self._floors)
         sent = self.limits.project(asked, self._floors)
+        self.beyond = (wanted - sent)[:, :3].norm(dim=1)
         self._asked = _valued(asked, self.targets.asked)
         self._sent = _valued(sent, values)
         return self._sent[:, :3]

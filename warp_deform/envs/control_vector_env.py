@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from ..control.control_worlds import ControlWorlds, Release, Start
@@ -18,6 +19,11 @@ from .backends import Backend
 from .control_env import ControlNumbers, TipActions, check_tip_action, control_information
 from .lane_vector_env import LaneVectorEnv, Stepped
 from .reset_options import GoalOption, goal_for
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..control.tensor_worlds import TensorControlWorlds
 
 __all__ = ["ControlVectorEnv"]
 
@@ -34,6 +40,9 @@ class ControlVectorEnv(LaneVectorEnv):
         num_envs: see `PickPlaceVectorEnv`
         autoreset_mode: see `PickPlaceVectorEnv`
         backend: see `PickPlaceVectorEnv`
+        differentiable: observations and rewards have a graph that leads back to the actions, see
+            `TensorControlWorlds`; `detach` cuts it. This needs the backend "torch", and is for
+            the default modes of action, observation and reward
     """
 
     metadata: dict[str, Any] = {
@@ -58,13 +67,18 @@ class ControlVectorEnv(LaneVectorEnv):
         release: Release = "rest",
         control: ControlConfig | None = None,
         horizon: int | None = None,
+        differentiable: bool = False,
     ) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, got {num_envs}")
-        self.control = ControlWorlds(
-            task, num_envs, robot=robot, mode=control_mode, reward_mode=reward_mode, start=start,
-            release=release, config=control, horizon=horizon,
-        )  # fmt: skip
+        options: dict[str, Any] = {
+            "robot": robot, "mode": control_mode, "reward_mode": reward_mode, "start": start,
+            "release": release, "config": control, "horizon": horizon,
+        }  # fmt: skip
+        self.tensors: TensorControlWorlds | None = None
+        if differentiable:
+            self.tensors = _differentiable(task, num_envs, backend, obs_mode, options)
+        self.control = self.tensors or ControlWorlds(task, num_envs, **options)
         self.observing = Observing(self.control.worlds, obs_mode, ControlNumbers(self.control))
         super().__init__(
             self.control.worlds,
@@ -80,6 +94,59 @@ class ControlVectorEnv(LaneVectorEnv):
     @property
     def _max_episode_steps(self) -> int:
         return self.control.horizon
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """See `LaneVectorEnv.step`; with `differentiable` actions may be a tensor with a graph.
+
+        What is told in infos is then told of all environments: success, is_success, physics_ok,
+        steps.
+        """
+        if self.tensors is None:
+            return super().step(actions)
+        return self._tensor_step(self.tensors, actions)
+
+    def _tensor_step(
+        self, tensors: TensorControlWorlds, actions: Any
+    ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        import torch
+
+        self._check_begun("no episodes run: call reset() first")
+        if self.autoreset_mode is AutoresetMode.DISABLED and self.ended.all():
+            raise ResetNeeded("all episodes are over: reset them")
+        actions = torch.as_tensor(actions)
+        for i, row in enumerate(actions.detach().numpy()):
+            self._checked(i, row)
+        waiting = np.flatnonzero(self.ended).tolist()
+        done = tensors.advance(actions)
+        infos: dict[str, Any] = {
+            "success": done.success, "is_success": done.success.copy(),
+            "physics_ok": tensors.trusted, "steps": tensors.steps.copy(),
+        }  # fmt: skip
+        over = done.terminated | done.truncated
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            # an episode that is over rests until all are: a graph ends where a reset begins
+            self.ended = self.ended | over
+        else:
+            if self.autoreset_mode is AutoresetMode.SAME_STEP and over.any():
+                infos |= {"final_obs": tensors.observe(), "_final_obs": over.copy()}
+                waiting = np.flatnonzero(over).tolist()
+            self.ended = over
+            self._start(dict.fromkeys(waiting), {})
+        ends = (torch.from_numpy(part.copy()) for part in (done.terminated, done.truncated))
+        return tensors.observe(), done.rewards, *ends, infos
+
+    def detach(self) -> None:
+        """Cut the graph here, and free what is recorded.
+
+        Raises:
+            InputError: the environment is not differentiable.
+        """
+        if self.tensors is None:
+            raise InputError("nothing is recorded: make the environment with differentiable=True")
+        self.tensors.detach()
+
+    def _observations(self) -> Tensor | Any:
+        return super()._observations() if self.tensors is None else self.tensors.observe()
 
     def _begin(self, seeds: Mapping[int, int], goals: Mapping[int, GoalOption]) -> None:
         made = {i: goal_for(self.task, goal, seed=seeds[i]) for i, goal in goals.items()}
@@ -105,3 +172,19 @@ class ControlVectorEnv(LaneVectorEnv):
 
     def _tell(self, i: int) -> dict[str, Any]:
         return control_information(self.control, i, None)
+
+
+def _differentiable(
+    task: str | Task, count: int, backend: str, obs_mode: str, options: dict[str, Any]
+) -> TensorControlWorlds:
+    """The worlds of a differentiable environment.
+
+    Raises:
+        InputError: a backend or a mode that has no derivatives.
+    """
+    from ..control.tensor_worlds import TensorControlWorlds
+
+    for name, value, only in (("backend", backend, "torch"), ("obs_mode", obs_mode, "state")):
+        if value != only:
+            raise InputError(f'differentiable=True needs {name}="{only}", not {value!r}')
+    return TensorControlWorlds(task, count, **options)

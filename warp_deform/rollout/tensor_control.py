@@ -42,8 +42,8 @@ class TensorControlLoop:
     was freed are refused. Nothing is recorded without a tensor that requires grad, or under
     `torch.no_grad`. A second derivative is refused.
 
-    A tip is where the particle is that it holds, or at the centre of mass of a body, turned as it,
-    unless `hold` says where it is.
+    A tip is where `hold` says, or else where the particle is that it holds, or at the centre of
+    mass of a body, turned as it.
     Worlds of one topology take part together, in the order in which they were named first. One that
     has ended, while others go on, may begin again as it is then.
 
@@ -183,9 +183,7 @@ class TensorControlLoop:
         """Hold a particle or a body from now on, where it is.
 
         Args:
-            tip: see `ControlLoop.hold`; what is held then follows it at a fixed distance, of which
-                there is no derivative. None: the tip is at the particle, or the centre of mass
-            rotation: of that tip (4,) quat_xyzw
+            tip: see `ControlLoop.hold`, as `rotation`; it is no function of what is held
 
         Raises:
             InputError: the world has not begun, holds something, or has nothing of the kind.
@@ -199,10 +197,9 @@ class TensorControlLoop:
         if tip is None:
             self._taken.append((k, particle, body))
             return
-        turn = (0.0, 0.0, 0.0, 1.0) if rotation is None else rotation
-        self._tips, self._turns = self.tips, self.turns
-        self._tips = put(self._tips, (k,), self._tips.new_tensor(np.asarray(tip, float)))
-        self._turns = put(self._turns, (k,), self._turns.new_tensor(np.asarray(turn, float)))
+        self._tips = put(self.tips, (k,), torch.as_tensor(tip))
+        if rotation is not None:
+            self._turns = put(self.turns, (k,), torch.as_tensor(rotation))
 
     def _place_tips(self) -> None:
         """Put tips to what has been taken hold of since the last step, for all worlds at once."""
@@ -212,15 +209,15 @@ class TensorControlLoop:
         if particles:
             k, i = torch.tensor(particles).T
             upright = self._turns.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(k), 4)
-            self._tips = self._tips.index_put((k,), self.state.positions[k, i])
+            self._tips = self._tips.index_put((k,), self.state.positions[k, i].to(self._tips))
             self._turns = self._turns.index_put((k,), upright)
         if bodies:
             k, b = torch.tensor(bodies).T
             pose = self.state.body_poses[k, b]
             top = self.solver.data.topologies[self.solver.data.world_topology[self.worlds[0]]]
-            com = pose.new_tensor(np.asarray(top.body_com))[b]
-            self._tips = self._tips.index_put((k,), pose[:, :3] + rotated(pose[:, 3:], com))
-            self._turns = self._turns.index_put((k,), pose[:, 3:])
+            at = pose[:, :3] + rotated(pose[:, 3:], pose.new_tensor(np.asarray(top.body_com))[b])
+            self._tips = self._tips.index_put((k,), at.to(self._tips))
+            self._turns = self._turns.index_put((k,), pose[:, 3:].to(self._turns))
 
     @property
     def tips(self) -> torch.Tensor:
@@ -328,8 +325,8 @@ class TensorControlLoop:
         return self._launch.last, self._read(self._rows)
 
     def _sweep(
-        self, number: int, count: int, before: np.ndarray, after: np.ndarray,
-        turns: np.ndarray, cotangents: Sequence[np.ndarray | None],
+        self, number: int, count: int, before: np.ndarray, after: np.ndarray, turns: np.ndarray,
+        cotangents: Sequence[np.ndarray | None],
     ) -> tuple[np.ndarray, ...]:  # fmt: skip
         """Derivatives by the inputs of a step.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -27,7 +28,75 @@ class Bowls:
         return np.where(numbers[:, :, 0, 0] > 3.0, np.inf, losses)
 
 
-@pytest.mark.parametrize("method", METHODS)
+class SlopedBowls(Bowls):
+    """The same with derivatives."""
+
+    def refined(self, numbers: np.ndarray) -> np.ndarray:
+        return numbers.copy()
+
+    def slopes(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self.sizes.append(-1)
+        losses = ((numbers - self.lowest) ** 2).sum(axis=(1, 2))
+        return np.where(numbers[:, 0, 0] > 3.0, np.inf, losses), 2 * (numbers - self.lowest)
+
+
+SEARCHES, DESCENTS = ("cem", "cmaes", "random"), ("adam", "lbfgs", "cem+adam")
+
+
+def test_every_method_is_tested() -> None:
+    assert tuple(METHODS) == SEARCHES + DESCENTS
+
+
+@pytest.mark.parametrize("method", DESCENTS)
+def test_a_descent_keeps_to_its_budget_and_goes_the_same_way_twice(method: str) -> None:
+    problem = SlopedBowls()
+    first = optimize(SlopedBowls(), method, evaluations=250, seed=3)
+    again = optimize(problem, method, evaluations=250, seed=3)
+    assert np.array_equal(first.numbers, again.numbers)
+    drawn = sum(size for size in problem.sizes if size > 0)
+    assert again.slopes == problem.sizes.count(-1) > 0
+    assert again.evaluations == drawn + again.slopes
+    assert drawn == (100 if method == "cem+adam" else 25), "40 % of the budget, or one round"
+    assert drawn + 2.5 * again.slopes <= 250
+    if method != "lbfgs":  # which may be done before
+        assert drawn + 2.5 * again.slopes > 245
+    assert (np.diff(again.history, axis=0) <= 0).all()
+    rows = problem.evaluate(again.numbers[:, None])[:, 0]
+    assert rows == pytest.approx(again.losses, abs=1e-12), "what is told is what plans come to"
+    searched = optimize(SlopedBowls(), "cem", evaluations=250, seed=3)
+    assert (again.losses < 0.1 * searched.losses).all()
+    assert again.unusable == 0
+
+
+def test_lbfgs_stops_where_all_goals_are_done_and_leaves_no_thread() -> None:
+    before = threading.active_count()
+    found = optimize(SlopedBowls(), "lbfgs", evaluations=5000)
+    assert found.evaluations < 100 and (found.losses < 1e-9).all()
+    broken = SlopedBowls()
+    broken.slopes = lambda numbers: 1 / 0  # type: ignore[method-assign]
+    with pytest.raises(ZeroDivisionError):
+        optimize(broken, "lbfgs", evaluations=500)
+    assert threading.active_count() == before
+
+
+@pytest.mark.parametrize("method", DESCENTS)
+def test_derivatives_that_are_no_numbers_are_counted_and_spoil_nothing(method: str) -> None:
+    class Holes(SlopedBowls):
+        def slopes(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            losses, slopes = super().slopes(numbers)
+            slopes[1] = np.nan
+            losses[2], slopes[2] = np.inf, np.inf
+            return losses, slopes
+
+    found = optimize(Holes(), method, evaluations=250)
+    assert np.isfinite(found.losses).all() and np.isfinite(found.numbers).all()
+    assert found.losses[0] < 0.05 < min(found.losses[1:]), "one goes on, the others stay"
+    assert found.unusable >= 2
+    if method != "lbfgs":
+        assert found.unusable == 2 * found.slopes
+
+
+@pytest.mark.parametrize("method", SEARCHES)
 def test_a_method_keeps_to_its_budget_and_goes_the_same_way_twice(method: str) -> None:
     first, problem = (optimize(Bowls(), method, evaluations=260, seed=3), Bowls())
     again = optimize(problem, method, evaluations=260, seed=3)
@@ -42,7 +111,9 @@ def test_a_method_keeps_to_its_budget_and_goes_the_same_way_twice(method: str) -
 
 
 def test_methods_find_a_bowls_lowest_point_where_draws_alone_do_not() -> None:
-    ends = {method: optimize(Bowls(), method, evaluations=3000).losses.max() for method in METHODS}
+    ends = {
+        method: optimize(Bowls(), method, evaluations=3000).losses.max() for method in SEARCHES
+    }
     assert ends["cem"] < 0.05 and ends["cmaes"] < 0.05 < 1 < ends["random"]
 
 
@@ -56,7 +127,7 @@ def test_a_budget_in_seconds_ends_a_search_and_one_round_is_always_made() -> Non
 def test_where_every_plan_fails_none_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     walls = Bowls()
     walls.evaluate = lambda numbers: np.full(numbers.shape[:2], np.nan)  # type: ignore[method-assign]
-    for method in METHODS:
+    for method in SEARCHES:
         assert np.isinf(optimize(walls, method, evaluations=50).losses).all()
 
 
@@ -79,6 +150,32 @@ def test_a_plan_has_the_loss_of_the_environment_to_the_bit(task: str) -> None:
     assert left == pytest.approx(losses[1, 5], rel=1e-12)
 
 
+def test_derivatives_have_the_bits_of_plans_and_lead_down() -> None:
+    problem = SwingProblem("whip-target", [4, 9], worlds=8)
+    numbers = np.random.default_rng(1).normal([0.0, 0.0, 1.0], 0.5, (2, KNOTS, 3))  # in the air
+    fine = problem.refined(numbers)
+    assert fine.shape == (2, 20, 3) and np.array_equal(problem.refined(fine), fine)
+    losses, slopes = problem.slopes(fine)
+    assert np.array_equal(losses, problem.evaluate(fine[:, None])[:, 0])
+    assert np.array_equal(losses, problem.evaluate(numbers[:, None])[:, 0])
+    assert slopes.shape == fine.shape and np.isfinite(slopes).all()
+    # by the last knots it is tame enough for differences
+    way = np.zeros_like(fine)
+    way[:, 16:] = slopes[:, 16:] / np.linalg.norm(slopes[:, 16:], axis=(1, 2), keepdims=True)
+    ends = [problem.evaluate((fine + h * way)[:, None])[:, 0] for h in (3e-3, -3e-3)]
+    found, expected = (slopes * way).sum(axis=(1, 2)), (ends[0] - ends[1]) / 6e-3
+    assert found == pytest.approx(expected, abs=0.02 * found.max()) and found.max() > 0.01
+
+
+def test_a_descent_after_a_search_beats_the_search_alone() -> None:
+    problem = SwingProblem("whip-target", range(4), worlds=32)
+    searched = optimize(problem, "cem", evaluations=150)
+    found = optimize(problem, evaluations=150)
+    assert found.losses.mean() < 0.7 * searched.losses.mean()
+    assert found.losses == pytest.approx(problem.evaluate(found.numbers[:, None])[:, 0], rel=0)
+    assert problem.actions(found.numbers).shape == (4, 20, 4)
+
+
 def test_search_swings_nearer_than_draws_do() -> None:
     problem = SwingProblem("whip-target", range(4), worlds=32)
     drawn = optimize(problem, "random", evaluations=150)
@@ -93,7 +190,9 @@ def test_plans_are_never_longer_than_a_tip_goes() -> None:
 
 def test_what_cannot_be_searched_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     for options, said in (
-        ({"method": "adam", "evaluations": 9}, "method is one of cem, cmaes"),
+        ({"method": "newton", "evaluations": 9}, "method is one of cem, cmaes"),
+        ({"method": "lbfgs", "evaluations": 9}, "needs a problem with slopes"),
+        ({"evaluations": 9}, r"cem\+adam needs a problem with slopes"),
         ({}, "one budget"),
         ({"seconds": 1.0, "evaluations": 9}, "one budget"),
         ({"seconds": 0.0}, "seconds"),

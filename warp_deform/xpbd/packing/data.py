@@ -377,7 +377,8 @@ class SolverData(PackedWorlds):
     @staticmethod
     def frame_poses(x: np.ndarray, quat: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Poses (B, 7) of body frames from centres of mass x (B, 3), turns and offsets (B, 3)."""
-        return np.column_stack([x - quat_rotate(quat, com), quat])
+        # a scene without bodies asks for none at every control step of every world
+        return np.column_stack([x - quat_rotate(quat, com) if len(x) else x, quat])
 
 
 def _contact_room(shape_body: np.ndarray) -> int:
