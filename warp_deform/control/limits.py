@@ -107,9 +107,8 @@ class TipLimits:
             return np.interp(z, heights, smallest), np.interp(z, heights, largest)
         import torch
 
-        grid, near, far = (
-            torch.from_numpy(np.ascontiguousarray(values)).to(z) for values in (heights, smallest, largest)
-        )
+        columns = (heights, smallest, largest)
+        grid, near, far = (torch.from_numpy(np.ascontiguousarray(c)).to(z) for c in columns)
         k = torch.searchsorted(grid, z.detach().contiguous()).clamp(1, len(heights) - 1)
         u = (z - grid[k - 1]) / (grid[k] - grid[k - 1])
         return near[k - 1] + u * (near[k] - near[k - 1]), far[k - 1] + u * (far[k] - far[k - 1])

@@ -34,9 +34,7 @@ _SEARCHES = 0.4
 """Share of the budget that "cem+adam" searches before it descends."""
 
 
-def _cem(
-    search: Search, rng: np.random.Generator, population: int, *, share: float = 1.0
-) -> None:
+def _cem(search: Search, rng: np.random.Generator, population: int, *, share: float = 1.0) -> None:
     """Draw around the mean of the best draws, with their spread, a goal by itself."""
     goals, shape = search.problem.goals, search.problem.shape
     mean, spread = np.zeros((goals, *shape)), np.full((goals, *shape), _SPREAD)

@@ -93,9 +93,7 @@ class TensorControlWorlds(ControlWorlds):
             )
         if self._held_particle is None and self.start != "held":
             raise InputError('what is taken hold of has no derivative: choose start="held"')
-        self._tensors = TensorControlLoop(
-            self.worlds.solver, rate=self.config.rate, memory=memory
-        )
+        self._tensors = TensorControlLoop(self.worlds.solver, rate=self.config.rate, memory=memory)
         self.beyond = torch.zeros(count, dtype=torch.float64)
         """How far the last targets lay from where the tips were led for them (W,) [m].
 
@@ -237,9 +235,7 @@ class TensorControlWorlds(ControlWorlds):
         self._set_floor(slot)
         self._floors = torch.from_numpy(self.targets.floors.copy())
 
-    def _led_to(
-        self, slots: list[int], actions: torch.Tensor, numbers: np.ndarray
-    ) -> torch.Tensor:
+    def _led_to(self, slots: list[int], actions: torch.Tensor, numbers: np.ndarray) -> torch.Tensor:
         """Where tips are led (W, 3) [m]: values of the environment, derivatives of torch."""
         values = self._sent.detach().numpy().copy()
         values[slots] = self.targets.follow(slots, numbers[slots])[:, -1]

@@ -111,9 +111,7 @@ def test_a_method_keeps_to_its_budget_and_goes_the_same_way_twice(method: str) -
 
 
 def test_methods_find_a_bowls_lowest_point_where_draws_alone_do_not() -> None:
-    ends = {
-        method: optimize(Bowls(), method, evaluations=3000).losses.max() for method in SEARCHES
-    }
+    ends = {method: optimize(Bowls(), method, evaluations=3000).losses.max() for method in SEARCHES}
     assert ends["cem"] < 0.05 and ends["cmaes"] < 0.05 < 1 < ends["random"]
 
 
