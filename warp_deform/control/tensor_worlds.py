@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..tasks.task import Task
     from ..worlds.state import WorldState
 
-__all__ = ["TensorControlWorlds", "TensorStep"]
+__all__ = ["TensorStep"]  # `warp_deform.control` has `TensorControlWorlds`
 
 _KEPT_STARTS = 4096
 """Starts that are kept, so that the same seeds begin again at little cost."""
