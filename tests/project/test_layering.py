@@ -54,7 +54,7 @@ FLOORS = {
         "training correction",
         "evaluation",
         "policy",
-        "data",
+        "data control",
         "models runs refinement interchange",
     ],
     "hardware": [

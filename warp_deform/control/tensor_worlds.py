@@ -91,7 +91,7 @@ class TensorControlWorlds(ControlWorlds):
                 f"reward_mode {self.rewards.mode} has no derivative: choose dense or "
                 "normalized_dense"
             )
-        if self._held_particle is None and self.start != "held":
+        if self._held == _NOTHING and self.start != "held":
             raise InputError('what is taken hold of has no derivative: choose start="held"')
         self._tensors = TensorControlLoop(self.worlds.solver, rate=self.config.rate, memory=memory)
         self.beyond = torch.zeros(count, dtype=torch.float64)
@@ -109,12 +109,17 @@ class TensorControlWorlds(ControlWorlds):
 
     def holding(self, slot: int) -> bool:
         """Whether the tip of a slot holds something."""
-        return self._grips[slot] != _NOTHING
+        return self.grips[slot] != _NOTHING
 
     @property
     def trusted(self) -> np.ndarray:
         """In which worlds no guard has fired (W,) bool."""
         return np.array([self.worlds.episodes[s].physics_ok for s in range(self.worlds.count)])
+
+    @property
+    def left(self) -> torch.Tensor:
+        """What is left to do in every world (W,), see `Task.remaining`."""
+        return self._left
 
     # -- starting
 
@@ -149,7 +154,8 @@ class TensorControlWorlds(ControlWorlds):
         self._live[slots] = True
         for slot in slots:
             particle, body = starts[slot].grip
-            tip = None if self._held_particle is not None else starts[slot].asked
+            # the middle of a held particle is the tip, as it is without derivatives
+            tip = None if self._held[0] is not None else starts[slot].asked
             self._tensors.hold(
                 slot,
                 particle=particle,
@@ -163,7 +169,7 @@ class TensorControlWorlds(ControlWorlds):
         return _Start(
             # before its end, which stops what is held
             state=replace(self.worlds.state(slot), run=None),
-            grip=self._grips[slot],
+            grip=self.grips[slot],
             asked=self.targets.asked[slot].copy(),
             floor=float(self.targets.floors[slot]),
         )
@@ -173,8 +179,8 @@ class TensorControlWorlds(ControlWorlds):
         self.worlds.restore(slot, start.state)
         self.targets.place([slot], start.asked[None])
         self.targets.floors[slot] = start.floor
-        self._grips[slot] = start.grip
-        self._held[slot] = HeldHistory()
+        self.grips[slot] = start.grip
+        self._carried[slot] = HeldHistory()
         self._note_taken(slot)
         self.steps[slot] = self._solved[slot] = 0
 
@@ -213,8 +219,9 @@ class TensorControlWorlds(ControlWorlds):
         numbers = actions.detach().numpy()
         live = self._live.copy()
         slots = np.flatnonzero(live).tolist()
+        keeps = isinstance(self.task, ControlTask) and self.task.keeps_hold
         for slot in slots:
-            if self.holding(slot) and not numbers[slot, -1] > 0:
+            if self.holding(slot) and not keeps and not numbers[slot, -1] > 0:
                 self._let_go(slot)
         if slots:
             self._tensors.advance(self._led_to(slots, actions, numbers))
@@ -230,8 +237,8 @@ class TensorControlWorlds(ControlWorlds):
 
     def _let_go(self, slot: int) -> None:
         self._tensors.let_go(slot, release=self.release)
-        self._grips[slot] = _NOTHING
-        self._held[slot].let_go(self.worlds.episodes[slot], self.task)
+        self.grips[slot] = _NOTHING
+        self._carried[slot].let_go(self.worlds.episodes[slot], self.task)
         self._set_floor(slot)
         self._floors = torch.from_numpy(self.targets.floors.copy())
 
@@ -258,7 +265,7 @@ class TensorControlWorlds(ControlWorlds):
         episode.sim_seconds += self.control.loop.seconds
         episode.problems = self._tensors.problems.get(slot, ()) or episode.problems
         self.worlds.look(slot)
-        self._held[slot].follow(episode, self.task)
+        self._carried[slot].follow(episode, self.task)
 
     def _paid(self, live: np.ndarray, trusted: np.ndarray, actions: torch.Tensor) -> TensorStep:
         """Rewards and ends after a step."""

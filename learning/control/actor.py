@@ -1,0 +1,137 @@
+"""The network of control, and the statistics that normalise what it sees."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from warp_deform.control.smooth_plans import smooth_plan
+from warp_deform.control.tensor_worlds import TensorControlWorlds
+
+__all__ = ["Actor", "BoundedSlopes", "RunningNorm", "as_actions", "look_around"]
+
+_STREAM = 13
+"""Keeps the generator of `look_around` apart from others."""
+_QUIET = 0.1
+"""Of an actor's last weights, what is left before training."""
+_LIFT = (0.0, 0.0, 0.5)
+"""What an actor does before training."""
+_CLIP = 10.0
+"""Normalised numbers are kept within so many standard deviations."""
+
+
+class RunningNorm(nn.Module):
+    """Mean and spread of all that was shown to `update`; `forward` normalises by them.
+
+    Args:
+        size: numbers of an observation
+    """
+
+    count: Tensor
+    mean: Tensor
+    square: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("square", torch.zeros(size, dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, seen: Tensor) -> None:
+        """Count observations (..., D) in."""
+        rows = seen.detach().reshape(-1, seen.shape[-1]).double()
+        total = self.count + len(rows)
+        away = rows.mean(dim=0) - self.mean
+        spread = ((rows - rows.mean(dim=0)) ** 2).sum(dim=0)
+        self.square += spread + away**2 * self.count * len(rows) / total
+        self.mean += away * len(rows) / total
+        self.count += len(rows)
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Observations (..., D) with mean 0 and spread 1."""
+        # what never changes stays 0, and does not blow up
+        spread = (self.square / self.count.clamp(min=1.0)).sqrt().clamp(min=1e-3)
+        return ((seen.double() - self.mean) / spread).clamp(-_CLIP, _CLIP).float()
+
+
+def _network(sizes: tuple[int, ...]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for before, after in itertools.pairwise(sizes):
+        layers += [nn.Linear(before, after), nn.ELU()]
+    return nn.Sequential(*layers[:-1])
+
+
+class Actor(nn.Module):
+    """Observations in, actions of "tip_delta_position" out: the tip's move, and hold at 1.
+
+    Args:
+        size: numbers of an observation
+        hidden: of the layers in between
+    """
+
+    def __init__(self, size: int, hidden: tuple[int, ...] = (256, 256)) -> None:
+        super().__init__()
+        self.norm = RunningNorm(size)
+        self.network = _network((size, *hidden, 3))
+        # at first it lifts: in the air slopes are tame, and against the table there are none
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            last.weight *= _QUIET
+            last.bias.copy_(torch.tensor(_LIFT))
+
+    def moves(self, seen: Tensor) -> Tensor:
+        """The network's numbers (W, 3) before they are bounded."""
+        numbers: Tensor = self.network(self.norm(seen))
+        return numbers
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Actions (W, 4): u / sqrt(1 + |u|^2), of a length below 1, and 1."""
+        return as_actions(self.moves(seen))
+
+
+def as_actions(moves: Tensor) -> Tensor:
+    """Actions (W, 4) of unbounded numbers (W, 3)."""
+    bounded = moves / (1.0 + (moves**2).sum(dim=-1, keepdim=True)).sqrt()
+    return torch.cat([bounded, torch.ones_like(bounded[:, :1])], dim=-1)
+
+
+def look_around(worlds: TensorControlWorlds, norm: RunningNorm, *, seed: int) -> None:
+    """Show statistics what swings at random look like, before there is a policy to look at."""
+    rng = np.random.default_rng([_STREAM, seed])
+    count, steps = worlds.worlds.count, worlds.horizon
+    worlds.reset({slot: slot for slot in range(count)})
+    plans = np.stack([smooth_plan(rng, steps) for _ in range(count)], axis=1)
+    with torch.no_grad():
+        for moves in plans:
+            norm.update(worlds.observe())
+            worlds.advance(torch.from_numpy(np.pad(moves, ((0, 0), (0, 1)), constant_values=1.0)))
+
+
+class BoundedSlopes:
+    """A hook for actions (W, A): each world's derivative gets at most the length `most`.
+
+    One chaotic world would outweigh all others. What is not finite counts as 0, and is counted.
+
+    Args:
+        most: of the derivative of one world's loss by its action
+        share: of one world in the loss, 1 / W where it is a mean
+    """
+
+    def __init__(self, most: float, share: float) -> None:
+        self._most = most * share
+        self.unusable = self.bounded = self.seen = 0
+
+    def __call__(self, slopes: Tensor) -> Tensor:
+        """The derivatives (W, A), bounded."""
+        finite = torch.isfinite(slopes).all(dim=-1, keepdim=True)
+        slopes = torch.where(finite, slopes, 0.0)
+        length = slopes.norm(dim=-1, keepdim=True)
+        self.seen += len(slopes)
+        self.unusable += int((~finite).sum())
+        self.bounded += int((length > self._most).sum())
+        return slopes * (self._most / length.clamp(min=self._most))
