@@ -1,24 +1,25 @@
-"""What searches come to on swings of a cable, by evaluations and CPU seconds.
+"""What methods come to on swings of a cable, all with the same CPU seconds.
 
-    python benchmarks/swings.py [--tasks TASK...] [--evaluations N...] [--out FILE]
+    python benchmarks/swings.py [--tasks TASK...] [--methods METHOD...] [--seconds S...]
+                                [--goals N] [--out FILE]
 
-Goals are those of 32 test seeds from 10,000. One row a task, method and number of evaluations a
-goal: mean score of `whip`, and distance and shares within 10, 5, 2 and 1 cm of `whip-target`. CPU
-seconds are those of the process for all goals together. Rows of other tasks and numbers stay in the
-file.
+Goals are those of 32 test seeds from 10,000. One row a task, method and budget, in CPU seconds of
+the process a goal: mean score of `whip`, and distance and shares within 10, 5, 2 and 1 cm of
+`whip-target`. All rows of a call come from one process, on one thread. Rows of other tasks, methods
+and budgets stay in the file.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from warp_deform.control import SwingProblem, optimize
-
-GOALS = 32
+from warp_deform.control import METHODS, SwingProblem, optimize
 
 
 def told(task: str, losses: np.ndarray) -> dict[str, float]:
@@ -33,29 +34,35 @@ def told(task: str, losses: np.ndarray) -> dict[str, float]:
 
 
 def main() -> None:
+    """Measure, and print rows."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/swings.jsonl"))
     parser.add_argument("--tasks", nargs="+", default=["whip", "whip-target"])
-    parser.add_argument("--methods", nargs="+", default=["random", "cem", "cmaes"])
-    parser.add_argument("--evaluations", nargs="+", type=int, default=[250, 1000])
+    parser.add_argument("--methods", nargs="+", default=list(METHODS))
+    parser.add_argument("--seconds", nargs="+", type=float, default=[0.2], help="a goal")
+    parser.add_argument("--goals", type=int, default=32)
     options = parser.parse_args()
+    torch.set_num_threads(1)
     rows = {}
     if options.out.exists():
         for line in options.out.read_text().splitlines():
             row = json.loads(line)
-            rows[row["task"], row["method"], row["evaluations"]] = row
+            rows[row["task"], row["method"], row["seconds"]] = row
     for task in options.tasks:
-        problem = SwingProblem(task, range(10_000, 10_000 + GOALS))
-        problem.evaluate(np.zeros((GOALS, 1, *problem.shape)))  # compiles its kernels
+        problem = SwingProblem(task, range(10_000, 10_000 + options.goals))
+        nothing = np.zeros((options.goals, 1, *problem.shape))
+        problem.evaluate(nothing)  # this and the next line compile kernels
+        problem.slopes(nothing[:, 0])
         for method in options.methods:
-            for evaluations in options.evaluations:
-                found = optimize(problem, method, evaluations=evaluations)
+            for seconds in options.seconds:
+                found = optimize(problem, method, seconds=seconds * options.goals)
                 row = {
-                    "task": task, "method": method, "evaluations": evaluations, "goals": GOALS,
-                    **told(task, found.losses), "cpu_s": found.cpu_seconds,
-                    "cpu_s_a_goal": found.cpu_seconds / GOALS,
+                    "task": task, "method": method, "seconds": seconds, "goals": options.goals,
+                    **told(task, found.losses), "plans": found.evaluations, "slopes": found.slopes,
+                    "unusable": found.unusable,
+                    "cpu_s_a_goal": found.cpu_seconds / options.goals, "load": os.getloadavg()[0],
                 }  # fmt: skip
-                rows[task, method, evaluations] = row
+                rows[task, method, seconds] = row
                 print(json.dumps(row), flush=True)
                 lines = [json.dumps(rows[key]) for key in sorted(rows)]
                 options.out.write_text("\n".join(lines) + "\n")
