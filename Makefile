@@ -12,11 +12,12 @@ DEMO := demo
 # torch and Newton again, for longer than most tests take.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help venv demo test check lint format bench docs chromium three clean
+.PHONY: help venv demo test test-lerobot check lint format bench docs chromium three clean
 
 help:
 	@echo "make demo    demonstrations of cable-shape and bag-items-1 and their videos, under demo/"
 	@echo "make test    the tests, on every core"
+	@echo "make test-lerobot   train and play a policy of LeRobot on our demonstrations (gigabytes)"
 	@echo "make check   lint, and the quick half of the tests: while you edit"
 	@echo "make lint    ruff and mypy"
 	@echo "make format  let ruff rewrite what it can"
@@ -44,6 +45,26 @@ demo: $(STAMP)
 # Neighbours share kernels and fixtures: a worker begins with a run of them, and steals later.
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto --dist worksteal --durations 20 tests
+
+# LeRobot wants an older torch than ours, of which Linux has builds for CUDA alone: an environment of
+# its own, of 9 GB. Everything after it is made runs offline, on the CPU.
+LEROBOT ?= build/lerobot
+LEROBOT_RUN := build/lerobot-run
+test-lerobot: $(STAMP)
+	test -x $(LEROBOT)/bin/lerobot-eval || { $(PYTHON) -m venv $(LEROBOT) && $(LEROBOT)/bin/python -m pip \
+		install --quiet --no-compile lerobot==0.4.4 -e . -e benchmarks/lerobot_env; }
+	rm -rf $(LEROBOT_RUN)
+	$(BIN)/warp-deform demo block-notarget --control -n 4 --verify --out $(LEROBOT_RUN)/demos
+	$(BIN)/warp-deform convert $(LEROBOT_RUN)/demos $(LEROBOT_RUN)/data --to lerobot
+	HF_HUB_OFFLINE=1 $(LEROBOT)/bin/lerobot-train --dataset.repo_id=local/block-notarget \
+		--dataset.root=$(LEROBOT_RUN)/data --policy.type=act --policy.device=cpu \
+		--policy.push_to_hub=false --policy.pretrained_backbone_weights=null --policy.dim_model=128 \
+		--policy.dim_feedforward=256 --policy.chunk_size=20 --policy.n_action_steps=20 --steps=50 \
+		--batch_size=8 --num_workers=0 --log_freq=10 --output_dir=$(LEROBOT_RUN)/act
+	HF_HUB_OFFLINE=1 $(LEROBOT)/bin/lerobot-eval --policy.path=$(LEROBOT_RUN)/act/checkpoints/last/pretrained_model \
+		--policy.device=cpu --env.type=warp_deform --env.discover_packages_path=lerobot_env_warp_deform \
+		--env.task=block-notarget --env.obs_type=environment_state_agent_pos --env.episode_length=60 \
+		--eval.n_episodes=1 --eval.batch_size=1 --output_dir=$(LEROBOT_RUN)/evaluation
 
 # What tests/slow.txt lists is left out.
 check: lint
