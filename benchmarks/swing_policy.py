@@ -4,7 +4,7 @@
 
 Prints one line of JSON: CPU seconds of the training, and of goals from 10,000 on, which training
 never saw, mean distance, shares within 10, 5, 2 and 1 cm, and the mean of exp(-10 D), `whip`'s
-score. Goals at which a guard fires are counted, and count as missed.
+score. Goals at which a guard fires are counted, and count as missed; means leave them out.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..episodes.operators import Operator
     from ..page.operator import PageOperator
 
-__all__ = ["RigOptions", "operator_page"]
+__all__ = ["RigOptions", "interruptible", "operator_page"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,11 @@ def operator_page(options: RigOptions, about: Mapping[str, Any]) -> Iterator[Pag
         **about,
     }
     session = OperatorSession(told, lambda: signal.pthread_kill(main, signal.SIGINT))
-    with listen(options.port) as bound, serving_beside(session, bound) as served:
+    with (
+        interruptible(),
+        listen(options.port) as bound,
+        serving_beside(session, bound) as served,
+    ):
         operator = PageOperator(session, served)
         operator.announce()
         if opener is not None:
@@ -93,3 +97,20 @@ def operator_page(options: RigOptions, about: Mapping[str, Any]) -> Iterator[Pag
         except Exception as error:
             operator.over(f"ended with an error: {error}")
             raise
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Let an interrupt end a motion, also where the program was started deaf to it.
+
+    What a script starts in the background ignores SIGINT, and Stop at the page would do nothing.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.SIG_IGN:
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -7,6 +7,7 @@ click that was held up on its way, by a tunnel that stood still say, is refused 
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
@@ -27,6 +28,8 @@ STOP = "stop"
 """What ends an episode; it is taken at any time."""
 FRESH_S = 3.0
 """Age of the beat that an answer names, above which it is refused [s]."""
+HALTS_S = 2.0
+"""Time after which a second stop is passed on as well [s]; sooner it would disturb the first."""
 _MOST_BEATS, _MOST_LINES = 16, 100
 
 
@@ -74,7 +77,7 @@ class OperatorSession:
         self.stop = threading.Event()
         self.replies: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
         self._about, self._halt = dict(about), halt
-        self._halted = False
+        self._halted = -math.inf
         self._question: Question | None = None
         self._beats: dict[int, float] = {}
         self._beat = 0
@@ -165,11 +168,11 @@ class OperatorSession:
         if self._question is not None:
             self._take(STOP, "stopped", post)
             return
-        if self._halted:
-            raise InputError("it was told to stop already")
-        self._halted = True
-        self._do_line(Job("line", {"text": "Stop was pressed at the page"}), post)
+        if time.monotonic() - self._halted < HALTS_S:
+            raise InputError("it was told to stop already; where it goes on, press Stop once more")
+        self._halted = time.monotonic()
         self._halt()
+        self._do_line(Job("line", {"text": "Stop was pressed at the page"}), post)
 
     def _asked(self, job: Job) -> Question:
         """The open question, if it is the one that is answered."""

@@ -1,1 +1,1 @@
-"""Policies for control at 20 Hz: by analytic gradients (APG, SHAC), and by PPO beside them."""
+"""Policies for control at 20 Hz, trained by analytic gradients (APG)."""

@@ -22,7 +22,7 @@ import torch
 from torch import nn
 
 from warp_deform.control.tensor_worlds import TensorControlWorlds
-from warp_deform.errors import InputError
+from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.support.progress import progress_bar
 
 from .actor import Actor, BoundedSlopes, look_around
@@ -31,6 +31,7 @@ __all__ = ["ApgConfig", "apg_update", "play", "train_apg"]
 
 _STREAM = 11
 """Keeps the generators of this training apart from those of episodes."""
+_MOST_EPISODES = 10_000
 _SLACK = 0.01
 """A target may lie so far beyond a limit [m] without a penalty."""
 
@@ -47,6 +48,9 @@ class ApgConfig:
         gradient_norm: longest gradient by all weights
         action_slope: longest derivative of one world's loss by one action
         press_penalty: off the reward, for each metre that a target lies beyond the tip's limits
+
+    Raises:
+        InputError: a number is out of its range.
     """
 
     updates: int = 600
@@ -56,6 +60,16 @@ class ApgConfig:
     gradient_norm: float = 1.0
     action_slope: float = 1.0
     press_penalty: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "worlds", "lr", "gradient_norm", "action_slope"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name} has to be positive, not {getattr(self, name)}")
+        if not self.worlds <= self.episodes <= _MOST_EPISODES:
+            raise InputError(
+                f"an update draws {self.worlds} of {self.episodes} episodes; episodes is at least "
+                f"worlds, and at most {_MOST_EPISODES}, where seeds of tests begin"
+            )
 
 
 def apg_update(
@@ -117,12 +131,9 @@ def train_apg(task: str, config: ApgConfig, *, seed: int, progress: bool = False
     """Train an actor for a swing; the same seed gives the same bits on one thread of torch.
 
     Raises:
-        InputError: no derivatives are there for the task, or fewer episodes than worlds.
+        InputError: no derivatives are there for the task.
+        WarpDeformError: the weights came to numbers that are none.
     """
-    if config.episodes < config.worlds:
-        raise InputError(
-            f"an update draws {config.worlds} of {config.episodes} episodes; take more episodes"
-        )
     worlds = TensorControlWorlds(task, config.worlds, action_penalty=0.0)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
@@ -135,13 +146,25 @@ def train_apg(task: str, config: ApgConfig, *, seed: int, progress: bool = False
         for update in range(1, config.updates + 1):
             told = apg_update(worlds, actor, optimizer, config, update=update, seed=seed)
             advance()
-            advance.note = f"loss {told['loss']:.3g}"
+            if not np.isfinite([told["loss"], told["gradient"]]).all():
+                raise WarpDeformError(
+                    f"the loss or its slope is no number after {update} updates; take a smaller lr"
+                )
+            advance.note = f"loss {told['loss']:.3g}, {told['guards']:.0f} guards"
+            if told["unusable"]:
+                advance.note += f", {told['unusable']:.0f} derivatives that are no numbers"
     return actor
 
 
 @torch.no_grad()
 def play(task: str, actor: Actor, seeds: Sequence[int], *, worlds: int = 32) -> np.ndarray:
-    """What is left to do [m] at the ends of the episodes of seeds (N,); inf where a guard fires."""
+    """What is left to do [m] at the ends of the episodes of seeds (N,); inf where a guard fires.
+
+    Raises:
+        InputError: there are no seeds.
+    """
+    if not len(seeds):
+        raise InputError("there is nothing to play: give one seed or more")
     playing = TensorControlWorlds(task, worlds, action_penalty=0.0)
     left = []
     for first in range(0, len(seeds), worlds):

@@ -22,13 +22,12 @@ def serving_beside(session: Session, bound: socket.socket) -> Iterator[Served]:
         BaseException: whatever ended one of its threads, at the end of a block that did not fail
             itself
     """
-    started: Future[tuple[Served, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+    started: Future[tuple[Served, asyncio.AbstractEventLoop]] = Future()
 
     async def serve() -> None:
         async with serving(session, bound) as served:
-            end = asyncio.Event()
-            started.set_result((served, asyncio.get_running_loop(), end))
-            await end.wait()
+            started.set_result((served, asyncio.get_running_loop()))
+            await served.ended.wait()  # also where its thread broke: no page waits for it in vain
 
     def run() -> None:
         try:
@@ -41,12 +40,12 @@ def serving_beside(session: Session, bound: socket.socket) -> Iterator[Served]:
 
     thread = threading.Thread(target=run, name="page server", daemon=True)
     thread.start()
-    served, loop, end = started.result()
+    served, loop = started.result()
     try:
         yield served
     finally:
         with contextlib.suppress(RuntimeError):  # the loop has ended by itself
-            loop.call_soon_threadsafe(end.set)
+            loop.call_soon_threadsafe(served.ended.set)
         thread.join()
     if served.broken is not None:
         raise served.broken

@@ -7,6 +7,7 @@ import {$, make} from "./panel.js";
 import {decode} from "./topdown.js";
 
 const SILENCE = 2000; // ms without a beat, after which nothing can be answered
+const SIGHT = 400; // ms that a question is seen before it is answered: a second click meant another one
 const HEADS = {
   plan: "May the arm do this?", home: "May the arm move?", problem: "Something has to be cleared",
   task: "Something to do by hand", keep: "Keep this?", point: "Where to pick, and where to place?",
@@ -45,13 +46,14 @@ async function looked(message) {
 async function asked(message) {
   question = message;
   beat = null;
-  sent = question.drawn = false;
+  sent = false;
+  question.drawn = 0;
   picked = cursor = null;
   $("refused").hidden = true;
   question.picture = message.plan ? await decode(message.plan) : null;
   if (question !== message) return; // another one came while this was decoded
   draw();
-  question.drawn = true;
+  question.drawn = performance.now();
   show();
   if (question.which === "point") $("above").focus();
 }
@@ -107,7 +109,8 @@ function changed(state) {
 
 const fresh = () => Boolean(beat) && performance.now() - beat.at < SILENCE;
 const open = () => document.body.dataset.connection === "open";
-const ready = () => Boolean(question) && !sent && fresh() && open();
+const seen = () => performance.now() - question.drawn > SIGHT;
+const ready = () => Boolean(question) && !sent && fresh() && seen() && open();
 
 function show() {
   const which = question?.which || "";

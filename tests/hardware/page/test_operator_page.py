@@ -116,6 +116,16 @@ def test_of_two_tabs_the_first_answer_counts(at):
         assert asking.answer() is Answer.STOP
 
 
+def test_stop_is_passed_on_again_where_the_first_did_not_end_it(at, monkeypatch):
+    monkeypatch.setattr("hardware.page.session.HALTS_S", 0.0)
+    with at.server.tab() as tab:
+        hear(tab, "hello")
+        for _ in range(2):
+            say(tab, do="halt")
+            assert "Stop was pressed" in hear(tab, "line")["text"]
+    assert at.halts == ["halt"] * 2
+
+
 def test_stop_is_taken_at_any_time_and_once(at):
     with at.server.tab() as tab:
         hear(tab, "hello")

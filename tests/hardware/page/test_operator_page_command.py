@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import threading
 from pathlib import Path
 
@@ -10,8 +11,21 @@ import pytest
 from fixtures.operator_desk import answer, question
 from fixtures.page_server import PageServer, hear
 
+from hardware.command.rig_options import interruptible
 from hardware.page.operator import PageOperator
 from warp_deform.command.main import main
+
+
+def test_stop_reaches_a_program_that_was_started_deaf_to_interrupts():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as what a script starts behind itself
+    try:
+        with pytest.raises(KeyboardInterrupt), interruptible():
+            signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+    with interruptible():
+        assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import torch
 
 from learning.control.actor import Actor, BoundedSlopes, RunningNorm, as_actions
 from learning.control.apg import ApgConfig, play, train_apg
-from warp_deform.errors import InputError
+from warp_deform.errors import InputError, WarpDeformError
 
 FEW = ApgConfig(updates=4, worlds=8, episodes=8)
 
@@ -54,7 +54,20 @@ def test_a_few_updates_lower_the_loss_and_the_same_seed_has_the_same_bits() -> N
 
 
 def test_what_cannot_be_trained_is_said() -> None:
-    with pytest.raises(InputError, match="take more episodes"):
-        train_apg("whip", ApgConfig(worlds=8, episodes=4), seed=0)
+    with pytest.raises(InputError, match="draws 8 of 4 episodes"):
+        ApgConfig(worlds=8, episodes=4)
+    with pytest.raises(InputError, match="where seeds of tests begin"):
+        ApgConfig(episodes=10_001)
+    with pytest.raises(InputError, match="updates has to be positive, not 0"):
+        ApgConfig(updates=0)
+    with pytest.raises(InputError, match="one seed or more"):
+        play("whip", Actor(5), [])
     with pytest.raises(InputError, match='choose start="held"'):
         train_apg("cable-line-notarget", FEW, seed=0)
+
+
+def test_a_training_that_breaks_ends_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = {"loss": float("nan"), "gradient": 0.0, "guards": 0.0, "unusable": 8.0, "bounded": 0.0}
+    monkeypatch.setattr("learning.control.apg.apg_update", lambda *_, **__: told)
+    with pytest.raises(WarpDeformError, match="no number after 1 updates"):
+        train_apg("whip-target", FEW, seed=0)

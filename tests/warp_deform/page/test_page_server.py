@@ -57,7 +57,8 @@ class Counter:
 def server():
     with serve_page(Counter()) as server:
         yield server
-    assert len(server.session.threads) == 1
+    # none where this process ran only tests that ask nothing of it
+    assert len(server.session.threads) <= 1
 
 
 @pytest.fixture
