@@ -1,4 +1,4 @@
-"""Makes the README's moving picture: a bag is opened, filled and carried in one real episode.
+"""Makes the moving picture of the first page of the docs: a bag is opened, filled and carried.
 
     python docs/make_bag.py docs/images/bag-items-1.webp
 

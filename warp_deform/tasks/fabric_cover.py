@@ -43,7 +43,7 @@ class FabricCover(Task):
 
     name = "fabric-cover"
     instruction = "Cover the cube with the fabric."
-    version = 2
+    version = 3
     max_actions = 2
     stages = (Stage(lift=0.10, speed=FABRIC_SPEED),)
     solver = FABRIC_SOLVER

@@ -16,6 +16,8 @@ from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.worlds.loop import SLOTS
 from warp_deform.worlds.state import WorldState
 
+pytestmark = pytest.mark.compiles("bags")
+
 FIRST = 30_000  # seed, of none that the rule was found or is reported with
 ENCLOSED = 4
 """Grade of an outlook that solves the task with every item enclosed."""

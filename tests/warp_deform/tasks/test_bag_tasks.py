@@ -20,6 +20,8 @@ from warp_deform.tasks.task import Layout, Snapshot
 from warp_deform.worlds import Worlds
 from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 
+pytestmark = pytest.mark.compiles("bags")
+
 BAGS = (BagAloneOpen, BagItems1, BagItems2, BagColorGoal)
 SHELL = bag_shell(BagConfig())
 each = pytest.mark.parametrize("cls", BAGS)

@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from ..contact.friction import friction
+from ..contact.table_support import table_support
 from ..lanes.algebra import add, mul, sub  # noqa: F401  (operators are found by name)
 from ..lanes.structures import structures
 from .rigid_body import rigid_body
@@ -26,9 +27,11 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
     The normal is that of the nearest point of the box; for a centre inside the box, that of the
     nearest face. Separation is limited as in `sphere_contact`.
 
-    A particle that the table carries does not give way downwards: the box would sink through light
-    fabric, as the table takes back only afterwards what a contact of very unequal masses gives to
-    the particle: `stands` is 0 for those. `particle_gap` is the distance of a point from a box.
+    A particle that the table carries does not give way downwards (`stands` is 0): the box would
+    sink through light fabric, as the table takes back only afterwards what a contact of very
+    unequal masses gives to the particle. It is given the correction all the same, so that the load
+    passes on to the table and its friction, see `table_support`. `particle_gap` is the distance of
+    a point from a box.
     """
     t = structures(scalar, lanes)
     S, R3 = t.S, t.R3
@@ -36,6 +39,7 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
     body = rigid_body(scalar, lanes)
     response, apply_impulse, moved = body.response, body.apply_impulse, body.moved
     coulomb_scalar = friction(scalar, lanes).coulomb_scalar
+    raised = table_support(scalar, lanes).raised
 
     @wp.func
     def particle_gap(p: R3, shape: int, b: int, shapes: Shapes, bodies: Bodies):
@@ -70,7 +74,7 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
         bodies: Bodies,
     ):
         px = particles.x[i]
-        p = R3(px.x[lane], px.y[lane], px.z[lane])
+        p = raised(R3(px.x[lane], px.y[lane], px.z[lane]), radius)
         h = shapes.half[shape]
         # the particle in the box's own frame
         away = wp.quat_rotate_inv(bodies.q[b], p - bodies.x[b]) - shapes.center[shape]
@@ -103,15 +107,14 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
             depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
             wv = particles.w[i]
             wi = wv[lane]
-            yields = wi * stands(p[2], radius, n[2])
             across = wi + response(b, bodies, r, n)
-            w = yields + response(b, bodies, r, n)
+            w = wi * stands(p[2], radius, n[2]) + response(b, bodies, r, n)
             if w > S(0.0):
                 slip = step - n * approach
                 budget = depth * mu * shapes.friction[shape] * across / w
                 along = n * (depth / w)
                 drag = slip * (coulomb_scalar(wp.dot(slip, slip), budget) / across)
-                given = along * yields - drag * wi
+                given = (along - drag) * wi
                 px.x[lane] = px.x[lane] + given[0]
                 px.y[lane] = px.y[lane] + given[1]
                 px.z[lane] = px.z[lane] + given[2]

@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from ..contact.table_support import table_support
 from ..lanes.algebra import add, mul, sub  # noqa: F401  (operators are found by name)
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
@@ -34,6 +35,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     count_one = access.count_one
     get, put, get_mass, put_scalar = access.get, access.put, access.get_mass, access.put_scalar
     stands = box_particle(scalar, lanes).stands
+    raised = table_support(scalar, lanes).raised
     project_box_particle = box_particle(scalar, lanes).project_box_particle
     turned = rigid_body(scalar, lanes).turned
     tape_ = tape(scalar, lanes)
@@ -125,7 +127,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         """The derivatives `by_...` of the loss times what the contact leaves: `wp.grad` of this
         takes the contact back.
         """
-        p = particle.x
+        p = raised(particle.x, radius)
         po = particle.xp
         wi = particle.w
         x = body.x
@@ -171,7 +173,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         budget = depth * mu * across / total
         along = m * (depth / total)
         drag = slip * (stick_share(wp.dot(slip, slip), budget) / across)
-        end = p + along * (wi * yielding) - drag * wi
+        end = particle.x + (along - drag) * wi
         return wp.dot(by_particle, end) + impulse_loss(
             x, q, w, inverse, r, drag - along, by_x, by_q
         )
@@ -255,7 +257,8 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         count_one(kind, lane, adj)
         h = box.half
         # which way the box pushes decides whether the table carries the particle
-        away = wp.quat_rotate_inv(body.q, particle.x - body.x) - box.center
+        p = raised(particle.x, radius)
+        away = wp.quat_rotate_inv(body.q, p - body.x) - box.center
         inside = wp.quat_rotate_inv(box.rotation, away)
         near = R3(
             wp.clamp(inside[0], -h[0], h[0]),
@@ -275,7 +278,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             elif oy >= oz:
                 n = R3(S(0.0), wp.sign(inside[1]), S(0.0))
         down = wp.quat_rotate(body.q, wp.quat_rotate(box.rotation, n))[2]
-        yielding = stands(particle.x[2], radius, down)
+        yielding = stands(p[2], radius, down)
         if particle.w * yielding + bodies.w[b] > S(0.0):
             rub = shapes.friction[shape]
             g, g_body, _box, g_mu, g_radius, _recovery, _yielding, _p, _x, _q = wp.grad(

@@ -14,6 +14,7 @@ import warp as wp
 
 from ..contact.closest_point import closest_point
 from ..contact.friction import friction
+from ..contact.table_support import table_support
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from .box_particle import box_particle
@@ -43,6 +44,7 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
     get, put, get_mass = access.get, access.put, access.get_mass
     barycentric = closest_point(scalar, lanes).barycentric
     stands = box_particle(scalar, lanes).stands
+    raised = table_support(scalar, lanes).raised
     # of an edge and a side of the box that are nearly parallel, the ends tell more
     PARALLEL = S(1.0e-3)
     # an axis of edges must win clearly: it would flicker where edges are nearly parallel
@@ -165,12 +167,15 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
         xa = get(cells.x, ia, lane)
         xb = get(cells.x, ib, lane)
         xc = get(cells.x, ic, lane)
+        za = raised(xa, radius)
+        zb = raised(xb, radius)
+        zc = raised(xc, radius)
         # in the box's own frame
         h = shapes.half[shape]
         turn = bodies.q[b] * shapes.rotation[shape]
-        a = wp.quat_rotate_inv(turn, xa - center)
-        e = wp.quat_rotate_inv(turn, xb - center)
-        c = wp.quat_rotate_inv(turn, xc - center)
+        a = wp.quat_rotate_inv(turn, za - center)
+        e = wp.quat_rotate_inv(turn, zb - center)
+        c = wp.quat_rotate_inv(turn, zc - center)
         gap, kind, n = separate(a, e, c, h, radius)
         if gap < radius and kind > 0:
             u = R3()
@@ -211,18 +216,19 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
                 local = shapes.center[shape] + wp.quat_rotate(shapes.rotation[shape], near)
                 r = wp.quat_rotate(bodies.q[b], local)
                 n = wp.quat_rotate(turn, n)
-                step = (xa - get(cells.xp, ia, lane)) * u[0] - moved(b, bodies, local)
-                step += (xb - get(cells.xp, ib, lane)) * u[1]
-                step += (xc - get(cells.xp, ic, lane)) * u[2]
+                step = (za - get(cells.xp, ia, lane)) * u[0] - moved(b, bodies, local)
+                step += (zb - get(cells.xp, ib, lane)) * u[1]
+                step += (zc - get(cells.xp, ic, lane)) * u[2]
                 approach = wp.dot(step, n)
                 depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
                 wa = get_mass(cells.w, ia, lane)
                 wb = get_mass(cells.w, ib, lane)
                 wc = get_mass(cells.w, ic, lane)
-                # corners that the table carries do not give way downwards, see `box_particle`
-                ya = wa * stands(xa[2], top.radius[radii + tri[0]], n[2])
-                yb = wb * stands(xb[2], top.radius[radii + tri[1]], n[2])
-                yc = wc * stands(xc[2], top.radius[radii + tri[2]], n[2])
+                # corners that the table carries do not give way downwards, but pass the load on,
+                # see `box_particle`
+                ya = wa * stands(za[2], radius, n[2])
+                yb = wb * stands(zb[2], radius, n[2])
+                yc = wc * stands(zc[2], radius, n[2])
                 w = ya * u[0] * u[0] + yb * u[1] * u[1] + yc * u[2] * u[2]
                 w += response(b, bodies, r, n)
                 across = wa * u[0] * u[0] + wb * u[1] * u[1] + wc * u[2] * u[2]
@@ -232,10 +238,11 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
                     budget = depth * mu * shapes.friction[shape] * across / w
                     along = n * (depth / w)
                     drag = slip * (coulomb_scalar(wp.dot(slip, slip), budget) / across)
-                    put(cells.x, ia, lane, xa + (along * ya - drag * wa) * u[0])
-                    put(cells.x, ib, lane, xb + (along * yb - drag * wb) * u[1])
-                    put(cells.x, ic, lane, xc + (along * yc - drag * wc) * u[2])
-                    apply_impulse(b, bodies, r, drag - along)
+                    push = along - drag
+                    put(cells.x, ia, lane, xa + push * (wa * u[0]))
+                    put(cells.x, ib, lane, xb + push * (wb * u[1]))
+                    put(cells.x, ic, lane, xc + push * (wc * u[2]))
+                    apply_impulse(b, bodies, r, -push)
                 bodies.touching[b] = bodies.touching[b] + 1
                 bodies.support[b] = bodies.support[b] + 1
                 met = True

@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from ..contact.closest_point import closest_point
+from ..contact.table_support import table_support
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from ..lanes.tape import BODY_WORDS, BOX_TRIANGLE_SCALARS, Kind, tape
@@ -36,6 +37,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     get, put, get_mass = access.get, access.put, access.get_mass
     barycentric = closest_point(scalar, lanes).barycentric
     stands = box_particle(scalar, lanes).stands
+    raised = table_support(scalar, lanes).raised
     solve = box_triangle(scalar, lanes)
     separate, corner_towards = solve.separate, solve.corner_towards
     project_box_triangle, next_near = solve.project_box_triangle, solve.next_near
@@ -215,9 +217,9 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         """The derivatives `after` the contact times what it leaves: `wp.grad` of this takes it
         back.
         """
-        xa = corners.a
-        xb = corners.b
-        xc = corners.c
+        xa = raised(corners.a, radius)
+        xb = raised(corners.b, radius)
+        xc = raised(corners.c, radius)
         oa = corners.a_start
         ob = corners.b_start
         oc = corners.c_start
@@ -270,10 +272,11 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         budget = depth * mu * across / total
         along = out * (depth / total)
         drag = slip * (stick_share(wp.dot(slip, slip), budget) / across)
-        ends = wp.dot(after.a, xa + (along * ya - drag * wa) * u[0])
-        ends += wp.dot(after.b, xb + (along * yb - drag * wb) * u[1])
-        ends += wp.dot(after.c, xc + (along * yc - drag * wc) * u[2])
-        return ends + impulse_loss(x, q, w, inverse, r, drag - along, after.x, after.q)
+        push = along - drag
+        ends = wp.dot(after.a, corners.a + push * (wa * u[0]))
+        ends += wp.dot(after.b, corners.b + push * (wb * u[1]))
+        ends += wp.dot(after.c, corners.c + push * (wc * u[2]))
+        return ends + impulse_loss(x, q, w, inverse, r, -push, after.x, after.q)
 
     @wp.func
     def sweep_box_triangle(
@@ -313,9 +316,12 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         # the branch that the forward pass took
         turn = body.q * box.rotation
         middle = body.x + wp.quat_rotate(body.q, box.center)
-        a = wp.quat_rotate_inv(turn, xa - middle)
-        e = wp.quat_rotate_inv(turn, xb - middle)
-        c = wp.quat_rotate_inv(turn, xc - middle)
+        za = raised(xa, radius)
+        zb = raised(xb, radius)
+        zc = raised(xc, radius)
+        a = wp.quat_rotate_inv(turn, za - middle)
+        e = wp.quat_rotate_inv(turn, zb - middle)
+        c = wp.quat_rotate_inv(turn, zc - middle)
         gap, which, n = separate(a, e, c, h, radius)
         from_ = a
         way = e - a
@@ -349,9 +355,9 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         wb = get_mass(adj.w_flat, ib, lane)
         wc = get_mass(adj.w_flat, ic, lane)
         yielding = R3(
-            stands(xa[2], top.radius[radii + tri[0]], down),
-            stands(xb[2], top.radius[radii + tri[1]], down),
-            stands(xc[2], top.radius[radii + tri[2]], down),
+            stands(za[2], radius, down),
+            stands(zb[2], radius, down),
+            stands(zc[2], radius, down),
         )
         given = wa * yielding[0] * u[0] + wb * yielding[1] * u[1] + wc * yielding[2] * u[2]
         if given + body.w > S(0.0):
