@@ -35,6 +35,13 @@ def pytest_ignore_collect(collection_path, config):
     return None
 
 
+def pytest_collection_modifyitems(items):
+    """What shares a long compilation comes first, in a row: two workers would each compile it."""
+    marks = (item.get_closest_marker("compiles") for item in items)
+    names = {item: mark.args[0] for item, mark in zip(items, marks, strict=True) if mark}
+    items.sort(key=lambda item: (item not in names, names.get(item)))
+
+
 def pytest_runtest_setup(item):
     """The emulator compiles the robot's model library when it starts."""
     if item.get_closest_marker("emulator") and shutil.which("cc") is None:

@@ -80,14 +80,7 @@ class FusedXPBD:
         self.bundle: Path | None = None
         self.continued = np.zeros(self.data.world_count, bool)
         """Which worlds are in the midst of a launch that goes on, see `ContinuedLaunch`."""
-        self._kernel = forward_kernel(
-            scalars[precision],
-            lanes,
-            bool(self.data.has_bodies),
-            self.data.has_sheets,
-            self.data.has_edges,
-            self.data.has_lines,
-        )
+        self._kernel = forward_kernel(*self.data.variant)
         self._launch: GroupLaunch | None = None
         self._launch_settings: Any = None
         self._cached_settings: tuple[Any, Any] | None = None

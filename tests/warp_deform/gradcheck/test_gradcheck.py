@@ -22,6 +22,8 @@ from warp_deform.tasks.cable_shape import CableShape
 from warp_deform.worlds import Worlds
 from warp_deform.xpbd.lanes.tape import Kind
 
+pytestmark = pytest.mark.compiles("adjoints")
+
 LINE = "cable-line-notarget"
 FEW = GradcheckConfig(levels=("substep",), states=4)
 MORE = replace(FEW, states=40)

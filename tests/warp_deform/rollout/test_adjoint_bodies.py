@@ -24,6 +24,8 @@ from warp_deform.rollout import DifferentiableRollout, Gradients, GripPath
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 
+pytestmark = pytest.mark.compiles("adjoints")
+
 DT = 1 / 1200
 CUBE = BoxConfig(mass=0.05, friction=0.8)
 SOLID = SolverConfig(
@@ -324,6 +326,19 @@ def test_a_sheet_draped_on_a_box() -> None:
     solver.data.lane("particles.v", 0)[:] = noise * 0.05 - [0, 0, 0.5]
     counts = Check(solver, 2).assert_right(rounding=100.0)
     assert counts["box_triangle"] > 0 and counts["box_particle"] > 0
+
+
+def test_a_box_that_slides_on_a_sheet_loads_the_table_under_it() -> None:
+    config = replace(FABRIC_SOLVER, damping=4.0, limits=LOOSE, sleep_speed=0.0, max_speed=1e3)
+    on = (0.5, 0.0, 2 * SMALL.radius + 0.02)
+    solver, _ = cloth_solver(SMALL, box=on, config=config, lanes=1, precision="float64")
+    tilted(solver, (0.004, -0.003, 0.3), on[2] - 1e-4)
+    set_twist(solver, (0.2, 0.1, -0.2, 0.3, 0.1, 0.5))
+    rng = np.random.default_rng(0)
+    solver.data.lane("particles.x", 0)[:, 2] -= rng.uniform(0, 1e-5, 36)
+    solver.data.lane("particles.v", 0)[:] = rng.normal(size=(36, 3)) * 0.02 + [0.1, 0, 0]
+    counts = Check(solver, 3).assert_right(rounding=100.0)
+    assert counts["box_particle"] >= 4 and counts["box_triangle"] > 0 and counts["table"] >= 36
 
 
 def test_bits_depend_neither_on_storage_nor_on_lanes() -> None:

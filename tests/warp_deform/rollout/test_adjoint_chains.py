@@ -13,6 +13,8 @@ from warp_deform.rollout import DifferentiableRollout, rollout
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 
+pytestmark = pytest.mark.compiles("adjoints")
+
 BEADS = 10
 
 

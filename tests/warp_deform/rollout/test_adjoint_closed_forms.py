@@ -20,6 +20,8 @@ from warp_deform.objects.box import BoxPart
 from warp_deform.rollout import DifferentiableRollout, Gradients, GripPath
 from warp_deform.xpbd.bodies.rigid_body import SLEEP_SPEED
 
+pytestmark = pytest.mark.compiles("adjoints")
+
 DT = 1 / 1200
 MU = 0.4
 SPEED = 0.6

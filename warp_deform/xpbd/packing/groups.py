@@ -64,17 +64,32 @@ class PackedWorlds:
         bodies = [self.topologies[k].body_count * self.lanes for k in self.group_topology]
         self.group_particle = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
         self.group_body = np.concatenate([[0], np.cumsum(bodies)]).astype(int)
-        self.has_bodies = self.group_body[-1] > 0
+        self.has_bodies = bool(self.group_body[-1] > 0)
         self.has_particles = self.group_particle[-1] > 0
         # both need the kernel with fabrics
         self.has_sheets = any(
             len(top.sheet_triangle) > 0 or bool((top.spring_floor > 0).any())
             for top in self.topologies
         )
-        self.has_lines = any(
-            bool((top.spring_mode >= SpringMode.CHAIN).any()) for top in self.topologies
+        # what is compiled in although a scene has none of it changes no bit of what it has. The
+        # kernels below differ by a tenth of their code: one that serves both is compiled once.
+        checks = self.scalar == wp.float64
+        self.has_lines = (
+            checks
+            or (self.has_bodies and not self.has_sheets)
+            or any(bool((top.spring_mode >= SpringMode.CHAIN).any()) for top in self.topologies)
         )
-        self.has_edges = any(len(top.sheet_edge) > 0 for top in self.topologies)
+        self.has_edges = (checks and self.has_sheets) or any(
+            len(top.sheet_edge) > 0 for top in self.topologies
+        )
+
+    @property
+    def variant(self) -> tuple[Any, int, bool, bool, bool, bool]:
+        """The first arguments of `forward_kernel` and `adjoint_kernel` for these worlds."""
+        return (
+            self.scalar, self.lanes,
+            self.has_bodies, self.has_sheets, self.has_edges, self.has_lines,
+        )  # fmt: skip
 
     def add_array(
         self, name: str, count: int, dtype: Any, shape: tuple[int, ...], number: Any

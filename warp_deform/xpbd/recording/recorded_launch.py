@@ -196,9 +196,7 @@ class RecordedLaunch(ContinuedLaunch):
         solver, data = self.solver, self.data
         self._launch(False)  # which looks whether the configuration has changed
         if self._taped is None or self._taped[0] is not self._config:
-            variant = (data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets,
-                       data.has_edges, data.has_lines)  # fmt: skip
-            kernel = forward_kernel(*variant, taped=True)
+            kernel = forward_kernel(*data.variant, taped=True)
             inputs = [self.settings(self.substeps), *data.structs(self.arrays)[:-1], tape.struct]
             self._taped = self._config, solver.group_launch(kernel, inputs), len(inputs) - 1
         _, launch, at = self._taped

@@ -94,8 +94,7 @@ class Recorder:
         self.memory, self.sleep = memory, sleep
         self.dt, self.damp_every = dt or solver.config.dt, damp_every
         data = solver.data
-        self._variant = (data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets,
-                         data.has_edges, data.has_lines)  # fmt: skip
+        self._variant = data.variant
         self._settings = self._new_settings()
         self._segments: list[_Segment] = []
         self._final: dict[str, Any] = {}

@@ -73,17 +73,17 @@ class SweepArena:
         if self._config is launch.solver.config:
             return
         self._config, self._on_again = launch.solver.config, -1
-        variant = (data.scalar, data.lanes, bool(data.has_bodies), data.has_sheets,
-                   data.has_edges, data.has_lines)  # fmt: skip
         settings, blank = launch.settings(launch.substeps), data.types.Tape()
         inputs = [settings, *data.structs(self._arrays)[:-1], blank]
         self._tape_at = len(inputs) - 1
-        self._forward = launch.solver.group_launch(forward_kernel(*variant, taped=True), inputs)
+        self._forward = launch.solver.group_launch(
+            forward_kernel(*data.variant, taped=True), inputs
+        )
         swept = [data.struct(name, self._arrays) for name in SWEPT]
         for name, array in contact_notes(data).items():
             setattr(swept[SWEPT.index("contacts")], name, array)
         self._sweep = launch.solver.group_launch(
-            adjoint_kernel(*variant),
+            adjoint_kernel(*data.variant),
             [settings, *swept, blank, self._by.by_state, self._by.by_bodies],
         )
 
