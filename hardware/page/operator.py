@@ -106,7 +106,7 @@ class PageOperator:
         question = Question(next(self._numbers), which, text, choices, plan or {})
         picture = None if drawn is None else encoded(drawn)
         self._tell("ask", question=question, drawn=picture)
-        self._notify(f"{text}\n  asked at the page {self._served.access.address}")
+        self._notify(f"{text}\n  asked at the page")  # its address is a secret, told once
         try:
             while True:
                 self._tell("beat")

@@ -72,6 +72,7 @@ class OperatorSession:
         "point": {"question": int, "beat": int, "pick": list, "place": list},
         "halt": {},
     }
+    urgent: frozenset[str] = frozenset({"halt"})
 
     def __init__(self, about: Mapping[str, Any], halt: Callable[[], None]) -> None:
         self.stop = threading.Event()

@@ -19,7 +19,7 @@ from ..robots.primitive import Outcome, find_grasp
 from ..support.flag_range import SEED
 from ..tasks.metrics import wrap_angle
 from ..tasks.task import Action
-from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
+from ..worlds.episode import DEMONSTRATOR_STREAM, StepReport, episode_rng
 from ..worlds.loop import EpisodeRun
 from ..worlds.spaces import check_action
 from ..worlds.state import WorldState
@@ -65,6 +65,7 @@ class PlaySession:
         "next": {},
         "keep": {},
     }
+    urgent: frozenset[str] = frozenset()
 
     def __init__(
         self,
@@ -213,18 +214,27 @@ class PlaySession:
 
     def _do_act(self, job: Job, post: Post) -> None:
         self._refuse_when_over()
-        post(self.step(self.action(job), HUMAN))
+        post(self.step(self.action(job), HUMAN, post))
         self._note_standing(post)
 
-    def step(self, action: Action, who: str) -> bytes:
+    def step(self, action: Action, who: str, post: Post) -> bytes:
         """Carry out an action and return the message that shows it.
+
+        The approach is posted before the carry is computed, so that a page need not wait for it.
 
         Raises:
             InputError: a person asked for what the arm cannot reach; nothing has changed.
         """
         worlds, episode = self.worlds, self.worlds.episodes[0]
         before, waiting = worlds.state(0), episode.posture.copy()
-        report = worlds.step({0: action}, record=1.0 / FRAMES_A_SECOND)[0]
+
+        def lead(reports: Mapping[int, StepReport]) -> None:
+            approach = clip(worlds.robot, reports[0], waiting, worlds.episodes[0].snapshot)
+            if approach is not None:
+                told = {"seed": self.run.seed, "actions": len(self.run.actions) + 1}
+                post(pack("lead", approach[0], end=approach[1], **told))
+
+        report = worlds.step({0: action}, record=1.0 / FRAMES_A_SECOND, led=lead)[0]
         if report.outcome is Outcome.UNREACHABLE and who == HUMAN:
             worlds.restore(0, before)
             raise InputError("the arm cannot reach there with its tip down; nothing has moved")
@@ -264,7 +274,7 @@ class PlaySession:
             with at_work(player.name, post):
                 action = self._choice(player, self.run)
                 post(sight_message(player, self.worlds, action, acts=True))
-                post(self.step(action, player.name))
+                post(self.step(action, player.name, post))
             self._note_standing(post)
             if not job.values["whole"]:
                 return

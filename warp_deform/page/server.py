@@ -2,6 +2,7 @@
 
 The event loop only moves bytes. One thread owns the session, and with it the worlds: jobs wait for
 it in one bounded queue, and what it has to say goes to the tabs in the order in which it says it.
+Urgent jobs go before all that wait, and are never refused: one at a time of every tab.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http
+import itertools
 import queue
 import signal
 import socket
@@ -53,6 +55,8 @@ class Session(Protocol):
     """What is served beside `access.FILES`; "" is what is served at the address itself."""
     verbs: Verbs
     """What a page may ask for."""
+    urgent: frozenset[str]
+    """Verbs that wait for no other job."""
     stop: threading.Event
     """Is set when a person wants a long job to end."""
 
@@ -72,6 +76,7 @@ class _Tab:
     connection: ServerConnection
     waiting: asyncio.Queue[bytes] = field(default_factory=lambda: asyncio.Queue(MOST_MESSAGES))
     greeted: bool = False
+    urges: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +101,8 @@ class Served:
         self.ended = asyncio.Event()
         self._session = session
         self._loop = asyncio.get_running_loop()
-        self._jobs: queue.Queue[_Asked | None] = queue.Queue()
+        self._jobs: queue.PriorityQueue[tuple[int, int, _Asked | None]] = queue.PriorityQueue()
+        self._numbers = itertools.count()
         self._waiting = 0
         self._tabs: list[_Tab] = []
         # a daemon: where it is at work for minutes, the process does not wait for it
@@ -106,7 +112,7 @@ class Served:
     async def close(self) -> None:
         """Let the job in hand end, and the thread; tabs have a moment for what was said last."""
         self._session.stop.set()
-        self._jobs.put(None)
+        self._queue(None)
         await asyncio.to_thread(self._thread.join, 10.0)
         sent = [asyncio.create_task(tab.waiting.join()) for tab in self._tabs]
         if sent:
@@ -172,7 +178,11 @@ class Served:
         except InputError as error:
             self._put(tab, _note(str(error)))
             return True
-        if self._waiting >= MOST_JOBS:
+        if job.do in self._session.urgent:
+            if not tab.urges:  # else it waits already
+                tab.urges = True
+                self._queue(_Asked(tab, job), urgent=True)
+        elif self._waiting >= MOST_JOBS:
             self._put(tab, _note("too much is waiting to be done; try again"))
         else:
             self._ask(_Asked(tab, job))
@@ -180,12 +190,15 @@ class Served:
 
     def _ask(self, asked: _Asked) -> None:
         self._waiting += asked.tab is not None and asked.job is not None
-        self._jobs.put(asked)
+        self._queue(asked)
+
+    def _queue(self, asked: _Asked | None, *, urgent: bool = False) -> None:
+        self._jobs.put((0 if urgent else 1, next(self._numbers), asked))
 
     def _work(self) -> None:
         """What the simulation's thread does."""
         try:
-            while (asked := self._jobs.get()) is not None:
+            while (asked := self._jobs.get()[2]) is not None:
                 self._do(asked)
         except BaseException as error:  # the verb raises it again: nothing is hidden
             self.broken = error
@@ -205,14 +218,17 @@ class Served:
         except WarpDeformError as error:
             post(_note(str(error)), everyone=False)
         if asked.tab is not None:
-            self._in_loop(self._done)
+            self._in_loop(self._done, asked)
 
     def _in_loop(self, call: Callable[..., Any], *arguments: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed: nobody listens any more
             self._loop.call_soon_threadsafe(call, *arguments)
 
-    def _done(self) -> None:
-        self._waiting -= 1
+    def _done(self, asked: _Asked) -> None:
+        if asked.tab is not None and asked.job is not None and asked.job.do in self._session.urgent:
+            asked.tab.urges = False
+        else:
+            self._waiting -= 1
 
     def _greet(self, tab: _Tab, messages: list[bytes]) -> None:
         if tab in self._tabs:

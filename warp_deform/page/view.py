@@ -97,6 +97,7 @@ class ViewSession:
         "open": {"key": int, "side": int},
         "clip": {"key": int, "side": int, "t": int},
     }
+    urgent: frozenset[str] = frozenset()
 
     def __init__(self, source: Source) -> None:
         self.stop = threading.Event()

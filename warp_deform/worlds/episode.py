@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,6 +24,7 @@ __all__ = [
     "LAYOUT_STREAM",
     "Carry",
     "Execution",
+    "Led",
     "RunningEpisode",
     "StepReport",
     "aloft",
@@ -108,6 +109,10 @@ class StepReport:
     frames: Frames | None
 
 
+Led = Callable[[Mapping[int, StepReport]], None]
+"""Is told how tips came down to what they take, by slot; the carry is not computed yet."""
+
+
 @dataclass(eq=False)
 class Execution:
     """One action while it is carried out: what was done so far, and what came of it."""
@@ -142,6 +147,12 @@ class Execution:
         seconds = [run.seconds for run in self.runs]
         frames = _join_frames([run.frames for run in self.runs], seconds) if recorded else None
         return StepReport(outcome, sum(seconds), tuple(self.motions), tuple(self.joints), frames)
+
+    def report_of_approach(self) -> StepReport:
+        """What the tip did until it was down at what it takes, where nothing is carried yet."""
+        (run,) = self.runs
+        motions, joints = tuple(self.motions[:1]), tuple(self.joints[:1])
+        return StepReport(self.outcome, run.seconds, motions, joints, run.frames)
 
 
 @dataclass(frozen=True, eq=False)

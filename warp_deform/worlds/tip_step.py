@@ -10,7 +10,7 @@ from ..robots.primitive import Motion, Outcome, approach
 from ..rollout.rollouts import GripPath, Rollout, rollout
 from ..tasks.task import Task
 from ..xpbd.fused_xpbd import FusedXPBD
-from .episode import ALOFT_EVERY, Carry, Execution, RunningEpisode
+from .episode import ALOFT_EVERY, Carry, Execution, Led, RunningEpisode
 
 __all__ = ["ActingWorlds", "carry_and_release", "lead_down", "tip_step"]
 
@@ -42,8 +42,17 @@ class ActingWorlds(Protocol):
         """Take a snapshot of a slot's state."""
 
 
-def tip_step(worlds: ActingWorlds, executions: Mapping[int, Execution], record: float) -> None:
-    """Carry out actions; notes outcomes, rollouts and motions in their executions."""
+def tip_step(
+    worlds: ActingWorlds,
+    executions: Mapping[int, Execution],
+    record: float,
+    led: Led | None = None,
+) -> None:
+    """Carry out actions; notes outcomes, rollouts and motions in their executions.
+
+    Args:
+        led: see `Worlds.step`
+    """
     carries = lead_down(worlds, executions, record)
     motions, paths = {}, {}
     for slot, carried in carries.items():
@@ -51,6 +60,8 @@ def tip_step(worlds: ActingWorlds, executions: Mapping[int, Execution], record: 
     moving = worlds.reachable(executions, motions)
     if not moving:
         return
+    if led is not None:
+        led({slot: executions[slot].report_of_approach() for slot in moving})
     runs = carry_and_release(worlds, {slot: paths[slot] for slot in moving}, record)
     for slot in moving:
         executions[slot].placed(runs[slot], carries[slot], paths[slot])

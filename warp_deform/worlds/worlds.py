@@ -33,6 +33,7 @@ from .episode import (
     LAYOUT_STREAM,
     Carry,
     Execution,
+    Led,
     RunningEpisode,
     StepReport,
     episode_rng,
@@ -132,9 +133,8 @@ class Worlds:
             layouts = {s: self._sample(rngs[s], goals.get(s)) for s in waiting}
             made = {s: goals[s] for s in waiting if s in goals}
             if self.task.goal_conditioned:
-                made |= self._construct_goals(
-                    {s: layouts[s] for s in waiting if s not in made}, seeds
-                )
+                missing = {s: layouts[s] for s in waiting if s not in made}
+                made |= self._construct_goals(missing, seeds)
                 layouts = {
                     s: layouts[s] if s in goals else layouts[s].with_targets(goal.targets)
                     for s, goal in made.items()
@@ -247,17 +247,18 @@ class Worlds:
         return bool(inside) and self.task.acceptable(episode.layout, snapshot)
 
     def step(
-        self, actions: Mapping[int, np.ndarray], *, record: float = 0.0
+        self, actions: Mapping[int, np.ndarray], *, record: float = 0.0, led: Led | None = None
     ) -> dict[int, StepReport]:
         """Run one pick-and-place in every named slot and let the worlds come to rest.
 
         Args:
             actions: (7,) each, pick x, y [m], yaw [rad], place x, y, yaw, lift [m]; finite
             record: interval of recorded frames [s]; 0 records nothing.
+            led: is called before tips carry, with reports of how they came there; jaws do not
         """
         executions = {slot: self._checked(slot, action) for slot, action in actions.items()}
         if self.task.jaw is None:
-            tip_step(self, executions, record)
+            tip_step(self, executions, record, led)
         else:
             jaw_step(self, executions, record)
         limits = self.solver.config.limits
@@ -329,8 +330,7 @@ class Worlds:
         data, episode = self.solver.data, self.episodes[slot]
         particle_q = np.array(data.lane("particles.x", slot), np.float32)
         particle_qd = np.array(data.lane("particles.v", slot), np.float32)
-        poses, twists = data.body_poses(slot)
-        body_q, body_qd = poses.astype(np.float32), twists.astype(np.float32)
+        body_q, body_qd = (each.astype(np.float32) for each in data.body_poses(slot))
         drawables, layout, topdown = episode.drawables, episode.layout, self._topdown
         ok = np.isfinite(particle_q).all() and np.isfinite(body_q).all()
 

@@ -15,11 +15,17 @@ const HEADS = {
 const KEYS = {yes: "Enter", another: "S"};
 
 let hello = null, question = null, beat = null, sent = false, over = "", pictures = {}, picked = null, cursor = null;
+let line = Promise.resolve(), link = 0; // messages one after the other; of which connection
 const send = connect(hear, changed);
 
+/** Take a message once those before it are done: pictures are decoded, which takes its time. */
 function hear(message) {
-  ({hello: greeted, look: looked, ask: asked, beat: beaten, closed, line: said, over: ended, note: refused})[message.kind](message);
-  mark();
+  const of = link, came = performance.now();
+  line = line.then(async () => {
+    if (of !== link) return; // of a connection that was lost: the next one begins with a greeting
+    await ({hello: greeted, look: looked, ask: asked, beat: beaten, closed, line: said, over: ended, note: refused})[message.kind](message, came);
+    mark();
+  }).catch(error => { console.error(error); });
 }
 
 function greeted(message) {
@@ -35,7 +41,8 @@ function greeted(message) {
 
 async function looked(message) {
   const {camera, above, mask, goal} = message;
-  pictures = {camera: await decode(camera, "image/jpeg"), above: await decode(above)};
+  const [photograph, view] = await Promise.all([decode(camera, "image/jpeg"), decode(above)]);
+  pictures = {camera: photograph, above: view};
   document.body.dataset.looks = message.actions;
   paint("mask", await decode(mask));
   $("goal-box").hidden = !goal;
@@ -44,6 +51,7 @@ async function looked(message) {
 }
 
 async function asked(message) {
+  const of = link;
   question = message;
   beat = null;
   sent = false;
@@ -51,16 +59,16 @@ async function asked(message) {
   picked = cursor = null;
   $("refused").hidden = true;
   question.picture = message.plan ? await decode(message.plan) : null;
-  if (question !== message) return; // another one came while this was decoded
+  if (of !== link) return; // the connection was lost while this was decoded
   draw();
   question.drawn = performance.now();
   show();
   if (question.which === "point") $("above").focus();
 }
 
-function beaten(message) {
+function beaten(message, came) {
   if (!question?.drawn || message.question !== question.number) return;
-  beat = {number: message.beat, at: performance.now()};
+  beat = {number: message.beat, at: came};
   show();
 }
 
@@ -95,6 +103,7 @@ function refused(message) {
 }
 
 function changed(state) {
+  link++;
   question = beat = null;
   const says = {
     open: "", lost: "Not connected; trying again. Nothing is answered meanwhile, and the arm does not begin anything that has to be asked for.",

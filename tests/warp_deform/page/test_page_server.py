@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -26,7 +27,8 @@ class Counter:
     """A session that counts."""
 
     files = {"": StaticFile("index.html")}
-    verbs = {"add": {"number": int}, "big": {}, "wait": {}}
+    verbs = {"add": {"number": int}, "big": {}, "wait": {}, "halt": {}}
+    urgent = frozenset({"halt"})
 
     def __init__(self):
         self.stop = threading.Event()
@@ -46,6 +48,8 @@ class Counter:
             self.total += job.values["number"]
             self.done.append(job.values["number"])
             post(pack("scene", total=self.total, count=len(self.done)))
+        elif job.do == "halt":
+            post(pack("halted", total=self.total), everyone=False)
         elif job.do == "big":
             post(pack("clip", total=self.total, text="x" * 2**20))
         else:
@@ -99,6 +103,39 @@ def test_other_pages_get_no_socket(server, origin):
     with pytest.raises(InvalidStatus) as refused:
         server.tab(origin=origin)
     assert refused.value.response.status_code == 403
+
+
+def test_a_forwarded_port_is_the_same_page(server):
+    """As `ssh -L N:127.0.0.1:N` does it, here from 127.0.0.2; another number is another host."""
+    port, base = server.access.port, f"/{server.access.token}/"
+
+    def forward():
+        near, _ = relay.accept()
+        far = socket.create_connection(("127.0.0.1", port))
+        pipes = [threading.Thread(target=pipe, args=two) for two in ((near, far), (far, near))]
+        for each in pipes:
+            each.start()
+        for each in pipes:
+            each.join()
+        for each in (near, far):
+            each.close()
+
+    def pipe(source, sink):
+        while data := source.recv(2**16):
+            sink.sendall(data)
+        sink.shutdown(socket.SHUT_WR)
+
+    with socket.create_server(("127.0.0.2", port)) as relay:
+        end = threading.Thread(target=forward)
+        end.start()
+        with server.tab(sock=socket.create_connection(("127.0.0.2", port))) as tab:
+            assert hear(tab, "scene")["total"] == server.session.total
+            say(tab, do="add", number=3)
+            assert hear(tab, "scene")["total"] == server.session.total
+        end.join(10)
+        assert not end.is_alive()
+    assert server.get(base, [("Host", f"localhost:{port}")]).status == 200
+    assert server.get(base, [("Host", f"localhost:{port + 1}")]).status == 403
 
 
 @pytest.mark.parametrize(
@@ -160,6 +197,25 @@ def test_a_long_job_is_stopped_and_only_so_many_wait(server, tab):
     assert hear(tab, "stopped")
     totals = [hear(tab, "scene")["total"] for _ in range(MOST_JOBS - 1)]
     assert totals[-1] == server.session.total == before + MOST_JOBS - 1
+
+
+def test_what_is_urgent_waits_for_nothing_that_waits(server, tab):
+    """It waits for the job in hand alone, also where the queue is full or a tab floods it."""
+    with server.tab() as other:
+        hear(other, "scene")
+        say(other, do="wait")
+        for _ in range(MOST_JOBS):
+            say(other, do="add", number=1)
+        assert "try again" in hear(other, "note")["text"]
+        before = server.session.total
+        for _ in range(5):  # of one tab no second one waits
+            say(tab, do="halt")
+        tab.send('{"do":"stop"}')
+        assert hear(tab, "halted", "scene") == {"kind": "halted", "total": before}
+        kinds = [hear(tab, "halted", "scene")["kind"] for _ in range(MOST_JOBS - 1)]
+        assert kinds == ["scene"] * (MOST_JOBS - 1)
+        say(tab, do="halt")
+        assert hear(tab, "halted")["total"] == before + MOST_JOBS - 1
 
 
 def test_a_tab_that_does_not_read_is_cut_off_and_greeted_anew(server, tab):

@@ -21,6 +21,7 @@ from warp_deform.page.play import PlaySession
 from warp_deform.page.wire import Job, unpack
 from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.rollout.rollouts import Frames
+from warp_deform.worlds import tip_step
 from warp_deform.worlds.episode import StepReport
 from warp_deform.worlds.worlds import Worlds
 from warp_deform.xpbd.guards import GuardLimits
@@ -65,7 +66,7 @@ def test_an_action_is_the_one_of_worlds(fresh):
     alone = Worlds(TASK, 1)
     alone.reset({0: 0})
     action = best(fresh)
-    (shown,) = act(fresh, action)
+    lead, shown = act(fresh, action)
     alone.step({0: action})
     assert shown["hash"] == hash_of(fresh) == alone.hash(0)
     assert shown["score"] == alone.score(0) and shown["acted"] == [HUMAN]
@@ -74,6 +75,26 @@ def test_an_action_is_the_one_of_worlds(fresh):
     assert len(shown["q"]) == len(shown["links"]) == round(shown["end"] * 30) + 1
     moved = np.abs(shown["q"] - shown["q"][0]).max((1, 2))
     assert moved[0] == 0 < moved[len(moved) // 2] < moved.max()
+    first = len(lead["q"]) - 1  # the approach, which is posted before the carry is computed
+    assert 0.3 < lead["end"] < shown["end"] and lead["actions"] == shown["actions"]
+    assert np.array_equal(lead["q"][:first], shown["q"][:first])
+    assert np.array_equal(lead["links"][:first], shown["links"][:first])
+
+
+def test_the_approach_is_posted_before_the_rest_is_computed(fresh, monkeypatch):
+    action, steps = best(fresh), []
+    monkeypatch.setattr(tip_step, "carry_and_release", lambda *_: steps.append("carry") or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        fresh.step(action, HUMAN, lambda message, everyone=True: steps.append(unpack(message)))
+    lead, carry = steps
+    assert lead["kind"] == "lead" and carry == "carry" and np.ptp(lead["links"], axis=0).max() > 0.1
+
+
+def test_where_nothing_is_taken_the_whole_motion_comes_at_once(fresh):
+    action = best(fresh)
+    action[:2] = 0.3, -0.45 if fresh.worlds.episodes[0].snapshot.particle_q[0, 1] > 0 else 0.45
+    (shown,) = act(fresh, action)
+    assert (shown["kind"], shown["outcomes"]) == ("clip", ["missed"])
 
 
 def test_undo_goes_back_bit_for_bit_and_a_reset_is_that_of_the_environment(fresh):
@@ -150,7 +171,7 @@ def test_a_guard_that_fires_is_told_and_undone(fresh, monkeypatch):
     strict = replace(solver.config, limits=GuardLimits(stretch=1.0001))
     with monkeypatch.context() as patch:
         patch.setattr(solver, "config", strict)
-        (shown,) = act(fresh, action)
+        shown = act(fresh, action)[-1]
     assert "near x" in shown["physics"]
     particles = np.linalg.norm(shown["q"] - np.array(shown["fault"]), axis=-1)
     assert particles.min() < 0.01  # at the middle of a link
@@ -164,7 +185,7 @@ def test_a_guard_that_fires_is_told_and_undone(fresh, monkeypatch):
     (scene,) = ask(fresh, "undo")
     assert (scene["hash"], scene["physics"], scene["fault"]) == (before, "", None)
     assert len(fresh.run.rows) == 1
-    (shown,) = act(fresh, action)
+    shown = act(fresh, action)[-1]
     assert not shown["physics"] and len(fresh.run.rows) == 2
 
 
@@ -216,8 +237,9 @@ def test_an_episode_of_a_person_is_a_demonstration(tmp_path):
 
 
 def test_demonstrators_act_step_by_step_or_until_they_are_stopped(fresh):
-    work, sight, shown, done = ask(fresh, "demonstrate", who="visible", whole=False)
+    work, sight, lead, shown, done = ask(fresh, "demonstrate", who="visible", whole=False)
     assert (work["who"], shown["acted"], done["who"]) == ("visible", ["visible"], "")
+    assert lead["kind"] == "lead" and lead["actions"] == shown["actions"] == 1
     assert sight["action"] == shown["action"] and sight["acts"] and "pick" not in sight
     fresh.stop.set()
     assert ask(fresh, "demonstrate", who="visible", whole=True) == []

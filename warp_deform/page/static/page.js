@@ -50,12 +50,13 @@ function ask(message) {
   if (waiting) note("one thing at a time: what was asked for before is still at work", true);
   if (waiting || !latest) return false;
   waiting = send({...message, at: latest.version});
+  pressed = performance.now();
   mark();
   return waiting;
 }
 
 function hear(message) {
-  ({hello: greeted, scene: staged, clip: moved, note: noted, grasp: probed, work: worked, sight: seen, table: ranked, gradient: pulled})[message.kind](message);
+  ({hello: greeted, scene: staged, lead: led, clip: moved, note: noted, grasp: probed, work: worked, sight: seen, table: ranked, gradient: pulled})[message.kind](message);
   mark();
 }
 
@@ -81,17 +82,23 @@ function staged(message) {
   settle(message);
 }
 
+/** The beginning of a motion, while the server is at the rest of it. */
+function led(message) { playback.add(newMotion({...message, open: true})); }
+
 function moved(message) {
   waiting = false;
-  latest = message;
-  message.frames = message.q.shape[0];
-  message.fps = hello.frames;
+  latest = playback.complete(playback.open ? timed(message) : newMotion(message));
+}
+
+const timed = clip => Object.assign(clip, {frames: clip.q.shape[0], fps: hello.frames});
+
+function newMotion(clip) {
   hand.drop();
   light(null);
   forget();
-  message.sight = coming;
+  clip.sight = coming;
   coming = null;
-  playback.add(message);
+  return timed(clip);
 }
 
 /** What somebody would do, and where it looks. */
@@ -113,7 +120,7 @@ async function seen(message) {
   refresh();
 }
 
-let sighted = null, coming = null, moving = null;
+let sighted = null, coming = null, moving = null, pressed = 0;
 function overlay(name, layer, height) {
   if (layer) top.layers[name] = layer; else delete top.layers[name];
   if (scene) scene.overlay(name, layer, hello.grid, height);
@@ -140,7 +147,11 @@ function pulled({place, to, says}) {
   refresh();
 }
 
-function ranked(message) { waiting = false; rank(message.rows); }
+function ranked(message) {
+  rank(message.rows);
+  if (waiting) $("contest").scrollIntoView({block: "nearest"}); // it was asked for, and may be out of sight
+  waiting = false;
+}
 
 function noted(message) {
   waiting = probing = false;
@@ -186,6 +197,8 @@ function ghost() { if (scene && goal) scene.overlay("goal", $("ghost").checked ?
 function showFrame(clip, frame) {
   if (clip !== moving) {
     moving = clip;
+    if (pressed) document.body.dataset.waited = ((performance.now() - pressed) / 1000).toFixed(3);
+    pressed = 0;
     if (clip.sight) seen({...clip.sight, acts: false}); else forget();
   }
   const part = (array, rest) => array.subarray(frame * rest, (frame + 1) * rest);
@@ -218,24 +231,27 @@ function mark() {
     actions: shown ? shown.actions : "", score: shown ? shown.score : "", seed: shown ? shown.seed : "",
     hash: shown ? shown.hash : "", over: shown ? shown.over : "", playing: playback.playing, waiting,
     clips: playback.clips.length, end: playback.length, time: playback.time.toFixed(3),
-    drawn: scene ? scene.drawn : 0, webgl: Boolean(scene), slow: Boolean(scene?.slow),
+    drawn: scene ? scene.drawn : 0, share: scene ? scene.share : "", webgl: Boolean(scene), slow: Boolean(scene?.slow),
     q: top.q ? top.q.reduce((sum, x, k) => sum + x * (k % 7 + 1), 0).toFixed(6) : "",
   });
 }
+
+/** Another text: the same one would be laid out and painted anew in every frame. */
+function write(id, text) { if ($(id).textContent !== text) $(id).textContent = text; }
 
 let before = 0;
 function loop(now) {
   requestAnimationFrame(loop);
   playback.speed = Number($("speed").value);
   playback.tick((now - before) / 1000);
+  if (scene) { scene.pace((now - before) / 1000, playback.playing); scene.draw(); }
   before = now;
-  if (scene) scene.draw();
   if (stale) { stale = false; top.draw(); }
   $("time").disabled = $("pause").disabled = !playback.clip;
-  $("pause").textContent = playback.playing ? "Pause" : "Play";
+  write("pause", playback.playing ? "Pause" : "Play");
   if (document.activeElement !== $("time")) $("time").value = playback.length ? playback.time / playback.length : 1;
-  $("time-says").textContent = playback.clip ? `${playback.time.toFixed(1)} s` : "";
-  $("hint").textContent = hint();
+  write("time-says", playback.clip ? `${playback.time.toFixed(1)} s` : "");
+  write("hint", hint());
   mark();
 }
 
@@ -247,7 +263,9 @@ function pull() {
 
 function hint() {
   if (!hello) return "connecting";
-  if (playback.playing) return "";
+  if (playback.clip?.open && playback.now >= playback.clip.end) return "the rest of the motion is being computed";
+  if (playback.playing || waiting) return "";
+  if (!playback.finished) return "paused: P plays on, a click on the table goes to the end";
   if (shown?.over) return `${shown.over}: undo, or go on to the next`;
   if (hand.pick) return "click where it goes; Q and E turn, Esc lets go";
   return scene ? "click or drag what to pick (or arrows and Enter); drag beside it to look around, scroll to come nearer" : "click what to pick, or drag it; or arrows and Enter";

@@ -15,11 +15,14 @@ export class Playback {
   /** Seconds from the beginning of the first clip. */
   get time() { return this.clips.slice(0, this.at).reduce((sum, clip) => sum + clip.end, 0) + this.now; }
 
-  get finished() { return !this.clip || (this.at === this.clips.length - 1 && this.now >= this.clip.end); }
+  /** The beginning of a motion whose rest is still computed: it waits at its end. */
+  get open() { const last = this.clips.at(-1); return last?.open ? last : null; }
+
+  get finished() { return !this.clip || (!this.clip.open && this.at === this.clips.length - 1 && this.now >= this.clip.end); }
 
   /** Keep the clips of `actions` actions of an episode alone; the last state stands. */
   keep(seed, actions) {
-    this.clips = this.clips.filter(clip => clip.seed === seed && clip.actions <= actions);
+    this.clips = this.clips.filter(clip => !clip.open && clip.seed === seed && clip.actions <= actions);
     this.at = Math.max(0, this.clips.length - 1);
     this.now = this.clip ? this.clip.end : 0;
     this.playing = false;
@@ -29,6 +32,14 @@ export class Playback {
     const waits = this.finished;
     this.clips.push(clip);
     if (waits) { this.at = this.clips.length - 1; this.now = 0; this.playing = true; this.draw(); }
+  }
+
+  /** The whole of a motion, instead of its beginning where that is shown; returns what is kept. */
+  complete(clip) {
+    const open = this.open;
+    if (open) return Object.assign(open, clip, {open: false});
+    this.add(clip);
+    return clip;
   }
 
   draw() {
@@ -56,6 +67,7 @@ export class Playback {
     while (this.clip && !this.finished) {
       this.now = this.clip.end;
       this.draw();
+      if (this.clip.open) return;
       this.ended(this.clip);
       if (this.at < this.clips.length - 1) { this.at++; this.now = 0; }
     }
@@ -63,12 +75,13 @@ export class Playback {
   }
 
   tick(seconds) {
-    if (!this.playing || !this.clip) return;
+    if (!this.playing || !this.clip || this.clip.open && this.now >= this.clip.end) return;
     this.now += Math.min(seconds, LONGEST_STEP) * this.speed;
     if (this.now >= this.clip.end) {
       const over = this.clip;
       this.now = over.end;
       this.draw();
+      if (over.open) return;
       if (this.at < this.clips.length - 1) { this.at++; this.now = 0; } else this.playing = false;
       this.ended(over);
     } else this.draw();

@@ -4,10 +4,12 @@ import * as T from "./three.js";
 
 const EYE = [1.5, -0.8, 1.0], LOOK_AT = [0.42, -0.03, 0.14];
 const FIELD = 0.73, WIDE = 1.25; // rad from top to bottom, where a view is so much wider than high
+const LAMP = [0.9, -1.0, 2.4], LIT = [0.4, 0, 0], BRIGHT = 2.0, SKY = 1.5;
+const LATE = 1 / 15, LEAST = 0.4, LESS = 0.75; // s a frame that is too long, share of the pixels' edge, its steps
 const FINGER = 0.015; // m: a particle so near to the ray is what the person means
 
 const tint = rgb => new T.Color().setRGB(rgb[0] / 255, rgb[1] / 255, rgb[2] / 255, T.SRGBColorSpace);
-const matt = (rgb, more = {}) => new T.MeshLambertMaterial({color: tint(rgb), ...more});
+const matt = (rgb, more = {}) => new T.MeshLambertMaterial({color: tint(rgb), fog: false, ...more});
 const glow = (color, more = {}) => new T.MeshBasicMaterial({color, transparent: true, opacity: 0.9, depthTest: false, ...more});
 
 /** A 3-D view, or null where the browser has no WebGL. */
@@ -40,7 +42,8 @@ class Scene {
     this.orbit.minDistance = 0.3; this.orbit.maxDistance = 4;
     this.orbit.update();
     this.orbit.addEventListener("change", () => { this.dirty = true; });
-    this.drawn = 0;
+    this.drawn = this.late = 0;
+    this.share = this.kept = 1;
     this.dirty = true;
     this.ray = new T.Raycaster();
     this.table = new T.Plane(new T.Vector3(0, 0, 1), 0);
@@ -50,16 +53,19 @@ class Scene {
   }
 
   light() {
-    const lamp = new T.DirectionalLight(0xffffff, 2.0);
-    lamp.position.set(0.9, -1.0, 2.4);
-    lamp.target.position.set(0.4, 0, 0);
+    const lamp = new T.DirectionalLight(0xffffff, BRIGHT);
+    lamp.position.set(...LAMP);
+    lamp.target.position.set(...LIT);
     lamp.castShadow = true;
     lamp.shadow.mapSize.set(2048, 2048);
     Object.assign(lamp.shadow.camera, {left: -1, right: 1, top: 1, bottom: -1, near: 1, far: 5});
     lamp.shadow.bias = -0.0008;
     lamp.shadow.radius = 3;
-    this.scene.add(lamp, lamp.target, new T.HemisphereLight(0xffffff, 0xb8b4ae, 1.5));
-    this.floor = new T.Mesh(new T.PlaneGeometry(30, 30), matt([214, 211, 206]));
+    this.scene.add(lamp, lamp.target, new T.HemisphereLight(0xffffff, 0xb8b4ae, SKY));
+    // the processor would spend a third of a frame on lighting a floor that is bright alike everywhere
+    const Floor = this.slow ? T.MeshBasicMaterial : T.MeshLambertMaterial, light = new T.Vector3(...LAMP).sub(new T.Vector3(...LIT)).normalize();
+    const lit = this.slow ? (BRIGHT * light.z + SKY) / Math.PI : 1;
+    this.floor = new T.Mesh(new T.PlaneGeometry(30, 30), new Floor());
     this.floor.position.z = -0.031;
     this.floor.receiveShadow = true;
     this.scene.add(this.floor);
@@ -68,7 +74,7 @@ class Scene {
       const style = getComputedStyle(document.documentElement);
       this.scene.background = new T.Color(style.getPropertyValue("--air").trim());
       this.scene.fog.color.copy(this.scene.background);
-      this.floor.material.color.set(style.getPropertyValue("--floor").trim());
+      this.floor.material.color.set(style.getPropertyValue("--floor").trim()).multiplyScalar(lit);
       this.dirty = true;
     };
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolor);
@@ -114,9 +120,9 @@ class Scene {
   furnish(hello) {
     if (this.slow && !this.flat) {
       this.renderer.localClippingEnabled = true;
-      this.flat = new FlatShadows(this.scene, [-0.5, 1.0, -2.4], hello.bounds);
+      this.flat = new FlatShadows(this.scene, LIT.map((x, k) => x - LAMP[k]), hello.bounds);
     }
-    for (const mesh of this.arm) { this.scene.remove(mesh); mesh.geometry.dispose(); }
+    for (const mesh of this.arm) { this.scene.remove(mesh); mesh.geometry.dispose(); mesh.userData.outline.dispose(); }
     if (!this.slab) {
       const add = (size, at, rgb) => {
         const mesh = new T.Mesh(new T.BoxGeometry(...size), matt(rgb));
@@ -136,8 +142,8 @@ class Scene {
       v += part.vertices; f += part.faces;
       const flat = geometry.toNonIndexed();
       flat.computeVertexNormals();
-      geometry.dispose();
       const mesh = new T.Mesh(flat, matt(part.color));
+      mesh.userData.outline = geometry;
       mesh.matrixAutoUpdate = false;
       mesh.castShadow = mesh.receiveShadow = true;
       this.scene.add(mesh);
@@ -171,7 +177,8 @@ class Scene {
       this.things.add(mesh);
       return mesh;
     };
-    this.balls = many(new T.SphereGeometry(1, 18, 12), m.sphere_segment);
+    this.balls = many(this.slow ? new T.SphereGeometry(1, 12, 8) : new T.SphereGeometry(1, 18, 12), m.sphere_segment);
+    if (this.flat) this.balls.userData.outline = this.flat.disc;
     this.rods = many(new T.CylinderGeometry(1, 1, 1, 10, 1, true).rotateX(Math.PI / 2), m.link_segment);
     this.buildCloths(m, color);
     this.boxes = Array.from(m.box_segment, (segment, k) => {
@@ -321,11 +328,20 @@ class Scene {
     this.dirty = true;
   }
 
+  /** A frame later: fewer pixels while things move and frames are late, all of them at rest. */
+  pace(seconds, moving) {
+    if (moving && !this.moving) this.kept = Math.min(1, this.kept / LESS);
+    this.moving = moving;
+    this.late = moving && seconds > LATE ? this.late + 1 : 0;
+    if (this.late > 1 && this.kept * LESS > LEAST) { this.kept *= LESS; this.late = 0; }
+    this.share = moving ? this.kept : 1;
+  }
+
   draw() {
-    const {clientWidth: w, clientHeight: h} = this.canvas, size = `${w}x${h}`;
+    const {clientWidth: w, clientHeight: h} = this.canvas, size = `${w}x${h}x${this.share}`;
     if (size !== this.size && w && h) {
       this.size = size;
-      this.renderer.setPixelRatio(this.slow ? 1 : Math.min(devicePixelRatio, 2));
+      this.renderer.setPixelRatio(this.share * (this.slow ? 1 : Math.min(devicePixelRatio, 2)));
       this.renderer.setSize(w, h, false);
       this.camera.aspect = w / h;
       this.camera.fov = 360 / Math.PI * Math.atan(Math.tan(FIELD / 2) * Math.max(1, WIDE * h / w));

@@ -13,6 +13,8 @@ export class FlatShadows {
       clippingPlanes: [plane(1, 0, -x0), plane(-1, 0, x1), plane(0, 1, -y0), plane(0, -1, y1)],
     });
     const [a, b] = [-light[0] / light[2], -light[1] / light[2]];
+    // what a ball of radius 1 hides from the lamp
+    this.disc = new T.ConeGeometry(1, 0, 12, 1, true).applyQuaternion(new T.Quaternion().setFromUnitVectors(new T.Vector3(0, 1, 0), new T.Vector3(...light).normalize()));
     this.group = new T.Group();
     this.group.matrixAutoUpdate = false;
     // x + a z, y + b z, and almost no height
@@ -20,11 +22,12 @@ export class FlatShadows {
     scene.add(this.group);
   }
 
-  /** Cast the shadows of meshes from now on; they share geometry and place with them. */
+  /** Cast the shadows of meshes from now on; they share place and, but for `userData.outline`, geometry with them. */
   cast(name, meshes) {
     for (const old of this.group.children.filter(each => each.userData.name === name)) this.group.remove(old);
     for (const mesh of meshes) {
-      const flat = mesh.isInstancedMesh ? new T.InstancedMesh(mesh.geometry, this.paint, mesh.count) : new T.Mesh(mesh.geometry, this.paint);
+      const outline = mesh.userData.outline || mesh.geometry;
+      const flat = mesh.isInstancedMesh ? new T.InstancedMesh(outline, this.paint, mesh.count) : new T.Mesh(outline, this.paint);
       if (mesh.isInstancedMesh) flat.instanceMatrix = mesh.instanceMatrix;
       flat.matrixAutoUpdate = false;
       flat.frustumCulled = false;

@@ -33,12 +33,21 @@ class Pane {
     }
     this.playback.clips = [];
     Object.assign(this.playback, {at: 0, now: 0, playing: false});
+    this.says("preparing the episode: the first one of a task takes some seconds");
     send({do: "open", key, side: this.side});
+  }
+
+  /** Words in the place of an episode that is not there yet; empty once it is. */
+  says(text) {
+    this.preparing = Boolean(text);
+    this.box.querySelector(".says").textContent = text;
+    this.box.querySelector(".top").hidden = this.preparing;
   }
 
   /** A simulated episode's start. */
   begin(message) {
     if (message.key !== this.key) return;
+    this.says("");
     this.about = message;
     this.clips = 0;
     this.same = message.same;
@@ -95,6 +104,7 @@ class Pane {
   /** A recording of a real robot: its pictures, a second each. */
   async show(message) {
     if (message.key !== this.key) return;
+    this.says("");
     this.about = message;
     this.scene = this.scene || null;
     this.box.querySelector(".stage").classList.add("flat");
@@ -146,7 +156,7 @@ function hear(message) {
     clip: () => pane.add(message, hello.frames),
     still: () => pane.add(message, hello.frames),
     pictures: () => pane.show(message),
-    note: () => { for (const each of panes) each.asking = false; fetching = false; note(message.text); },
+    note: () => { for (const each of panes) { each.asking = false; if (each.preparing) each.says(message.text); } fetching = false; note(message.text); },
   })[message.kind](message);
 }
 
@@ -244,7 +254,7 @@ function loop(now) {
   for (const pane of open()) {
     pane.playback.speed = Number($("speed").value);
     pane.playback.tick((now - before) / 1000);
-    pane.scene?.draw();
+    if (pane.scene) { pane.scene.pace((now - before) / 1000, pane.playback.playing); pane.scene.draw(); }
     if (!pane.steps) pane.ask();
   }
   before = now;
