@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from tyro.conf import arg
 
@@ -16,14 +17,19 @@ from ..refinement.settings import FolderSettings, RefineSettings
 
 __all__ = ["RefineOptions", "refine"]
 
+_OfActions = Literal["enumerate", "random", "cem", "gradient"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class RefineOptions(RefineSettings, CommandOptions):
     """Improve recorded demonstrations by search; the same command goes on where it was stopped."""
 
-    method: Literal["enumerate", "random", "cem", "gradient"] = "cem"
+    method: Literal[
+        "enumerate", "random", "cem", "gradient", "cmaes", "adam", "lbfgs", "cem+adam"
+    ] = "cem"
     """How to search beyond the task's candidates: not at all, by random draws, by draws ever closer
-    to the best (the cross-entropy method), or down the gradient of the task's loss."""
+    to the best (the cross-entropy method), or down the gradient of the task's loss. With
+    --trajectories: random, cem, cmaes, adam, lbfgs or cem+adam."""
     depth: Literal[1, 2] = 2
     """Actions to look ahead."""
     budget: Annotated[int, arg(metavar="N"), COUNT] = 64
@@ -33,6 +39,14 @@ class RefineOptions(RefineSettings, CommandOptions):
     way_points: bool = False
     """Bend the paths of the recorded actions instead, by the gradient. No policy can follow such
     paths, so the folder then holds paths and no demonstrations."""
+    trajectories: bool = False
+    """Refine demonstrations at 20 Hz (see `demo --control`) as trajectories: shorter, more exact,
+    smoother. Picks and places are led at 20 Hz first."""
+    evaluations: Annotated[int, arg(metavar="N"), COUNT] = 250
+    """With --trajectories: simulated episodes that the search for one may spend."""
+    horizon: Annotated[int | None, arg(metavar="N"), COUNT] = None
+    """With --trajectories: control steps after which picks and places are given up that are led at
+    20 Hz. By default the environment's, 200 for tasks of the benchmark."""
 
 
 def refine(options: RefineOptions) -> Outcome:
@@ -43,6 +57,11 @@ def refine(options: RefineOptions) -> Outcome:
     from ..refinement.refine import refine as refine_folder
 
     quiet_warp()
+    if options.trajectories:
+        return _trajectories(options)
+    _refuse(options, ("evaluations", "horizon"), "goes with --trajectories")
+    if options.method not in get_args(_OfActions):
+        raise InputError(f"--method {options.method} goes with --trajectories")
     if options.way_points:
         return _bend(options)
     config = options.configure(RefineConfig, search=options.configure(SearchConfig))
@@ -55,6 +74,38 @@ def refine(options: RefineOptions) -> Outcome:
     if report.origins:
         text += "; actions of the improved: "
         text += ", ".join(f"{count} {name}" for name, count in report.origins.items())
+    return Outcome(data=asdict(report), text=text)
+
+
+def _refuse(options: RefineOptions, names: Sequence[str], why: str) -> None:
+    """Raise InputError where one of these flags is not as usual."""
+    usual = {field.name: field.default for field in fields(options)}
+    for name in names:
+        if getattr(options, name) != usual[name]:
+            raise InputError(f"--{name.replace('_', '-')} {why}")
+
+
+def _trajectories(options: RefineOptions) -> Outcome:
+    """Refine demonstrations at 20 Hz."""
+    from ..refinement.trajectories import TrajectoryConfig, refine_trajectories
+
+    others = ("accept", "depth", "budget", "lifts", "way_points")
+    _refuse(options, others, "does not go with --trajectories")
+    if options.method in ("enumerate", "gradient"):
+        raise InputError(f"--method {options.method} does not go with --trajectories")
+    report = refine_trajectories(options.configure(TrajectoryConfig))
+    count = report.episodes
+    text = (
+        f"{options.out}: {report.improved} of {count} episodes improved; control steps "
+        f"{report.actions_before} -> {report.actions_after}, mean loss {report.loss_before:.4f} -> "
+        f"{report.loss_after:.4f}, mean roughness {report.roughness_before:.2f} -> "
+        f"{report.roughness_after:.2f}, not solved at rest {report.unrested_before} -> "
+        f"{report.unrested_after}, in {report.seconds:.1f} s"
+    )
+    if report.kept:
+        text += "; kept: " + ", ".join(f"{n} {why}" for why, n in report.kept.items())
+    if report.lost:
+        text += f"; left out, because at 20 Hz they do not solve the task: {report.lost}"
     return Outcome(data=asdict(report), text=text)
 
 

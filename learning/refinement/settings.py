@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 from warp_deform.support.flag_range import COUNT
 
-__all__ = ["FolderSettings", "RefineSettings"]
+__all__ = ["FolderSettings", "RefineSettings", "TrajectorySettings"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,3 +36,15 @@ class RefineSettings(FolderSettings):
     accept: Literal["score", "solved"] = "score"
     """When an episode replaces the original. score: it has no lower last score and no more actions.
     solved: it solves the task in fewer actions, or in as many with a higher score."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectorySettings(FolderSettings):
+    """Which trajectories to refine, and how."""
+
+    method: Literal["cem", "cmaes", "random", "adam", "lbfgs", "cem+adam"] = "cem"
+    evaluations: int = 250
+    """Simulated episodes that the search for one may spend; one with derivatives counts 2.5."""
+    horizon: int | None = None
+    """Control steps after which picks and places are given up that are led at 20 Hz; None: as the
+    environment."""

@@ -17,16 +17,12 @@ from ..episodes import (
     ControlRecord,
     ControlRow,
     Episode,
-    EpisodeInfo,
     Step,
-    combine_hashes,
-    cpu_fingerprint,
-    versions,
 )
 from ..errors import InputError, WarpDeformError
 from ..tasks.task import Task
 from ..worlds.loop import SLOTS, SOLVED
-from .recording import origin, task_config
+from .recording import episode_info, origin
 
 __all__ = ["ControlRun", "LedTask", "control_worlds", "led", "record_control", "without_idle_end"]
 
@@ -235,22 +231,12 @@ def record_control(
         pictures=pictures,
     )
     named = {} if isinstance(worlds.task, ControlTask) else origin(worlds.task)
-    info = EpisodeInfo(
-        task=worlds.task.name,
-        seed=run.seed,
-        success=run.ended == SOLVED,
-        score=last.score,
-        actions=len(run.actions),
+    info = episode_info(
+        worlds,
+        slot,
+        run,
         demonstrator=demonstrator,
-        robot=worlds.robot.name,
-        state_hash=combine_hashes(row.state_hash for row in run.rows),
-        physics_ok=episode.physics_ok,
         sim_seconds=last.sim_seconds,
-        discarded_starts=episode.discarded_starts,
-        config=task_config(worlds.task),
-        versions=versions(),
-        cpu=cpu_fingerprint(),
-        goal=None,
         extra={**named, CONTROL: how.as_json()},
         format=CONTROL_FORMAT,
     )

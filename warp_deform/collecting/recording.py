@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,7 +16,15 @@ from ..tasks.task import Task
 from ..worlds.loop import SOLVED, EpisodeRun
 from ..worlds.worlds import Worlds
 
-__all__ = ["GOAL_TARGETS", "observe", "origin", "record", "recorded_task", "task_config"]
+__all__ = [
+    "GOAL_TARGETS",
+    "episode_info",
+    "observe",
+    "origin",
+    "record",
+    "recorded_task",
+    "task_config",
+]
 
 GOAL_TARGETS = "goal_targets"
 """Where an episode of a goal-conditioned task keeps what its last state stands for as a goal."""
@@ -55,26 +64,50 @@ def record(worlds: Worlds, slot: int, run: EpisodeRun[Step], *, demonstrator: st
         replace(row, action=action, outcome=outcome)
         for row, action, outcome in zip(run.rows, run.actions, run.outcomes, strict=False)
     ]
-    episode, last = worlds.episodes[slot], run.rows[-1]
-    info = EpisodeInfo(
+    episode = worlds.episodes[slot]
+    info = episode_info(
+        worlds,
+        slot,
+        run,
+        demonstrator=demonstrator,
+        sim_seconds=float(episode.sim_seconds),
+        extra={**origin(worlds.task), **_as_goal(worlds, slot), **_enclosed(worlds, slot)},
+    )
+    return Episode(info, (*rows, run.rows[-1]), episode.goal)
+
+
+class _Run(Protocol):
+    """What every kind of played episode knows, see `EpisodeRun`."""
+
+    seed: int
+    ended: str | None
+
+    @property
+    def rows(self) -> Sequence[Any]: ...
+
+    @property
+    def actions(self) -> Sequence[np.ndarray]: ...
+
+
+def episode_info(worlds: Worlds, slot: int, run: _Run, **own: Any) -> EpisodeInfo:
+    """What is told of the episode that has just ended in a slot, besides its kind's own."""
+    episode = worlds.episodes[slot]
+    return EpisodeInfo(
         task=worlds.task.name,
         seed=run.seed,
         success=run.ended == SOLVED,
-        score=last.score,
+        score=run.rows[-1].score,
         actions=len(run.actions),
-        demonstrator=demonstrator,
         robot=worlds.robot.name,
         state_hash=combine_hashes(row.state_hash for row in run.rows),
         physics_ok=episode.physics_ok,
-        sim_seconds=float(episode.sim_seconds),
         discarded_starts=episode.discarded_starts,
         config=task_config(worlds.task),
         versions=versions(),
         cpu=cpu_fingerprint(),
         goal=None,
-        extra={**origin(worlds.task), **_as_goal(worlds, slot), **_enclosed(worlds, slot)},
+        **own,
     )
-    return Episode(info, (*rows, last), episode.goal)
 
 
 def _as_goal(worlds: Worlds, slot: int) -> dict[str, Any]:

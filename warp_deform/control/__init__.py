@@ -13,6 +13,7 @@ _HOME = {
     "EpisodeProblem": ".episode_problem",
     "SwingProblem": ".swing_problem",
     "TensorControlWorlds": ".tensor_worlds",
+    "TrajectoryProblem": ".trajectory_problem",
     "optimize": ".plan_search",
 }
 

@@ -126,7 +126,7 @@ class ControlWorlds:
         self._last = np.zeros((count, self.targets.width))
         self._carried = [HeldHistory() for _ in range(count)]
         self.grips: list[tuple[int | None, int | None]] = [_NOTHING] * count
-        """The particle or body that every tip holds."""
+        """The particle or body that every tip holds; None twice where it holds nothing."""
 
     @property
     def task(self) -> Task:
@@ -157,12 +157,16 @@ class ControlWorlds:
             grasps = self._scripted_grasps(slots)
         self._begin(slots, grasps)
         for slot in slots:
-            self._carried[slot] = HeldHistory()
-            if self.holding(slot):
-                self._note_taken(slot)
-        self.steps[slots] = self._solved[slots] = 0
-        self._last[slots] = 0.0
+            self.begin_history(slot)
         self.rewards.start(slots)
+
+    def begin_history(self, slot: int) -> None:
+        """Forget what a slot's episode has done: it is where it began."""
+        self._carried[slot] = HeldHistory()
+        if self.holding(slot):
+            self._note_taken(slot)
+        self.steps[slot] = self._solved[slot] = 0
+        self._last[slot] = 0.0
 
     @property
     def _held(self) -> tuple[int | None, int | None]:
@@ -336,10 +340,6 @@ class ControlWorlds:
             self.grips[slot] = _NOTHING
             self._carried[slot].let_go(self.worlds.episodes[slot], self.task)
             self._set_floor(slot)
-
-    def held(self, slot: int) -> tuple[int | None, int | None]:
-        """Particle or body that the tip of a slot holds; None twice where it holds nothing."""
-        return self.grips[slot]
 
     def _note_taken(self, slot: int) -> None:
         episode = self.worlds.episodes[slot]

@@ -20,26 +20,21 @@ of the page.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from ..objects.box import Box, BoxConfig, BoxPart, add_box
-from ..objects.cable import Cable, CableConfig, add_cable, cable_line
+from ..objects.cable import Cable, add_cable, cable_line
 from ..objects.colors import GRAY
-from ..rendering.pixels import BOUNDS
 from ..tasks.free_space import FreeSpace
-from ..tasks.losses import lengths
-from ..tasks.task import Action, Layout, Snapshot, Stage
-from .control_task import ControlTask
+from ..tasks.task import Layout, Snapshot, Stage
+from .cable_shape import CableShapeControl
 from .led_cable import CABLE
 from .modes import ControlConfig
 
 if TYPE_CHECKING:
     import newton
-    from torch import Tensor
 
 __all__ = ["PushCable", "push_actions"]
 
@@ -60,7 +55,7 @@ _AT_ONCE = 0.9
 """Share of the greatest speed at which it goes at most."""
 
 
-class PushCable(ControlTask):
+class PushCable(CableShapeControl):
     """Every bead as after other pushes."""
 
     name = "push-cable"
@@ -74,7 +69,6 @@ class PushCable(ControlTask):
     held_body = 0
     keeps_hold = True
 
-    cable: ClassVar[CableConfig] = CableConfig()
     pushes: ClassVar[int] = 6
 
     def add_objects(self, builder: newton.ModelBuilder) -> tuple[Cable | Box, ...]:
@@ -97,42 +91,6 @@ class PushCable(ControlTask):
         way = _REACH * np.column_stack([np.cos(angle), np.sin(angle)])
         ends = np.stack([through - way, through + way], axis=1)
         return push_actions(layout.body_q[0, :2], ends, self.control)
-
-    def is_goal(self, particle_q: np.ndarray) -> bool:
-        """Where all of it is over the table."""
-        (x0, x1), (y0, y1) = BOUNDS[:2]
-        xy = particle_q[:, :2]
-        return bool(((xy > (x0, y0)) & (xy < (x1, y1))).all())
-
-    def layout_for(self, layout: Layout, particle_q: np.ndarray) -> Layout:
-        """The layout with the goal where pushes have led."""
-        return replace(layout, targets=np.array(particle_q, dtype=float))
-
-    def losses(
-        self,
-        layouts: Sequence[Layout],
-        snapshots: Sequence[Snapshot],
-        particle_q: Tensor,
-        body_q: Tensor,
-    ) -> Tensor:
-        """Mean over the beads of their distance from the goal [m] over sqrt(3): DaXBench's D."""
-        goals = particle_q.new_tensor(np.stack([layout.targets for layout in layouts]))
-        return lengths(particle_q - goals).mean(-1) / np.sqrt(3)
-
-    def score(self, layout: Layout, snapshot: Snapshot) -> float:
-        """DaXBench's score, exp(-10 D)."""
-        away = np.linalg.norm(snapshot.particle_q - layout.targets, axis=1).mean()
-        return float(np.exp(-10 * away / np.sqrt(3)))
-
-    def acceptable(self, layout: Layout, snapshot: Snapshot) -> bool:
-        """Any start is."""
-        return True
-
-    def demonstrate(
-        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
-    ) -> Action | None:
-        """None: no pick and place pushes."""
-        return None
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(147,): x, y, z of every bead, then of every bead of the goal, then of the box."""

@@ -117,6 +117,11 @@ class TensorControlWorlds(ControlWorlds):
         return np.array([self.worlds.episodes[s].physics_ok for s in range(self.worlds.count)])
 
     @property
+    def running(self) -> np.ndarray:
+        """In which worlds an episode goes on (W,) bool; the others pause until they are reset."""
+        return self._live.copy()
+
+    @property
     def left(self) -> torch.Tensor:
         """What is left to do in every world (W,), see `Task.remaining`."""
         return self._left

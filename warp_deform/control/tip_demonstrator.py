@@ -17,7 +17,7 @@ from ..support.quaternion import quat_from_yaw
 from ..tasks.task import Task
 from ..worlds.acting import snapped
 from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
-from ..worlds.loop import EpisodeRun
+from ..worlds.loop import Act, EpisodeRun
 from .control_worlds import ControlWorlds
 
 __all__ = ["LED_MODES", "TipDemonstrator", "usual_mode"]
@@ -73,18 +73,20 @@ class TipDemonstrator:
     Actions are numbers of float32, so that data sets of that precision repeat them.
 
     Args:
-        name: "scripted" or "visible", see `warp_deform.planning.demonstrators`
+        name: "scripted" or "visible", see `warp_deform.planning.demonstrators`; or who says what to
+            pick and place next, as those do
 
     Raises:
         InputError: the mode of the worlds is none of `LED_MODES`.
     """
 
-    def __init__(self, control: ControlWorlds, name: str = "scripted") -> None:
+    def __init__(self, control: ControlWorlds, name: str | Act[Any] = "scripted") -> None:
         if control.targets.mode not in LED_MODES:
             raise InputError(
                 f"demonstrations are led in {' or '.join(LED_MODES)}, not {control.targets.mode!r}"
             )
-        self._control, self._act = control, demonstrator(name)
+        self._control = control
+        self._act = demonstrator(name) if isinstance(name, str) else name
         speed, turn = control.config.max_speed, control.config.max_turn
         primitive = control.task.primitive
         self._primitive: PrimitiveConfig = replace(
@@ -155,7 +157,7 @@ class TipDemonstrator:
             led.action = chosen
         action = np.concatenate([asked[[0, 1, 3]], led.action[3:]])
         stage, floor = self._stage(action), float(self._control.targets.floors[slot])
-        particle, body = self._control.held(slot)
+        particle, body = self._control.grips[slot]
         objects = self._control.worlds.episodes[slot].objects
         grasp = Grasp(
             float(asked[2]), np.zeros(3), quat_from_yaw(0.0), particle, body,

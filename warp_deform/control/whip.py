@@ -22,19 +22,17 @@ Numbers to beat: `whip` 0.83 (DaXBench's APG; CEM-MPC has 0.34); `whip-target` 9
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from ..objects.cable import Cable, CableConfig, add_cable, cable_line
-from ..rendering.pixels import BOUNDS
+from ..objects.cable import Cable, add_cable, cable_line
 from ..tasks.free_space import FreeSpace
 from ..tasks.ground_truth import Row, Rows
 from ..tasks.losses import lengths
-from ..tasks.task import Action, Layout, Snapshot, Stage
+from ..tasks.task import Layout, Snapshot, Stage
 from ..xpbd.config import SolverConfig
-from .control_task import ControlTask
+from .cable_shape import CableShapeControl
 from .modes import ControlConfig
 from .smooth_plans import smooth_plan
 
@@ -50,7 +48,7 @@ _START = (0.5, -0.16)
 """Where the held end lies on average [m]; the cable lies across the middle of the table."""
 
 
-class Whip(ControlTask):
+class Whip(CableShapeControl):
     """Every bead as after another swing."""
 
     name = "whip"
@@ -70,8 +68,6 @@ class Whip(ControlTask):
     horizon = 20
     held_particle = 0
 
-    cable: ClassVar[CableConfig] = CableConfig()
-
     def add_objects(self, builder: newton.ModelBuilder) -> tuple[Cable]:
         """Add the cable, straight along y."""
         return (add_cable(builder, self.cable, cable_line(self.cable, _START, (0.5, 1.0))),)
@@ -82,49 +78,9 @@ class Whip(ControlTask):
         beads = cable_line(self.cable, (x, y), (x, y + 1.0))
         return Layout(particle_q=beads, body_q=np.zeros((0, 7)), targets=self.aimed_at(beads))
 
-    def aimed_at(self, particle_q: np.ndarray) -> np.ndarray:
-        """What of a state (24, 3) is the goal (n, 3) [m]."""
-        return np.array(particle_q, dtype=float)
-
     def plan_to_goal(self, rng: np.random.Generator) -> np.ndarray:
         """A smooth swing."""
         return smooth_plan(rng, self.horizon)
-
-    def is_goal(self, particle_q: np.ndarray) -> bool:
-        """Where all of it is over the table."""
-        (x0, x1), (y0, y1) = BOUNDS[:2]
-        xy = particle_q[:, :2]
-        return bool(((xy > (x0, y0)) & (xy < (x1, y1))).all())
-
-    def layout_for(self, layout: Layout, particle_q: np.ndarray) -> Layout:
-        """The layout with the goal where a swing has led."""
-        return replace(layout, targets=self.aimed_at(particle_q))
-
-    def losses(
-        self,
-        layouts: Sequence[Layout],
-        snapshots: Sequence[Snapshot],
-        particle_q: Tensor,
-        body_q: Tensor,
-    ) -> Tensor:
-        """Mean over the beads of their distance from the goal [m] over sqrt(3): DaXBench's D."""
-        goals = particle_q.new_tensor(np.stack([layout.targets for layout in layouts]))
-        return lengths(particle_q - goals).mean(-1) / np.sqrt(3)
-
-    def score(self, layout: Layout, snapshot: Snapshot) -> float:
-        """DaXBench's score, exp(-10 D)."""
-        away = np.linalg.norm(snapshot.particle_q - layout.targets, axis=1).mean()
-        return float(np.exp(-10 * away / np.sqrt(3)))
-
-    def acceptable(self, layout: Layout, snapshot: Snapshot) -> bool:
-        """Any start is."""
-        return True
-
-    def demonstrate(
-        self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
-    ) -> Action | None:
-        """None: no pick and place swings."""
-        return None
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(144,): x, y, z of every bead, then of every bead of the goal."""
