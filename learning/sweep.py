@@ -12,9 +12,7 @@ thread each, by joblib on one machine or Ray on a cluster whose machines share t
 
 from __future__ import annotations
 
-import contextlib
 import difflib
-import fcntl
 import json
 import os
 import sys
@@ -36,6 +34,7 @@ from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.robots import robot as find_robot
+from warp_deform.support.owned_folder import owned_folder
 from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 
@@ -196,7 +195,7 @@ def run_sweep(
         count = min(most, max(len(todo), 1))
     crew = Workers(count, ray=ray)
     failed: list[dict[str, str]] = []
-    with _owned(config.out):
+    with owned_folder(config.out, lock="sweep.lock", work="sweep"):
         for task in dict.fromkeys(cell.task for cell in todo):
             _collect(config, task, workers=workers, ray=ray)
         bar = progress_bar("sweep", len(cells), done=len(cells) - len(todo), unit="runs")
@@ -343,32 +342,3 @@ def _value(key: str, value: object, hint: Any) -> Any:
     if type(value) is not wanted:  # in Python, a bool is an int
         raise InputError(f"{key} is {value!r}; it must be {_SAID.get(wanted, 'a string')}")
     return Path(str(value)) if hint is Path else value
-
-
-@contextlib.contextmanager
-def _owned(out: Path) -> Iterator[None]:
-    """Hold the folder against another sweep; the lock ends with the process, however it ends.
-
-    A folder that was made for a sweep which then fails before there is anything in it, goes again.
-    """
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    path = out / "sweep.lock"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        lock = path.open("a")
-    except OSError as error:
-        raise InputError(f"out {out} cannot be made: {error.strerror}") from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(f"another sweep is at work in {out}; wait for it to end") from error
-        try:
-            yield
-        except Exception:
-            if made and [each.name for each in out.iterdir()] == [path.name]:
-                path.unlink()
-                for folder in made:
-                    with contextlib.suppress(OSError):  # it holds something else
-                        folder.rmdir()
-            raise

@@ -8,16 +8,16 @@ from typing import Any
 
 from warp_deform.support.progress import duration
 
-__all__ = ["evaluated", "interrupted", "trained"]
+__all__ = ["evaluated", "interrupted", "table", "trained"]
 
 _LIFT = {"action": "the policy", "privileged": "the paper's rule, which reads the simulator"}
 
 
-def interrupted(step: int) -> str:
+def interrupted(step: int, *, unit: str = "step") -> str:
     """What an interruption of `train` leaves, by the step of the state that is stored."""
     if not step:
-        return "no step is kept yet, the same command begins again"
-    return f"steps up to {step} are kept, the same command goes on and ends with the same bits"
+        return f"no {unit} is kept yet, the same command begins again"
+    return f"{unit}s up to {step} are kept, the same command goes on and ends with the same bits"
 
 
 def trained(report: Mapping[str, Any], *, out: Path) -> str:
@@ -61,7 +61,7 @@ def trained(report: Mapping[str, Any], *, out: Path) -> str:
         f"{duration(report['seconds'])}"
     )
     lines["next"] = f"warp-deform eval {out}"
-    return _table(lines)
+    return table(lines)
 
 
 def evaluated(report: Mapping[str, Any]) -> str:
@@ -99,7 +99,7 @@ def evaluated(report: Mapping[str, Any]) -> str:
         lines["videos"] = ", ".join(report["videos"])
     if "shared" in report:
         lines["shared"] = report["shared"]
-    return _table(lines)
+    return table(lines)
 
 
 def _compared(test: Mapping[str, Any], report: Mapping[str, Any]) -> str:
@@ -114,6 +114,7 @@ def _count(number: int, what: str) -> str:
     return f"{number} {what}" + "s" * (number != 1)
 
 
-def _table(data: Mapping[str, str]) -> str:
+def table(data: Mapping[str, str]) -> str:
+    """Lines of a name and what is said of it, one below the other."""
     width = max(map(len, data))
     return "\n".join(f"{key:<{width}}  {value}" for key, value in data.items())

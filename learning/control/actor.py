@@ -11,7 +11,15 @@ from torch import Tensor, nn
 from warp_deform.control.smooth_plans import smooth_plan
 from warp_deform.control.tensor_worlds import TensorControlWorlds
 
-__all__ = ["Actor", "BoundedSlopes", "RunningNorm", "as_actions", "look_around"]
+__all__ = [
+    "Actor",
+    "BoundedSlopes",
+    "RunningNorm",
+    "as_actions",
+    "layers",
+    "look_around",
+    "pressed",
+]
 
 _STREAM = 13
 """Keeps the generator of `look_around` apart from others."""
@@ -19,6 +27,8 @@ _QUIET = 0.1
 """Of an actor's last weights, what is left before training."""
 _LIFT = (0.0, 0.0, 0.5)
 """What an actor does before training."""
+_SLACK = 0.01
+"""A target may lie so far beyond a limit [m] without a penalty."""
 _CLIP = 10.0
 """Normalised numbers are kept within so many standard deviations."""
 
@@ -58,11 +68,12 @@ class RunningNorm(nn.Module):
         return ((seen.double() - self.mean) / spread).clamp(-_CLIP, _CLIP).float()
 
 
-def _network(sizes: tuple[int, ...]) -> nn.Sequential:
-    layers: list[nn.Module] = []
+def layers(sizes: tuple[int, ...]) -> nn.Sequential:
+    """A network of these widths, with ELU in between."""
+    parts: list[nn.Module] = []
     for before, after in itertools.pairwise(sizes):
-        layers += [nn.Linear(before, after), nn.ELU()]
-    return nn.Sequential(*layers[:-1])
+        parts += [nn.Linear(before, after), nn.ELU()]
+    return nn.Sequential(*parts[:-1])
 
 
 class Actor(nn.Module):
@@ -76,7 +87,7 @@ class Actor(nn.Module):
     def __init__(self, size: int, hidden: tuple[int, ...] = (256, 256)) -> None:
         super().__init__()
         self.norm = RunningNorm(size)
-        self.network = _network((size, *hidden, 3))
+        self.network = layers((size, *hidden, 3))
         # at first it lifts: in the air slopes are tame, and against the table there are none
         last = self.network[-1]
         assert isinstance(last, nn.Linear)
@@ -110,6 +121,14 @@ def look_around(worlds: TensorControlWorlds, norm: RunningNorm, *, seed: int) ->
         for moves in plans:
             norm.update(worlds.observe())
             worlds.advance(torch.from_numpy(np.pad(moves, ((0, 0), (0, 1)), constant_values=1.0)))
+
+
+def pressed(worlds: TensorControlWorlds) -> Tensor:
+    """How far the last targets (W,) lay beyond the tips' limits, more than a little [m].
+
+    What presses against a limit has no slope there; a penalty has.
+    """
+    return (worlds.beyond - _SLACK).clamp(min=0.0)
 
 
 class BoundedSlopes:

@@ -13,16 +13,20 @@ from .actor import Actor
 
 __all__ = ["load_actor", "save_actor"]
 
-_AGENT = "apg"
+_METHODS = ("apg", "shac")
 
 
-def save_actor(folder: Path, actor: Actor, *, task: str, updates: int) -> Path:
-    """Write an actor after so many updates into a folder, each file whole or not at all."""
+def save_actor(folder: Path, actor: Actor, *, task: str, method: str, updates: int) -> Path:
+    """Write an actor after so many updates into a folder, each file whole or not at all.
+
+    Args:
+        method: that trained it, "apg" or "shac"
+    """
     run = RunFolder(folder)
     run.create()
     sizes = [each.in_features for each in actor.network if isinstance(each, nn.Linear)]
     config = {"size": sizes[0], "hidden": sizes[1:]}
-    record = {"agent": {"task": task, "agent": _AGENT, "config": config}}
+    record = {"agent": {"task": task, "agent": method, "config": config}}
     return run.write_snapshot(updates, actor.state_dict(), record)
 
 
@@ -35,7 +39,7 @@ def load_actor(path: Path) -> tuple[Actor, str]:
     weights, record = read_snapshot(Path(path))
     about = record["agent"]
     try:
-        if about["agent"] != _AGENT:
+        if about["agent"] not in _METHODS:
             raise ValueError(f"it is of the agent {about['agent']}")
         actor = Actor(about["config"]["size"], tuple(about["config"]["hidden"]))
         actor.load_state_dict(weights)

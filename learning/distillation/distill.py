@@ -14,10 +14,7 @@ training play validation episodes, and the best of them plays the test.
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,6 +26,7 @@ from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.episodes import versions
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.planning.demonstrators import demonstrator
+from warp_deform.support.owned_folder import owned_folder
 from warp_deform.tasks.registry import task as find_task
 
 from ..correction.correct import CorrectConfig, correct
@@ -95,7 +93,7 @@ def distill(config: DistillConfig) -> dict[str, Any]:
     """
     out = Path(config.out).resolve()
     planned = None if config.plan is None else read_plan(config.plan)
-    with _owned(out):
+    with owned_folder(out, lock=_LOCK, work="distillation"):
         record = _claim(out, config)
         stages = Stages(out / "stages.jsonl", told=f"distill {config.task}" * config.progress)
         few = FEW if planned is None else planned.demos
@@ -329,28 +327,3 @@ def _first_difference(a: Any, b: Any) -> str | None:
     if not (isinstance(a, dict) and isinstance(b, dict)):
         return None
     return next((key for key in sorted({*a, *b}) if a.get(key) != b.get(key)), None)
-
-
-@contextlib.contextmanager
-def _owned(out: Path) -> Iterator[None]:
-    """Hold the folder against another distillation; a folder made for one that is refused goes."""
-    made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        lock = (out / _LOCK).open("a")
-    except OSError as error:
-        raise InputError(f"--out {out} cannot be made: {error.strerror}") from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(f"another distillation is at work in {out}") from error
-        try:
-            yield
-        except InputError:
-            if [each.name for each in out.iterdir()] == [_LOCK]:
-                (out / _LOCK).unlink()
-                for folder in made:
-                    with contextlib.suppress(OSError):  # it holds something else
-                        folder.rmdir()
-            raise

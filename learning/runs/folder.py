@@ -109,6 +109,10 @@ class RunFolder:
                 f"{self.path} holds no training run; `warp-deform train` makes one with --out"
             )
         settings, what = read_json(self.settings), f"{self.settings} is not what training writes"
+        if "control" in settings:
+            raise InputError(
+                f"{self.path} is a run of `train-control`; use `warp-deform eval-control {self.path}`"
+            )
         check_fields(settings, _SETTINGS, what=what)
         check_fields(settings["agent"], _AGENT, what=what)
         check_fields(settings["schedule"], {"steps": int}, what=what)

@@ -50,11 +50,11 @@ FLOORS = {
         "command",
         "page",
         "sweep distillation",
-        "report",
+        "report control",
         "training correction",
         "evaluation",
         "policy",
-        "data control",
+        "data",
         "models runs refinement interchange",
     ],
     "hardware": [

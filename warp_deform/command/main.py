@@ -90,6 +90,12 @@ VERBS: dict[str, Verb] = {
         "choose a run's best snapshot and test it",
         kept=f"what was played is kept, {_GOES_ON}",
     ),
+    "train-control": Verb(
+        "learning.command.control:train_control",
+        "train a policy of control at 20 Hz by gradients",
+        kept=f"all but the last updates is kept, {_GOES_ON} and ends with the same bits",
+    ),
+    "eval-control": Verb("learning.command.control:eval_control", "test a run of train-control"),
     "report": Verb(
         "learning.command.verbs:report",
         "write tables and learning curves beside the paper's",

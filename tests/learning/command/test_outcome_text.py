@@ -149,7 +149,18 @@ def test_an_interruption_says_what_is_kept(
     said = capsys.readouterr().err
     assert said.startswith("warp-deform: interrupted") and said.count("\n") == 1
     assert ("same command goes on" in said) is (
-        verb in {"demo", "goals", "train", "eval", "sweep", "refine", "correct", "distill"}
+        verb
+        in {
+            "demo",
+            "goals",
+            "train",
+            "eval",
+            "sweep",
+            "refine",
+            "correct",
+            "distill",
+            "train-control",
+        }
     )
     assert ("episode" in said) is (verb in {"demo", "refine", "correct", "franka"})
 

@@ -7,10 +7,15 @@ import pytest
 import torch
 
 from learning.control.actor import Actor, BoundedSlopes, RunningNorm, as_actions
-from learning.control.apg import ApgConfig, play, train_apg
-from warp_deform.errors import InputError, WarpDeformError
+from learning.control.apg import Apg, ApgConfig
+from learning.control.play import play_control
+from warp_deform.control import TensorControlWorlds
+from warp_deform.errors import InputError
 
-FEW = ApgConfig(updates=4, worlds=8, episodes=8)
+
+@pytest.fixture(scope="module")
+def worlds() -> TensorControlWorlds:
+    return TensorControlWorlds("whip-target", 8, action_penalty=0.0)
 
 
 def test_statistics_are_those_of_all_that_was_shown() -> None:
@@ -41,33 +46,25 @@ def test_actions_are_never_longer_than_a_tip_goes_and_keep_hold() -> None:
     assert (lifted[:, 2] > 0.3).all(), "before training it lifts"
 
 
-def test_a_few_updates_lower_the_loss_and_the_same_seed_has_the_same_bits() -> None:
-    seeds = range(8)  # those that it trains on
-    before = play("whip-target", train_apg("whip-target", ApgConfig(updates=1, worlds=8,
-                  episodes=8, lr=1e-12), seed=0), seeds, worlds=8)  # fmt: skip
-    actor, again = (train_apg("whip-target", FEW, seed=0) for _ in range(2))
-    for one, other in zip(actor.state_dict().values(), again.state_dict().values(), strict=True):
-        assert torch.equal(one, other)
-    after = play("whip-target", actor, seeds, worlds=8)
-    assert np.isfinite(after).all() and after.mean() < before.mean()
-    assert np.array_equal(play("whip-target", actor, [5, 3], worlds=8), after[[5, 3]])
+def test_a_few_updates_lower_the_loss_and_the_same_seed_has_the_same_bits(
+    worlds: TensorControlWorlds,
+) -> None:
+    learners = [Apg(worlds, ApgConfig(), episodes=8, updates=4, seed=0) for _ in range(2)]
+    before = play_control(worlds, learners[0].actor, range(8))  # the seeds that it trains on
+    for learner in learners:
+        for number in range(1, 5):
+            learner.update(number)
+    one, other = (learner.tensors() for learner in learners)
+    assert one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+    after = play_control(worlds, learners[0].actor, range(8))
+    assert np.isfinite(after.left).all() and after.left.mean() < before.left.mean()
+    some = play_control(worlds, learners[0].actor, [5, 3])
+    assert np.array_equal(some.left, after.left[[5, 3]])
+    assert np.array_equal(some.scores, after.scores[[5, 3]])
 
 
-def test_what_cannot_be_trained_is_said() -> None:
-    with pytest.raises(InputError, match="draws 8 of 4 episodes"):
-        ApgConfig(worlds=8, episodes=4)
-    with pytest.raises(InputError, match="where seeds of tests begin"):
-        ApgConfig(episodes=10_001)
-    with pytest.raises(InputError, match="updates has to be positive, not 0"):
-        ApgConfig(updates=0)
+def test_what_cannot_be_trained_or_played_is_said(worlds: TensorControlWorlds) -> None:
+    with pytest.raises(InputError, match="lr must be a number above 0, got 0"):
+        ApgConfig(lr=0)
     with pytest.raises(InputError, match="one seed or more"):
-        play("whip", Actor(5), [])
-    with pytest.raises(InputError, match='choose start="held"'):
-        train_apg("cable-line-notarget", FEW, seed=0)
-
-
-def test_a_training_that_breaks_ends_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = {"loss": float("nan"), "gradient": 0.0, "guards": 0.0, "unusable": 8.0, "bounded": 0.0}
-    monkeypatch.setattr("learning.control.apg.apg_update", lambda *_, **__: told)
-    with pytest.raises(WarpDeformError, match="no number after 1 updates"):
-        train_apg("whip-target", FEW, seed=0)
+        play_control(worlds, Actor(5), [])

@@ -15,7 +15,7 @@ from warp_deform.errors import InputError
 def test_a_saved_actor_acts_the_same_to_the_bit(tmp_path: Path) -> None:
     actor, seen = Actor(5, (8, 8)), torch.randn(20, 5)
     actor.norm.update(3.0 * seen + 1.0)
-    path = save_actor(tmp_path / "run", actor, task="whip", updates=4)
+    path = save_actor(tmp_path / "run", actor, task="whip", method="apg", updates=4)
     again, task = load_actor(path)
     assert task == "whip" and torch.equal(again(seen), actor(seen))
     assert sorted(each.name for each in path.parent.iterdir()) == [
@@ -24,7 +24,7 @@ def test_a_saved_actor_acts_the_same_to_the_bit(tmp_path: Path) -> None:
 
 
 def test_what_is_no_actor_is_refused(tmp_path: Path) -> None:
-    path = save_actor(tmp_path, Actor(5, (8,)), task="whip", updates=1)
+    path = save_actor(tmp_path, Actor(5, (8,)), task="whip", method="shac", updates=1)
     path.write_bytes(path.read_bytes()[:-8])
     with pytest.raises(InputError, match="damaged"):
         load_actor(path)
@@ -32,4 +32,4 @@ def test_what_is_no_actor_is_refused(tmp_path: Path) -> None:
     with torch.no_grad():
         broken.network[0].bias.fill_(float("nan"))  # type: ignore[union-attr, operator]
     with pytest.raises(InputError, match="not finite"):
-        load_actor(save_actor(tmp_path, broken, task="whip", updates=2))
+        load_actor(save_actor(tmp_path, broken, task="whip", method="apg", updates=2))

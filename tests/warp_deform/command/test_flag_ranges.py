@@ -51,6 +51,7 @@ NEEDED = {
     "train": [LINE, "--agent", "gt-mlp", "--data", "d", "--out", "r"], "eval": ["r"],
     "sweep": ["grid.toml"], "refine": ["d", "--out", "o"], "play": [LINE], "view": ["d"],
     "correct": ["r", "--out", "o", "--teacher", "mpc"], "distill": [LINE, "--out", "o"],
+    "train-control": ["whip", "--out", "r"], "eval-control": ["r"],
 }  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from learning.evaluation.settings import EvalSettings
 from learning.policy.policy import AGENTS
 from learning.refinement import waypoints
 from learning.refinement.refine import ACCEPT, RefineConfig
-from learning.refinement.settings import RefineSettings
+from learning.refinement.settings import RefineSettings, TrajectorySettings
 from learning.training import train as training
 from learning.training.config import TrainConfig
 from learning.training.processes import DEVICES
@@ -32,11 +32,13 @@ from warp_deform.collecting.settings import CollectSettings, DemonstratorName
 from warp_deform.command import main as cli
 from warp_deform.command import verbs as own_verbs
 from warp_deform.command.main import CommandOptions, main
+from warp_deform.control import METHODS as CONTROL_METHODS
 from warp_deform.errors import InputError
 from warp_deform.gradcheck import GradcheckConfig
 from warp_deform.planning import METHODS, SearchConfig
 from warp_deform.planning.demonstrators import DEMONSTRATORS
 
+REFINEMENTS = {**dict.fromkeys(METHODS), **CONTROL_METHODS}
 COMMAND = {each.name for each in fields(CommandOptions)}
 LINE = "cable-line-notarget"
 TRAIN = ["train", LINE, "--agent", "gt-mlp-2step", "--data", "d", "--out", "r"]
@@ -97,7 +99,8 @@ def test_what_options_and_configuration_share_is_written_once(
         (DemonstratorName, DEMONSTRATORS),
         (get_type_hints(TrainSettings)["device"], DEVICES),
         (get_type_hints(RefineSettings)["accept"], ACCEPT),
-        (get_type_hints(refine.RefineOptions)["method"], METHODS),
+        (get_type_hints(refine.RefineOptions)["method"], REFINEMENTS),
+        (get_type_hints(TrajectorySettings)["method"], CONTROL_METHODS),
         (get_args(get_type_hints(GradcheckConfig)["levels"])[0], GradcheckConfig().levels),
     ],
 )

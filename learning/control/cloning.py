@@ -1,0 +1,246 @@
+"""Behaviour cloning of demonstrations at 20 Hz, in chunks. One file, read from top to bottom.
+
+    for every update
+        draw rows of demonstrations: what was seen, and the K actions that followed
+        predict these from what was seen, descend the absolute error
+    in every control step
+        predict a chunk, and act as the mean of what this and earlier chunks say of now
+
+Chunks keep a policy from standing still where demonstrators pause, and the mean over chunks
+(temporal ensembling) makes its motion smooth. It sees the state, not pictures, by an MLP.
+
+Source: Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware" (ACT),
+RSS 2023: chunks, temporal ensembling with weights exp(-m i), the absolute error. Its transformer
+and its variational code are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from warp_deform.collecting.control_replay import led_task_of
+from warp_deform.collecting.control_runs import ControlRun, LedTask, control_worlds, led
+from warp_deform.control.control_worlds import ControlWorlds
+from warp_deform.control.numbers import control_numbers, recorded_numbers
+from warp_deform.episodes import EpisodeReader
+from warp_deform.errors import InputError
+from warp_deform.support.checked import POSITIVE, check_fields
+from warp_deform.worlds.loop import SOLVED
+
+from .actor import RunningNorm, layers
+
+__all__ = [
+    "ChunkPolicy",
+    "Chunks",
+    "Cloner",
+    "CloningConfig",
+    "PlayedClone",
+    "ensembled",
+    "play_clone",
+    "read_chunks",
+]
+
+_STREAM = 17
+"""Keeps the generators of this training apart from those of episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloningConfig:
+    """How to clone demonstrations.
+
+    Attributes:
+        updates: of the weights
+        batch: rows of an update
+        chunk: actions that are predicted at once
+        lr: Adam's step size at first; it falls linearly to 0
+        noise: standard deviation of noise on normalised observations while training
+        decay: m in the weights exp(-m i) of chunks, i from the oldest one on
+
+    Raises:
+        InputError: a number is not above 0.
+    """
+
+    updates: int = 6000
+    batch: int = 256
+    chunk: int = 10
+    lr: float = 1e-3
+    noise: float = 0.02
+    decay: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_fields(self, dict.fromkeys(self.__dataclass_fields__, POSITIVE))
+
+
+@dataclass(frozen=True, eq=False)
+class Chunks:
+    """Rows of demonstrations.
+
+    Attributes:
+        seen: observations "state" (N, D) float32
+        actions: that followed (N, K, A) float32; beyond an episode's end its last one, unmoving
+        how: how the tips of all of them were led
+    """
+
+    seen: Tensor
+    actions: Tensor
+    how: LedTask
+
+
+def read_chunks(folder: Path, chunk: int) -> Chunks:
+    """The rows of a folder of demonstrations at 20 Hz.
+
+    Raises:
+        InputError: it holds picks and places, or tips that were led in several ways.
+    """
+    seen, following, ways = [], [], set()
+    for episode in EpisodeReader(folder, control=True):
+        ways.add(led_task_of(episode.info))
+        numbers = recorded_numbers(episode)
+        actions = np.array([s.action for s in episode.steps if s.action is not None], np.float32)
+        still = actions[-1:].copy()
+        still[:, :-1] = 0.0
+        padded = np.concatenate([actions, np.repeat(still, chunk, axis=0)])
+        at = np.arange(len(actions))[:, None] + np.arange(chunk)
+        seen.append(numbers[: len(actions)])
+        following.append(padded[at])
+    if len(ways) != 1:
+        raise InputError(f"{folder} holds tips that were led in {len(ways)} ways; clone one")
+    return Chunks(
+        seen=torch.from_numpy(np.concatenate(seen)),
+        actions=torch.from_numpy(np.concatenate(following)),
+        how=ways.pop(),
+    )
+
+
+class ChunkPolicy(nn.Module):
+    """Observations in, chunks of actions out.
+
+    Args:
+        size: numbers of an observation
+        chunk: actions of a chunk
+        width: numbers of an action
+        hidden: of the layers in between
+    """
+
+    def __init__(
+        self, size: int, chunk: int, width: int, hidden: tuple[int, ...] = (256, 256)
+    ) -> None:
+        super().__init__()
+        self.norm = RunningNorm(size)
+        self.chunk, self.width = chunk, width
+        self.network = layers((size, *hidden, chunk * width))
+
+    def forward(self, seen: Tensor, noise: float = 0.0) -> Tensor:
+        """Chunks (W, K, A) for observations (W, D)."""
+        normed = self.norm(seen)
+        if noise:
+            normed = normed + noise * torch.randn_like(normed)
+        chunks: Tensor = self.network(normed)
+        return chunks.unflatten(-1, (self.chunk, self.width))
+
+
+class Cloner:
+    """A policy in training; the same seed gives the same bits on one thread of torch."""
+
+    def __init__(self, chunks: Chunks, config: CloningConfig, *, seed: int) -> None:
+        self._chunks, self._config, self._seed = chunks, config, seed
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.policy = ChunkPolicy(chunks.seen.shape[1], *chunks.actions.shape[1:])
+        self.policy.norm.update(chunks.seen)
+        self._adam = torch.optim.Adam(self.policy.network.parameters(), lr=config.lr)
+
+    def update(self, number: int) -> float:
+        """One update of the weights, counted from 1; its loss.
+
+        What is random is drawn from the seed and the number.
+        """
+        config, chunks = self._config, self._chunks
+        rng = np.random.default_rng([_STREAM, self._seed, number])
+        rows = torch.from_numpy(rng.integers(len(chunks.seen), size=config.batch))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(int(rng.integers(2**62)))
+            predicted = self.policy(chunks.seen[rows], config.noise)
+        loss = (predicted - chunks.actions[rows]).abs().mean()
+        self._adam.param_groups[0]["lr"] = config.lr * (1.0 - (number - 1) / config.updates)
+        self._adam.zero_grad()
+        loss.backward()
+        self._adam.step()
+        return float(loss.detach())
+
+
+def ensembled(chunks: Sequence[np.ndarray], decay: float) -> np.ndarray:
+    """The action (A,) now, of the chunks (K, A) that were predicted so far, oldest first.
+
+    Chunks that end before now say nothing. The weight of the i-th that speaks is exp(-decay i).
+    """
+    reach = len(chunks[-1])
+    last = list(chunks[-reach:])
+    said = np.array([chunk[len(last) - 1 - k] for k, chunk in enumerate(last)])
+    weights = np.exp(-decay * np.arange(len(said)))
+    return np.asarray((weights[:, None] * said).sum(axis=0) / weights.sum())
+
+
+@dataclass(frozen=True)
+class PlayedClone:
+    """What came of an episode.
+
+    Attributes:
+        solved: as the environment counts it, and by no guard's leave
+        steps: control steps
+    """
+
+    solved: bool
+    score: float
+    steps: int
+    ended: str
+
+
+def play_clone(
+    how: LedTask, policy: ChunkPolicy, seeds: Sequence[int], *, decay: float = CloningConfig.decay
+) -> dict[int, PlayedClone]:
+    """Let a policy play the episodes of seeds; what came of them, by seed."""
+    control, said = control_worlds(how), dict[int, list[np.ndarray]]()
+
+    def act(runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+        seen = np.stack([_seen(control, slot, run) for slot, run in runs.items()])
+        with torch.no_grad():
+            chunks = policy(torch.from_numpy(seen)).numpy()
+        actions: dict[int, np.ndarray | None] = {}
+        for (slot, run), chunk in zip(runs.items(), chunks, strict=True):
+            said.setdefault(run.seed, []).append(chunk)
+            action = np.clip(ensembled(said[run.seed], decay), -1.0, 1.0)
+            actions[slot] = action.astype(np.float32)
+        return actions
+
+    return {
+        run.seed: PlayedClone(
+            run.ended == SOLVED,
+            run.rows[-1].score if run.rows else 0.0,
+            len(run.actions),
+            run.ended or "",
+        )
+        for _, run in led(control, seeds, start=lambda runs: None, act=act)
+    }
+
+
+def _seen(control: ControlWorlds, slot: int, run: ControlRun) -> np.ndarray:
+    """The observation "state" (D,) float32 of a slot, as recordings have it."""
+    episode, tip = control.worlds.episodes[slot], run.rows[-1].control
+    assert tip is not None, "rows of control have a tip"
+    numbers = control_numbers(
+        tip=tip.tip,
+        holding=tip.holding,
+        particle_q=episode.snapshot.particle_q,
+        particle_qd=episode.snapshot.particle_qd,
+        body_q=episode.snapshot.body_q,
+        goal=np.asarray(episode.layout.targets, dtype=float),
+        time=len(run.actions) / control.horizon,
+    )
+    return np.concatenate([np.asarray(array, np.float32).ravel() for array in numbers.values()])
