@@ -3,7 +3,8 @@
 Every cell of the grid is a training run in a folder of its own, so nothing but the folders is
 needed to go on after an interruption: demonstrations, training and evaluation each resume by
 themselves, and a run that is done says so in `sweep.json`. Runs are spread over processes of one
-thread each, by joblib on one machine or Ray on a cluster whose machines share the folder.
+thread each, by joblib on one machine or Ray on a cluster whose machines share the folder; what a
+lost machine had in hand is done again on another one.
 
     OUT/demos/TASK                    demonstrations
     OUT/runs/TASK-AGENT-DEMOS-sSEED   training runs
@@ -189,8 +190,8 @@ def run_sweep(
     config = _resolved(config)
     cells = config.cells()
     todo = [cell for cell in cells if not _done(cell, config)]
-    count = None
-    if ray is None or workers is not None:
+    count = workers
+    if ray is None:
         most = joblib.cpu_count() if workers is None else worker_count(workers, len(todo))
         count = min(most, max(len(todo), 1))
     crew = Workers(count, ray=ray)

@@ -118,8 +118,9 @@ def collect(config: CollectConfig) -> CollectReport:
     if config.video is not None:
         check_video(config.video)
     config = replace(config, out=Path(config.out).resolve())
-    on_cluster = config.ray is not None and config.workers is None
-    count = None if on_cluster else worker_count(config.workers, config.episodes)
+    count = config.workers
+    if config.ray is None:
+        count = worker_count(config.workers, config.episodes)
     workers = Workers(count, ray=config.ray)
     with Collection(config.out, _description(config)).owned() as collection:
         with workers:

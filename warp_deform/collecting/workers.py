@@ -1,4 +1,4 @@
-"""Work spread over processes: joblib's loky on one machine, its Ray backend on a cluster."""
+"""Work spread over processes: of joblib's loky on one machine, or of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import functools
 import os
 import signal
-import socket
 import threading
 import time
 import warnings
@@ -19,10 +18,10 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError, _Execu
 
 from ..errors import InputError, WarpDeformError
 from ..quiet import quiet_warp
-from ..support.extras import install_extra
 from ..tasks.registration import register_task
 from ..tasks.registry import registered
 from ..tasks.task import Task
+from . import cluster
 
 __all__ = ["Workers", "single_threaded", "worker_count"]
 
@@ -35,23 +34,25 @@ LEAST_EPISODES = 64
 MOST_A_CORE = 8
 """More processes than this a core are taken for a mistake, which could use up the memory."""
 
-_CONNECT_SECONDS = 5.0
 _LOOK_SECONDS = 0.5
 
 
 def worker_count(asked: int | None, episodes: int) -> int:
     """Processes to use: as asked, else one per core but no more than the work is worth."""
     if asked is not None:
-        if asked < 1:
-            raise InputError(f"workers is {asked}; it must be 1 or more")
-        cores = int(joblib.cpu_count())
-        if asked > MOST_A_CORE * cores:
-            raise InputError(
-                f"workers is {asked}, more than {MOST_A_CORE} for each of {cores} cores; a process "
-                "takes half a gigabyte, and more than one a core gains nothing"
-            )
-        return asked
+        return _checked(asked, int(joblib.cpu_count()))
     return max(1, min(int(joblib.cpu_count()), episodes // LEAST_EPISODES))
+
+
+def _checked(asked: int, cores: int) -> int:
+    if asked < 1:
+        raise InputError(f"workers is {asked}; it must be 1 or more")
+    if asked > MOST_A_CORE * cores:
+        raise InputError(
+            f"workers is {asked}, more than {MOST_A_CORE} for each of {cores} cores; a process "
+            "takes half a gigabyte, and more than one a core gains nothing"
+        )
+    return asked
 
 
 @contextlib.contextmanager
@@ -87,23 +88,30 @@ class Workers:
         ray: address of a Ray cluster ("auto" for the one this machine belongs to)
 
     Raises:
-        InputError: Ray is asked for and not installed, or its cluster does not answer.
+        InputError: Ray is asked for and not installed, its cluster does not answer, or `count` is
+            out of proportion to its cores.
     """
 
     def __init__(self, count: int | None, *, ray: str | None = None) -> None:
-        self._ray = ray is not None
+        self._ray = ray
+        self._joined = contextlib.ExitStack()
         self._starting: Any = None
-        cores = 1 if ray is None else _connect(ray)
-        self.count = count or cores
+        if ray is None:
+            self.count = count or 1
+        else:
+            with cluster.joined(ray) as cores:
+                self.count = cores if count is None else _checked(count, cores)
 
     @property
     def apart(self) -> bool:
         """Whether the work is done by other processes than this one."""
-        return self._ray or self.count > 1
+        return self._ray is not None or self.count > 1
 
     def __enter__(self) -> Workers:
         """Let the processes start and import while the caller does something else."""
-        if self.apart and not self._ray:
+        if self._ray is not None:
+            self._joined.enter_context(cluster.joined(self._ray))
+        elif self.apart:
             try:
                 self._starting = self._loky(joblib.delayed(_import)() for _ in range(self.count))
             except KeyboardInterrupt:
@@ -116,6 +124,7 @@ class Workers:
             _interrupted()
         if self._starting is not None:
             _close(self._starting)
+        self._joined.close()
 
     def run(
         self, function: Callable[[Chunk], Iterable[Result]], chunks: Sequence[Chunk]
@@ -131,23 +140,23 @@ class Workers:
                     yield from function(chunk)
             return
         tasks = registered()
+        if self._ray is not None:
+            call = functools.partial(_call, function, tasks=tasks)
+            for results in cluster.unordered(call, chunks, self.count):
+                yield from results
+            return
         calls = (joblib.delayed(_call)(function, chunk, tasks) for chunk in chunks)
         try:
             if self._starting is not None:
                 for _ in self._starting:
                     pass
                 self._starting = None
-            if not self._ray:
-                done = self._loky(calls)
-                try:
-                    for results in done:
-                        yield from results
-                finally:
-                    _close(done)
-                return
-            with joblib.parallel_config(backend="ray", n_jobs=self.count):
-                for results in joblib.Parallel(batch_size=1)(calls):
+            done = self._loky(calls)
+            try:
+                for results in done:
                     yield from results
+            finally:
+                _close(done)
         except TerminatedWorkerError as error:
             raise WarpDeformError(
                 "a worker process was killed, perhaps because memory ran out; what is complete is "
@@ -228,23 +237,3 @@ def _call(
         register_task(task)
     with single_threaded():
         return list(function(chunk))
-
-
-def _connect(address: str) -> int:
-    """Join a Ray cluster; the number of its cores."""
-    try:
-        import ray
-        from ray.util.joblib import register_ray
-    except ImportError as error:
-        raise InputError(
-            f"Ray is not installed. Run {install_extra('ray')} in the clone, or leave out --ray"
-        ) from error
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    try:
-        if host and port.isdecimal():  # Ray itself would go on trying for many minutes
-            socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS).close()
-        ray.init(address=address, ignore_reinit_error=True, log_to_driver=False)
-    except (OSError, OverflowError, ValueError) as error:
-        raise InputError(f"no Ray cluster answers at {address!r}: {error}") from error
-    register_ray()
-    return int(ray.cluster_resources().get("CPU", 1))
