@@ -7,7 +7,8 @@
         predict a chunk, and act as the mean of what this and earlier chunks say of now
 
 Chunks keep a policy from standing still where demonstrators pause, and the mean over chunks
-(temporal ensembling) makes its motion smooth. It sees the state, not pictures, by an MLP.
+(temporal ensembling) makes its motion smooth. It sees the state, not pictures, as `features` tell
+it, by an MLP.
 
 Source: Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware" (ACT),
 RSS 2023: chunks, temporal ensembling with weights exp(-m i), the absolute error. Its transformer
@@ -28,12 +29,13 @@ from warp_deform.collecting.control_replay import led_task_of
 from warp_deform.collecting.control_runs import ControlRun, LedTask, control_worlds, led
 from warp_deform.control.control_worlds import ControlWorlds
 from warp_deform.control.numbers import control_numbers, recorded_numbers
-from warp_deform.episodes import EpisodeReader
+from warp_deform.episodes import Episode, EpisodeReader
 from warp_deform.errors import InputError
 from warp_deform.support.checked import POSITIVE, check_fields
 from warp_deform.worlds.loop import SOLVED
 
 from .actor import RunningNorm, layers
+from .features import StateSizes, relative_features
 
 __all__ = [
     "ChunkPolicy",
@@ -66,11 +68,11 @@ class CloningConfig:
         InputError: a number is not above 0.
     """
 
-    updates: int = 6000
+    updates: int = 30000
     batch: int = 256
     chunk: int = 10
     lr: float = 1e-3
-    noise: float = 0.02
+    noise: float = 0.05
     decay: float = 0.01
 
     def __post_init__(self) -> None:
@@ -84,11 +86,13 @@ class Chunks:
     Attributes:
         seen: observations "state" (N, D) float32
         actions: that followed (N, K, A) float32; beyond an episode's end its last one, unmoving
+        sizes: what an observation consists of
         how: how the tips of all of them were led
     """
 
     seen: Tensor
     actions: Tensor
+    sizes: StateSizes
     how: LedTask
 
 
@@ -98,10 +102,11 @@ def read_chunks(folder: Path, chunk: int) -> Chunks:
     Raises:
         InputError: it holds picks and places, or tips that were led in several ways.
     """
-    seen, following, ways = [], [], set()
+    seen, following, ways, sizes = [], [], set(), set()
     for episode in EpisodeReader(folder, control=True):
         ways.add(led_task_of(episode.info))
         numbers = recorded_numbers(episode)
+        sizes.add(_sizes(episode))
         actions = np.array([s.action for s in episode.steps if s.action is not None], np.float32)
         still = actions[-1:].copy()
         still[:, :-1] = 0.0
@@ -111,34 +116,49 @@ def read_chunks(folder: Path, chunk: int) -> Chunks:
         following.append(padded[at])
     if len(ways) != 1:
         raise InputError(f"{folder} holds tips that were led in {len(ways)} ways; clone one")
+    if len(sizes) != 1:
+        raise InputError(f"{folder} holds episodes with other objects in each; clone one kind")
     return Chunks(
+        sizes=sizes.pop(),
         seen=torch.from_numpy(np.concatenate(seen)),
         actions=torch.from_numpy(np.concatenate(following)),
         how=ways.pop(),
     )
 
 
+def _sizes(episode: Episode) -> StateSizes:
+    first, record = episode.steps[0], episode.info.control
+    assert record is not None, "it was read as one of control"
+    goal = np.shape(record.goal)
+    return StateSizes(len(first.particle_q), len(first.body_q), goal if np.prod(goal) else ())
+
+
 class ChunkPolicy(nn.Module):
     """Observations in, chunks of actions out.
 
     Args:
-        size: numbers of an observation
+        sizes: what an observation consists of
         chunk: actions of a chunk
         width: numbers of an action
         hidden: of the layers in between
     """
 
     def __init__(
-        self, size: int, chunk: int, width: int, hidden: tuple[int, ...] = (256, 256)
+        self, sizes: StateSizes, chunk: int, width: int, hidden: tuple[int, ...] = (256, 256)
     ) -> None:
         super().__init__()
-        self.norm = RunningNorm(size)
-        self.chunk, self.width = chunk, width
-        self.network = layers((size, *hidden, chunk * width))
+        self.sizes, self.chunk, self.width = sizes, chunk, width
+        features = relative_features(torch.zeros(1, sizes.numbers), sizes).shape[1]
+        self.norm = RunningNorm(features)
+        self.network = layers((features, *hidden, chunk * width))
+
+    def look_at(self, seen: Tensor) -> None:
+        """Take observations (N, D) for what is normal."""
+        self.norm.update(relative_features(seen, self.sizes))
 
     def forward(self, seen: Tensor, noise: float = 0.0) -> Tensor:
         """Chunks (W, K, A) for observations (W, D)."""
-        normed = self.norm(seen)
+        normed = self.norm(relative_features(seen, self.sizes))
         if noise:
             normed = normed + noise * torch.randn_like(normed)
         chunks: Tensor = self.network(normed)
@@ -152,8 +172,8 @@ class Cloner:
         self._chunks, self._config, self._seed = chunks, config, seed
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.policy = ChunkPolicy(chunks.seen.shape[1], *chunks.actions.shape[1:])
-        self.policy.norm.update(chunks.seen)
+            self.policy = ChunkPolicy(chunks.sizes, *chunks.actions.shape[1:])
+        self.policy.look_at(chunks.seen)
         self._adam = torch.optim.Adam(self.policy.network.parameters(), lr=config.lr)
 
     def update(self, number: int) -> float:

@@ -56,7 +56,7 @@ def test_a_policy_sees_in_play_what_was_recorded(demos: Path) -> None:
             seen.append(rows[0])
             return chunks.actions[len(seen) - 1][None]
 
-    policy = Told(chunks.seen.shape[1], CHUNK, chunks.actions.shape[2])
+    policy = Told(chunks.sizes, CHUNK, chunks.actions.shape[2])
     played = play_clone(chunks.how, policy, [SEED])[SEED]
     assert played.solved and played.steps == recorded
     # the means over chunks that agree differ from them in the last bits
