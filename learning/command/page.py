@@ -102,4 +102,4 @@ def view(options: ViewOptions) -> Outcome:
         serve_until_interrupted(session, bound, browser=opener)
     count = len(session.entries)
     data = {"folder": options.folder, "episodes": count}
-    return Outcome(data=data, text=f"{options.folder}: {count} episodes")
+    return Outcome(data=data, text=f"{options.folder}: {count} episode{'s' * (count != 1)}")
