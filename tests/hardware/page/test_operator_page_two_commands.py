@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 from fixtures.operator_desk import answer, question, say
-from fixtures.page_server import hear
 from fixtures.places import ROOT
 from websockets.sync.client import connect
 
