@@ -2,17 +2,19 @@
 
     for every update
         draw rows of demonstrations: what was seen, and the K actions that followed
-        predict these from what was seen, descend the absolute error
+        propose several chunks for what was seen, descend the absolute error of the nearest one
     in every control step
-        predict a chunk, and act as the mean of what this and earlier chunks say of now
+        take the likeliest proposal, and act as the mean of what this and earlier chunks say of now
 
 Chunks keep a policy from standing still where demonstrators pause, and the mean over chunks
 (temporal ensembling) makes its motion smooth. It sees the state, not pictures, as `features` tell
-it, by an MLP.
+it, by an MLP. Demonstrators who pick now here and now there are not averaged into a place between:
+each proposal is free to follow one of them.
 
 Source: Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware" (ACT),
 RSS 2023: chunks, temporal ensembling with weights exp(-m i), the absolute error. Its transformer
-and its variational code are left out.
+and its variational code are left out. Proposals: Rupprecht et al., "Learning in an Uncertain World:
+Representing Ambiguity Through Multiple Hypotheses", ICCV 2017.
 """
 
 from __future__ import annotations
@@ -48,6 +50,10 @@ __all__ = [
     "read_chunks",
 ]
 
+_OTHERS = 0.05
+"""Share of the loss that all proposals have in common, so that none is left behind."""
+_LIKELY = 0.02
+"""Weight of the loss of which proposal will be nearest."""
 _STREAM = 17
 """Keeps the generators of this training apart from those of episodes."""
 
@@ -62,17 +68,19 @@ class CloningConfig:
         chunk: actions that are predicted at once
         lr: Adam's step size at first; it falls linearly to 0
         noise: standard deviation of noise on normalised observations while training
+        proposals: chunks that are proposed for what is seen
         decay: m in the weights exp(-m i) of chunks, i from the oldest one on
 
     Raises:
         InputError: a number is not above 0.
     """
 
-    updates: int = 30000
+    updates: int = 20000
     batch: int = 256
     chunk: int = 10
     lr: float = 1e-3
     noise: float = 0.05
+    proposals: int = 4
     decay: float = 0.01
 
     def __post_init__(self) -> None:
@@ -140,29 +148,41 @@ class ChunkPolicy(nn.Module):
         sizes: what an observation consists of
         chunk: actions of a chunk
         width: numbers of an action
+        proposals: chunks that are proposed
         hidden: of the layers in between
     """
 
     def __init__(
-        self, sizes: StateSizes, chunk: int, width: int, hidden: tuple[int, ...] = (256, 256)
+        self,
+        sizes: StateSizes,
+        chunk: int,
+        width: int,
+        proposals: int = CloningConfig.proposals,
+        hidden: tuple[int, ...] = (256, 256),
     ) -> None:
         super().__init__()
-        self.sizes, self.chunk, self.width = sizes, chunk, width
+        self.sizes, self.shape = sizes, (proposals, chunk, width)
         features = relative_features(torch.zeros(1, sizes.numbers), sizes).shape[1]
         self.norm = RunningNorm(features)
-        self.network = layers((features, *hidden, chunk * width))
+        self.network = layers((features, *hidden, proposals * chunk * width + proposals))
 
     def look_at(self, seen: Tensor) -> None:
         """Take observations (N, D) for what is normal."""
         self.norm.update(relative_features(seen, self.sizes))
 
-    def forward(self, seen: Tensor, noise: float = 0.0) -> Tensor:
-        """Chunks (W, K, A) for observations (W, D)."""
+    def propose(self, seen: Tensor, noise: float = 0.0) -> tuple[Tensor, Tensor]:
+        """Chunks (W, M, K, A) for observations (W, D), and logits (W, M) of which is nearest."""
         normed = self.norm(relative_features(seen, self.sizes))
         if noise:
             normed = normed + noise * torch.randn_like(normed)
-        chunks: Tensor = self.network(normed)
-        return chunks.unflatten(-1, (self.chunk, self.width))
+        out = self.network(normed)
+        count = self.shape[0]
+        return out[:, count:].unflatten(-1, self.shape), out[:, :count]
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """The likeliest chunks (W, K, A) for observations (W, D)."""
+        chunks, likely = self.propose(seen)
+        return chunks[torch.arange(len(seen)), likely.argmax(dim=1)]
 
 
 class Cloner:
@@ -170,9 +190,10 @@ class Cloner:
 
     def __init__(self, chunks: Chunks, config: CloningConfig, *, seed: int) -> None:
         self._chunks, self._config, self._seed = chunks, config, seed
+        chunk, width = chunks.actions.shape[1:]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.policy = ChunkPolicy(chunks.sizes, *chunks.actions.shape[1:])
+            self.policy = ChunkPolicy(chunks.sizes, chunk, width, config.proposals)
         self.policy.look_at(chunks.seen)
         self._adam = torch.optim.Adam(self.policy.network.parameters(), lr=config.lr)
 
@@ -186,8 +207,12 @@ class Cloner:
         rows = torch.from_numpy(rng.integers(len(chunks.seen), size=config.batch))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(rng.integers(2**62)))
-            predicted = self.policy(chunks.seen[rows], config.noise)
-        loss = (predicted - chunks.actions[rows]).abs().mean()
+            proposed, likely = self.policy.propose(chunks.seen[rows], config.noise)
+        away = (proposed - chunks.actions[rows][:, None]).abs().mean(dim=(2, 3))
+        nearest = away.detach().argmin(dim=1, keepdim=True)
+        guess = nn.functional.cross_entropy(likely, nearest[:, 0])
+        follow = (1.0 - _OTHERS) * away.gather(1, nearest).mean() + _OTHERS * away.mean()
+        loss = follow + _LIKELY * guess
         self._adam.param_groups[0]["lr"] = config.lr * (1.0 - (number - 1) / config.updates)
         self._adam.zero_grad()
         loss.backward()
@@ -199,11 +224,15 @@ def ensembled(chunks: Sequence[np.ndarray], decay: float) -> np.ndarray:
     """The action (A,) now, of the chunks (K, A) that were predicted so far, oldest first.
 
     Chunks that end before now say nothing. The weight of the i-th that speaks is exp(-decay i).
+    Those that are outvoted on holding, an action's last number, are left out: between going down
+    and rising with what was taken there is nothing, and a tip that did the mean of both hovered.
     """
     reach = len(chunks[-1])
     last = list(chunks[-reach:])
     said = np.array([chunk[len(last) - 1 - k] for k, chunk in enumerate(last)])
     weights = np.exp(-decay * np.arange(len(said)))
+    holds = said[:, -1] > 0.0
+    weights *= holds == (weights @ said[:, -1] > 0.0)
     return np.asarray((weights[:, None] * said).sum(axis=0) / weights.sum())
 
 

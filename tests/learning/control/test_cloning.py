@@ -10,16 +10,20 @@ import torch
 
 from learning.control.cloning import (
     ChunkPolicy,
+    Chunks,
     Cloner,
     CloningConfig,
     ensembled,
     play_clone,
     read_chunks,
 )
+from learning.control.features import StateSizes
 from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.control_runs import LedTask
 from warp_deform.control.numbers import recorded_numbers
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
+from warp_deform.tasks.registry import task
 
 SEED, CHUNK = 6, 10
 
@@ -52,7 +56,7 @@ def test_a_policy_sees_in_play_what_was_recorded(demos: Path) -> None:
     class Told(ChunkPolicy):
         """Says what the demonstrator did next."""
 
-        def forward(self, rows: torch.Tensor, noise: float = 0.0) -> torch.Tensor:
+        def forward(self, rows: torch.Tensor) -> torch.Tensor:
             seen.append(rows[0])
             return chunks.actions[len(seen) - 1][None]
 
@@ -70,6 +74,28 @@ def test_the_ensemble_weighs_chunks_by_their_age_and_forgets_those_that_are_over
     share = np.exp(-0.5)
     assert ensembled([old, new], 0.5) == pytest.approx([(1.0 + share * 3.0) / (1.0 + share)])
     assert ensembled([old + 100, old, new], 0.5) == ensembled([old, new], 0.5)
+
+
+def test_who_is_outvoted_on_holding_does_not_act() -> None:
+    """Two that go down empty and one that rises with what it took: the tip goes down."""
+    down, rise = np.array([[-0.6, -1.0]] * 3), np.array([[0.5, 1.0]] * 3)
+    assert ensembled([down, down, rise], 0.01) == pytest.approx([-0.6, -1.0])
+    assert ensembled([rise, down, rise], 0.01) == pytest.approx([0.5, 1.0])
+
+
+def test_proposals_follow_demonstrators_who_differ() -> None:
+    """Half go left and half go right, in the same state: the mean of them would go nowhere."""
+    sizes, count = StateSizes(0, 0, ()), 64
+    sides = torch.where(torch.arange(count) % 2 == 0, 1.0, -1.0)
+    actions = torch.stack([sides, torch.full_like(sides, -1.0)], dim=1)[:, None].repeat(1, 3, 1)
+    how = LedTask(task("block-notarget").__class__)
+    chunks = Chunks(torch.zeros(count, sizes.numbers), actions, sizes, how)
+    cloner = Cloner(chunks, CloningConfig(updates=300, batch=64), seed=0)
+    for number in range(1, 301):
+        cloner.update(number)
+    with torch.no_grad():
+        chosen = cloner.policy(chunks.seen[:1])[0, :, 0]
+    assert chosen.abs().min() > 0.8 and chosen.sign().unique().numel() == 1
 
 
 def test_training_learns_and_has_the_same_bits_twice(demos: Path) -> None:
