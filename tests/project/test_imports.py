@@ -131,7 +131,7 @@ def test_every_task_has_a_gymnasium_id() -> None:
     [
         ("cable-ring", "WarpDeform/CableRing-v2"),
         ("cable-ring-notarget", "WarpDeform/CableRingNotarget-v2"),
-        ("bag-items-1", "WarpDeform/BagItems1-v4"),
+        ("bag-items-1", "WarpDeform/BagItems1-v5"),
     ],
 )
 def test_gymnasium_id(name: str, expected: str) -> None:

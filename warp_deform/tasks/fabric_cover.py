@@ -43,7 +43,7 @@ class FabricCover(Task):
 
     name = "fabric-cover"
     instruction = "Cover the cube with the fabric."
-    version = 3
+    version = 4
     max_actions = 2
     stages = (Stage(lift=0.10, speed=FABRIC_SPEED),)
     solver = FABRIC_SOLVER

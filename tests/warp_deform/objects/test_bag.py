@@ -325,7 +325,7 @@ def test_a_box_pushed_against_a_bag_from_outside_stays_outside():
     size = CUBE.parts[0].size
     assert max(poke(a, bag.faces, b, size) for a, b in zip(x[::12], q[::12], strict=True)) < 3e-3
     # the bag is what gave way
-    assert x[-1, :, 1].mean() < x[0, :, 1].mean() - 0.007
+    assert x[-1, :, 1].mean() < x[0, :, 1].mean() - 0.01
 
 
 def test_a_lowered_box_stops_at_the_bottom_of_a_bag():

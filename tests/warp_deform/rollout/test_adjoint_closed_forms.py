@@ -229,10 +229,12 @@ def shoved(push: complex, long: complex, dt: float, seconds: float) -> complex:
         clock = tick * dt
         bead = push * clock / long if clock < np.real(long) else push
         to = x + v * dt
-        overlap, approach = bead - to, (bead - last) - (to - x)
+        overlap, before = bead - to, last - x
         if np.real(overlap) > 0:
-            allowed = ideal().recovery * dt + approach
-            to += overlap if np.real(overlap) < np.real(allowed) else allowed
+            # of an overlap that the substep began with, most stays
+            inside = np.real(before) > 0
+            left = max(before - ideal().recovery * dt, 0.8 * before, key=np.real) if inside else 0
+            to += overlap - left if np.real(overlap) > np.real(left) else 0
         step, budget = to - x, MU * G * dt**2
         step = step - budget if np.real(step) > np.real(budget) else 0.0 * step
         if np.real(step) >= SLEEP_SPEED * dt:

@@ -14,13 +14,11 @@ from typing import Any
 import warp as wp
 
 from ..lanes.structures import structures
+from .overlap_recovery import overlap_recovery
 from .rigid_body import rigid_body
 
-__all__ = ["AHEAD", "ALONE", "BOTH", "GIVEN_BACK", "REACTION", "SHARED", "VISIT", "body_contact"]
+__all__ = ["AHEAD", "ALONE", "BOTH", "REACTION", "SHARED", "VISIT", "body_contact"]
 
-GIVEN_BACK = 0.2
-"""Share of an overlap that a substep undoes: all at once, it would become speed and rock the
-box."""
 STEEP = 0.5
 """Least vertical share of the normal with which one body rests on another."""
 VISIT = 6
@@ -47,6 +45,7 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
     S, R3, M33, Bodies, Contacts = t.S, t.R3, t.M33, t.Bodies, t.Contacts
     body = rigid_body(scalar, lanes)
     turned, moved = body.turned, body.moved
+    remaining = overlap_recovery(scalar).remaining
 
     @wp.func
     def begin_body(b: int, bodies: Bodies):
@@ -140,8 +139,8 @@ def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespac
         contacts.u[c] = u
         contacts.v[c] = v
         overlap = wp.max(-before, S(0.0))
-        remaining = wp.max(overlap - max_recovery, overlap * S(1.0 - GIVEN_BACK))
-        contacts.steps[c] = R3(gap + remaining, wp.dot(slip, u), wp.dot(slip, v))
+        left = remaining(overlap, max_recovery)
+        contacts.steps[c] = R3(gap + left, wp.dot(slip, u), wp.dot(slip, v))
         contacts.impulse[c] = R3()
         contacts.mu[c] = mu
 

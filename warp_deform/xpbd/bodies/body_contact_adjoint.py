@@ -12,8 +12,8 @@ from typing import Any
 import warp as wp
 
 from ..lanes.structures import structures
-from .body_contact import GIVEN_BACK
 from .body_sweeps_adjoint import body_sweeps_adjoint
+from .overlap_recovery import overlap_recovery
 from .rigid_body import rigid_body
 
 __all__ = ["body_contact_adjoint"]
@@ -30,6 +30,7 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     S, R3, Q, M33 = t.S, t.R3, t.Q, t.M33
     Bodies, Contacts, BodyAdjoint = t.Bodies, t.Contacts, t.BodyAdjoint
     turned = rigid_body(scalar, lanes).turned
+    remaining = overlap_recovery(scalar).remaining
     add_mass = body_sweeps_adjoint(scalar, lanes).add_mass
 
     @wp.func
@@ -168,8 +169,8 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         v = wp.cross(n, u)
         gap = wp.dot(pb - pa, n)
         overlap = wp.max(wp.dot(slip, n) - gap, S(0.0))
-        remaining = wp.max(overlap - max_recovery, overlap * S(1.0 - GIVEN_BACK))
-        total = gs[0] * (gap + remaining) + gs[1] * wp.dot(slip, u) + gs[2] * wp.dot(slip, v)
+        left = remaining(overlap, max_recovery)
+        total = gs[0] * (gap + left) + gs[1] * wp.dot(slip, u) + gs[2] * wp.dot(slip, v)
         total += weights_loss(wb, sb, rb, n, u, v, gw + by.upper)
         total += weights_loss(wa, sa, ra, n, u, v, gw) * two
         total += wp.dot(by.ra, ra) * two + wp.dot(by.rb, rb)

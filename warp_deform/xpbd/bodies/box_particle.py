@@ -10,6 +10,7 @@ from ..contact.friction import friction
 from ..contact.table_support import table_support
 from ..lanes.algebra import add, mul, sub  # noqa: F401  (operators are found by name)
 from ..lanes.structures import structures
+from .overlap_recovery import overlap_recovery
 from .rigid_body import rigid_body
 
 __all__ = ["box_particle"]
@@ -25,7 +26,7 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
     """`project_box_particle`: one particle of one lane against one box.
 
     The normal is that of the nearest point of the box; for a centre inside the box, that of the
-    nearest face. Separation is limited as in `sphere_contact`.
+    nearest face. Separation is limited as in `overlap_recovery`.
 
     A particle that the table carries does not give way downwards (`stands` is 0): the box would
     sink through light fabric, as the table takes back only afterwards what a contact of very
@@ -40,6 +41,7 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
     response, apply_impulse, moved = body.response, body.apply_impulse, body.moved
     coulomb_scalar = friction(scalar, lanes).coulomb_scalar
     raised = table_support(scalar, lanes).raised
+    correction = overlap_recovery(scalar).correction
 
     @wp.func
     def particle_gap(p: R3, shape: int, b: int, shapes: Shapes, bodies: Bodies):
@@ -104,7 +106,7 @@ def box_particle(scalar: Any, lanes: int) -> SimpleNamespace:
             po = particles.xp[i]
             step = p - R3(po.x[lane], po.y[lane], po.z[lane]) - moved(b, bodies, local)
             approach = wp.dot(step, n)
-            depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
+            depth = correction(radius - gap, approach, max_recovery)
             wv = particles.w[i]
             wi = wv[lane]
             across = wi + response(b, bodies, r, n)

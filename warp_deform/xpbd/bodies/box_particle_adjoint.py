@@ -12,6 +12,7 @@ from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from ..lanes.tape import Kind, tape
 from .box_particle import box_particle
+from .overlap_recovery import overlap_recovery
 from .rigid_body import rigid_body
 
 __all__ = ["box_particle_adjoint"]
@@ -36,6 +37,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     get, put, get_mass, put_scalar = access.get, access.put, access.get_mass, access.put_scalar
     stands = box_particle(scalar, lanes).stands
     raised = table_support(scalar, lanes).raised
+    correction = overlap_recovery(scalar).correction
     project_box_particle = box_particle(scalar, lanes).project_box_particle
     turned = rigid_body(scalar, lanes).turned
     tape_ = tape(scalar, lanes)
@@ -165,7 +167,7 @@ def box_particle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         m = wp.quat_rotate(q, wp.quat_rotate(rotation, n))
         step = p - po - (x + r - (xp + wp.quat_rotate(qp, local)))
         approach = wp.dot(step, m)
-        depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
+        depth = correction(radius - gap, approach, max_recovery)
         response = response_of(w, inverse, q, r, m)
         across = wi + response
         total = wi * yielding + response

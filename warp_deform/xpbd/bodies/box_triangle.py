@@ -18,6 +18,7 @@ from ..contact.table_support import table_support
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from .box_particle import box_particle
+from .overlap_recovery import overlap_recovery
 from .rigid_body import rigid_body
 
 __all__ = ["box_triangle"]
@@ -31,7 +32,8 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
 
     A face of the box is met by the triangle's corners, see `box_particle`, so only the triangle's
     normal (a corner of the box meets it) and edges across edges are solved here: with the radius of
-    the fabric, and shared by the triangle's corners. Separation is limited as in `sphere_contact`.
+    the fabric, and shared by the triangle's corners. Separation is limited as in
+    `overlap_recovery`.
     """
     t = structures(scalar, lanes)
     S, R3, L = t.S, t.R3, t.L
@@ -45,6 +47,7 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
     barycentric = closest_point(scalar, lanes).barycentric
     stands = box_particle(scalar, lanes).stands
     raised = table_support(scalar, lanes).raised
+    correction = overlap_recovery(scalar).correction
     # of an edge and a side of the box that are nearly parallel, the ends tell more
     PARALLEL = S(1.0e-3)
     # an axis of edges must win clearly: it would flicker where edges are nearly parallel
@@ -220,7 +223,7 @@ def box_triangle(scalar: Any, lanes: int) -> SimpleNamespace:
                 step += (zb - get(cells.xp, ib, lane)) * u[1]
                 step += (zc - get(cells.xp, ic, lane)) * u[2]
                 approach = wp.dot(step, n)
-                depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
+                depth = correction(radius - gap, approach, max_recovery)
                 wa = get_mass(cells.w, ia, lane)
                 wb = get_mass(cells.w, ib, lane)
                 wc = get_mass(cells.w, ic, lane)

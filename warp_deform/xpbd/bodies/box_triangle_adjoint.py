@@ -14,6 +14,7 @@ from ..lanes.tape import BODY_WORDS, BOX_TRIANGLE_SCALARS, Kind, tape
 from .box_particle import box_particle
 from .box_particle_adjoint import box_particle_adjoint
 from .box_triangle import box_triangle
+from .overlap_recovery import overlap_recovery
 
 __all__ = ["box_triangle_adjoint"]
 
@@ -29,25 +30,24 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     """
     t = structures(scalar, lanes)
     S, R3, Q = t.S, t.R3, t.Q
-    Shapes, Bodies, Topology = t.Shapes, t.Bodies, t.Topology
-    Sheets, Cells, Tape = t.Sheets, t.Cells, t.Tape
-    Adjoint, BodyAdjoint = t.Adjoint, t.BodyAdjoint
+    Shapes, Bodies, Topology, Sheets = t.Shapes, t.Bodies, t.Topology, t.Sheets
+    Cells, Tape, Adjoint, BodyAdjoint = t.Cells, t.Tape, t.Adjoint, t.BodyAdjoint
     access = lane_access(scalar, lanes)
     count_one = access.count_one
     get, put, get_mass = access.get, access.put, access.get_mass
     barycentric = closest_point(scalar, lanes).barycentric
     stands = box_particle(scalar, lanes).stands
     raised = table_support(scalar, lanes).raised
+    correction = overlap_recovery(scalar).correction
     solve = box_triangle(scalar, lanes)
     separate, corner_towards = solve.separate, solve.corner_towards
     project_box_triangle, next_near = solve.project_box_triangle, solve.next_near
     particle_ = box_particle_adjoint(scalar, lanes)
     stick_share, response_of = particle_.stick_share, particle_.response_of
-    impulse_loss = particle_.impulse_loss
-    BodyValue, BoxValue = particle_.BodyValue, particle_.BoxValue
-    taped_body, box_value = particle_.taped_body, particle_.box_value
+    impulse_loss, add_radius = particle_.impulse_loss, particle_.add_radius
+    BodyValue, taped_body = particle_.BodyValue, particle_.taped_body
+    BoxValue, box_value = particle_.BoxValue, particle_.box_value
     add_to_body, add_mass = particle_.add_to_body, particle_.add_mass
-    add_radius = particle_.add_radius
     tape_ = tape(scalar, lanes)
     record_pose, position = tape_.record_pose, tape_.position
 
@@ -261,7 +261,7 @@ def box_triangle_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
         step = (xa - oa) * u[0] + (xb - ob) * u[1] + (xc - oc) * u[2]
         slid = step - (x + r - (xp + wp.quat_rotate(qp, local)))
         approach = wp.dot(slid, out)
-        depth = wp.min(radius - gap, wp.max(max_recovery - approach, S(0.0)))
+        depth = correction(radius - gap, approach, max_recovery)
         response = response_of(w, inverse, q, r, out)
         ya = wa * yielding[0]
         yb = wb * yielding[1]

@@ -44,6 +44,64 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
     solve_contacts = body_sweeps(scalar, lanes).solve_contacts
 
     @wp.func
+    def meet_particles(
+        lane: int,
+        at: Span,
+        tops: wp.vec4i,
+        shape: int,
+        number: int,
+        b: int,
+        mu: S,
+        max_recovery: S,
+        top: Topology,
+        shapes: Shapes,
+        particles: Particles,
+        bodies: Bodies,
+        tape: Tape,
+    ):
+        """All particles of a lane against one box, which is shape `number` of its world."""
+        far = wp.length(shapes.half[shape])
+        center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
+        for i in range(at.particles):
+            radius = top.radius[at.radii + i]
+            x = particles.x[at.p0 + i]
+            d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
+            if wp.dot(d, d) < (far + radius) * (far + radius):
+                if wp.static(taped):
+                    if record_box_particle(
+                        tops[3],
+                        at.p0 + i,
+                        lane,
+                        radius,
+                        shape,
+                        b,
+                        mu,
+                        max_recovery,
+                        particles,
+                        shapes,
+                        bodies,
+                        tape,
+                    ):
+                        tape.k[tops[2]] = i
+                        tape.k[tops[2] + 1] = number
+                        tops[2] += wp.static(BODY_WORDS)
+                        tops[3] += wp.static(BOX_PARTICLE_SCALARS)
+                else:
+                    project_box_particle(
+                        at.p0 + i,
+                        lane,
+                        radius,
+                        shape,
+                        b,
+                        mu,
+                        max_recovery,
+                        particles,
+                        shapes,
+                        bodies,
+                    )
+        return tops
+
+    @wp.func
     def solve_lane(
         lane: int,
         at: Span,
@@ -73,50 +131,28 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
         for b in range(b0, b0 + count):
             bodies.touching[b] = 0
             bodies.support[b] = 0
+        thickest = S(0.0)
+        for i in range(at.particles):
+            thickest = wp.max(thickest, top.radius[radii + i])
         mark = int(tops[2])
         for shape in range(first, last):
             b = b0 + shapes.body[shape]
+            tops = meet_particles(
+                lane,
+                at,
+                tops,
+                shape,
+                shape - first,
+                b,
+                mu,
+                max_recovery,
+                top,
+                shapes,
+                particles,
+                bodies,
+                tape,
+            )
             far = wp.length(shapes.half[shape])
-            center = bodies.x[b] + wp.quat_rotate(bodies.q[b], shapes.center[shape])
-            thickest = S(0.0)
-            for i in range(at.particles):
-                radius = top.radius[radii + i]
-                thickest = wp.max(thickest, radius)
-                x = particles.x[p0 + i]
-                d = R3(x.x[lane], x.y[lane], x.z[lane]) - center
-                if wp.dot(d, d) < (far + radius) * (far + radius):
-                    if wp.static(taped):
-                        if record_box_particle(
-                            tops[3],
-                            p0 + i,
-                            lane,
-                            radius,
-                            shape,
-                            b,
-                            mu,
-                            max_recovery,
-                            particles,
-                            shapes,
-                            bodies,
-                            tape,
-                        ):
-                            tape.k[tops[2]] = i
-                            tape.k[tops[2] + 1] = shape - first
-                            tops[2] += wp.static(BODY_WORDS)
-                            tops[3] += wp.static(BOX_PARTICLE_SCALARS)
-                    else:
-                        project_box_particle(
-                            p0 + i,
-                            lane,
-                            radius,
-                            shape,
-                            b,
-                            mu,
-                            max_recovery,
-                            particles,
-                            shapes,
-                            bodies,
-                        )
             if wp.static(with_sheets and taped):
                 touched = record_box_triangles(
                     tops[2],
@@ -157,6 +193,29 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
                     sheets,
                     cells,
                 )
+            if wp.static(with_sheets):
+                if at.triangles > 0:
+                    # what a fabric over the box has pressed into those below is not left as it is:
+                    # it would come back as speed
+                    touching = bodies.touching[b]
+                    support = bodies.support[b]
+                    tops = meet_particles(
+                        lane,
+                        at,
+                        tops,
+                        shape,
+                        shape - first,
+                        b,
+                        mu,
+                        max_recovery,
+                        top,
+                        shapes,
+                        particles,
+                        bodies,
+                        tape,
+                    )
+                    bodies.touching[b] = touching
+                    bodies.support[b] = support
         if wp.static(taped):
             tape.k[tops[2]] = (tops[2] - mark) // wp.static(BODY_WORDS)
             tops[2] += 1

@@ -123,7 +123,7 @@ def tape(scalar: Any, lanes: int) -> SimpleNamespace:
         particles = at.particles
         near = run.near_count
         bodies = at.bodies * wp.static(L)
-        solid = at.shapes * (at.particles + at.triangles) * wp.static(L)
+        solid = at.shapes * (2 * at.particles + at.triangles) * wp.static(L)
         end = tape.end[at.g]
         words = springs + at.passes + particles + near + wp.static(TRIANGLE_WORDS) * listed
         words += wp.static(2 * L * (GRIP_WORDS + 4) + 8) + wp.static(BODY_WORDS) * (bodies + solid)

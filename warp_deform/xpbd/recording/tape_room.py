@@ -103,8 +103,8 @@ class TapeRoom:
 
     Room is counted in elements (groups, 4). `use` is what a substep took, None before any was
     taped; a tape has `spare` room on top, as the kernel begins no substep that might not fit. The
-    spare includes every box with every particle and triangle: once a tape, not once a substep, that
-    is less than a handful of substeps take.
+    spare includes every box with every triangle and, twice, with every particle: once a tape, not
+    once a substep, that is less than a handful of substeps take.
     """
 
     def __init__(self, data: SolverData, control: dict[str, Mirrored]) -> None:
@@ -193,7 +193,7 @@ def _solid(data: SolverData) -> np.ndarray:
     rows = []
     for k in data.group_topology:
         top = data.topologies[k]
-        solid = len(top.shape_body) * (top.particle_count + len(top.sheet_triangle))
+        solid = len(top.shape_body) * (2 * top.particle_count + len(top.sheet_triangle))
         solid *= data.lanes
         rows.append((0, 0, BODY_WORDS * solid, BOX_TRIANGLE_SCALARS * solid))
     return np.array(rows)
