@@ -1,6 +1,6 @@
 """Random actions in a vector environment: several episodes side by side, with autoreset.
 
-python examples/vector_env.py [--env WarpDeform/CableRing-v2] [--num-envs 16] [--steps 30]
+python examples/vector_env.py [--env WarpDeform/CableRing-v3] [--num-envs 16] [--steps 30]
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from warp_deform.quiet import quiet_warp
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--env", default="WarpDeform/CableRing-v2", help="a Gymnasium id")
+    parser.add_argument("--env", default="WarpDeform/CableRing-v3", help="a Gymnasium id")
     parser.add_argument("--num-envs", type=int, default=16)
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--seed", type=int, default=0, help="of the first environment")

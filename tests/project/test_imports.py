@@ -129,8 +129,8 @@ def test_every_task_has_a_gymnasium_id() -> None:
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("cable-ring", "WarpDeform/CableRing-v2"),
-        ("cable-ring-notarget", "WarpDeform/CableRingNotarget-v2"),
+        ("cable-ring", "WarpDeform/CableRing-v3"),
+        ("cable-ring-notarget", "WarpDeform/CableRingNotarget-v3"),
         ("bag-items-1", "WarpDeform/BagItems1-v5"),
     ],
 )

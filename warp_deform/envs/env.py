@@ -31,7 +31,7 @@ _FRAME = (360, 640)  # [pixels] rows, columns
 class PickPlaceEnv(gymnasium.Env[Any, np.ndarray]):
     """Rearrange cables, fabrics, bags or boxes by picking and placing, in the episodes of a task.
 
-        env = gymnasium.make("WarpDeform/CableRing-v2")
+        env = gymnasium.make("WarpDeform/CableRing-v3")
         observation, info = env.reset(seed=0)
         observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
 

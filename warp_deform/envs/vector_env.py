@@ -29,7 +29,7 @@ __all__ = ["PickPlaceVectorEnv"]
 class PickPlaceVectorEnv(LaneVectorEnv):
     """`num_envs` episodes of a task, simulated together: the fast way to gather experience.
 
-        envs = gymnasium.make_vec("WarpDeform/CableRing-v2", num_envs=16)
+        envs = gymnasium.make_vec("WarpDeform/CableRing-v3", num_envs=16)
         observations, infos = envs.reset(seed=0)          # episodes 0 to 15
         observations, rewards, terminations, truncations, infos = envs.step(actions)
 

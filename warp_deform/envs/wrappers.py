@@ -36,7 +36,7 @@ _RULE = "privileged"
 class PrivilegedStage(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Takes the lift out of the action, Box (6,), and fills in that of the task's stage.
 
-    env = PrivilegedStage(gymnasium.make("WarpDeform/CableRing-v2"))
+    env = PrivilegedStage(gymnasium.make("WarpDeform/CableRing-v3"))
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:

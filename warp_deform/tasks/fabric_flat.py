@@ -45,8 +45,8 @@ class FabricFlat(Task):
     """A fabric of 0.2 m has to cover 0.85 of a square of its size that is drawn on the table.
 
     Deliberate differences from the original: the demonstrator pulls a corner, which is one cell
-    inwards, to where it lies in a flat fabric on the square, not to the square's own corner and
-    3 cm beyond; the original's fabric stretches by that much, this one would be dragged off.
+    inwards, 7.5 mm beyond where it lies in a flat fabric on the square, not to 3 cm beyond the
+    square's own corner; the original's fabric stretches that much, this one would be dragged off.
 
     Args:
         folded: start with a corner of the fabric turned over, a variant that the paper has not
@@ -54,7 +54,7 @@ class FabricFlat(Task):
 
     name = "fabric-flat"
     instruction = "Spread the fabric on the drawn square."
-    version = 2
+    version = 3
     max_actions = 10
     stages = (Stage(lift=0.05, speed=FABRIC_SPEED),)
     solver = FABRIC_SOLVER
@@ -67,8 +67,9 @@ class FabricFlat(Task):
     fabric: ClassVar[ClothConfig] = FABRIC
     visible: ClassVar[bool] = True
     """Whether the square is drawn."""
-    overshoot: ClassVar[float] = 0.0
-    """How far beyond its target the demonstrator pulls a corner [m]; the original 0.03."""
+    overshoot: ClassVar[float] = 0.0075
+    """How far beyond its target the demonstrator pulls a corner [m]; the original 0.03. Tuned on
+    seeds of no test: it needs 3.1 actions, as there; 2.2 without, and at 0.02 it often fails."""
     inset: ClassVar[float] = FABRIC.spacing
     """How far inside the square's corners the demonstrator's targets are, along both sides [m]."""
 

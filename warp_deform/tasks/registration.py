@@ -24,7 +24,7 @@ Registered = TypeVar("Registered", bound="type[Task]")
 
 
 def env_id(task: str) -> str:
-    """Gymnasium id of the task called `task`: `cable-ring` is `WarpDeform/CableRing-v2`.
+    """Gymnasium id of the task called `task`: `cable-ring` is `WarpDeform/CableRing-v3`.
 
     Of an installed task that has not been loaded, the version is what its entry point says.
     """
