@@ -247,7 +247,7 @@ def test_first_pull_takes_the_nearest_corner_and_the_next_the_farthest_off(cls) 
     action = task.demonstrate(layout, later, rng)
     assert action[:2] == pytest.approx(moved[wrong, :2], abs=1e-6)
     way = home - moved[wrong, :2]
-    beyond_home = home + 0.0075 * way / np.linalg.norm(way)
+    beyond_home = home + 0.0065 * way / np.linalg.norm(way)
     assert action[3:5] == pytest.approx(beyond_home, abs=1e-6)
 
 
