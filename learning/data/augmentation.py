@@ -22,6 +22,7 @@ from warp_deform.tasks.ground_truth import YAW_SCALE, Row, Rows, row_kinds, rows
 __all__ = [
     "RigidTransform",
     "draw_transform",
+    "draw_transforms",
     "move_actions",
     "move_picture",
     "move_points",
@@ -59,11 +60,7 @@ class RigidTransform:
 
     def matrix(self) -> np.ndarray:
         """(2, 3) float64, of column and row [pixels]."""
-        c, s = math.cos(self.turn), math.sin(self.turn)
-        linear = np.array([[c, -s * self.handed], [s, c * self.handed]])
-        matrix = np.empty((2, 3))
-        matrix[:, :2], matrix[:, 2] = linear, _PIVOT + self.shift - linear @ _PIVOT
-        return matrix
+        return _matrices([self])[0]
 
     def of_pixels(self, pixels: np.ndarray) -> np.ndarray:
         """Where pixels (n, 2), row and column, go: float64 (n, 2)."""
@@ -98,13 +95,68 @@ def draw_transform(
             turn = 2 * math.pi * int(rng.integers(copies)) / copies
         x, y = rng.normal(0.0, _SHIFT, size=2)
         drawn = RigidTransform(turn, (float(x), float(y)), grid, mirrored)
-        moved = np.round(drawn.of_pixels(pixels))
-        if ((moved >= 0) & (moved < SHAPE)).all():
+        if _in_view(drawn.of_pixels(pixels)):
             return drawn
-    raise InputError(
+    raise _too_far_apart(action)
+
+
+def draw_transforms(
+    actions: np.ndarray,
+    *,
+    rng: np.random.Generator,
+    grid: PixelGrid = TABLE_GRID,
+    copies: int | None = None,
+) -> list[RigidTransform]:
+    """A random transform for each of many actions (B, 7), all at once; see `draw_transform`."""
+    actions = np.asarray(actions, dtype=float)
+    pixels = grid.to_pixel(actions[:, [[0, 1], [3, 4]]])
+    drawn: dict[int, RigidTransform] = {}
+    left = np.arange(len(actions))
+    for _ in range(_MOST_DRAWS):
+        if len(left) == 0:
+            return [drawn[i] for i in range(len(actions))]
+        if copies is None:
+            turns = rng.normal(0.0, _TURN, size=len(left))
+        else:
+            turns = 2 * math.pi * rng.integers(copies, size=len(left)) / copies
+        shifts = rng.normal(0.0, _SHIFT, size=(len(left), 2))
+        tried = [
+            RigidTransform(turn, (x, y), grid)
+            for turn, (x, y) in zip(turns.tolist(), shifts.tolist(), strict=True)
+        ]
+        matrix = _matrices(tried)
+        columns = pixels[left][..., ::-1]
+        moved = columns @ matrix[:, :, :2].transpose(0, 2, 1) + matrix[:, None, :, 2]
+        seen = _in_view(moved[..., ::-1])
+        drawn |= {int(left[k]): tried[k] for k in np.flatnonzero(seen)}
+        left = left[~seen]
+    raise _too_far_apart(actions[left[0]])
+
+
+def _in_view(pixels: np.ndarray) -> np.ndarray:
+    """Whether pixels (..., n, 2), row and column, all lie within the picture: (...)."""
+    whole = np.round(pixels)
+    return np.asarray(((whole >= 0) & (whole < SHAPE)).all(axis=(-2, -1)))
+
+
+def _too_far_apart(action: np.ndarray) -> InputError:
+    return InputError(
         f"pick {action[:2].tolist()} and place {action[3:5].tolist()} [m] of a demonstration do "
         "not fit into one picture"
     )
+
+
+def _matrices(transforms: Sequence[RigidTransform]) -> np.ndarray:
+    """(B, 2, 3) float64, of column and row [pixels].
+
+    Cosines are Python's: numpy's depend on the processor in their last bit.
+    """
+    c = np.array([math.cos(each.turn) for each in transforms])
+    s = np.array([math.sin(each.turn) for each in transforms])
+    handed = np.array([each.handed for each in transforms])
+    linear = np.stack([np.stack([c, -s * handed], 1), np.stack([s, c * handed], 1)], 1)
+    shift = _PIVOT + np.array([each.shift for each in transforms]) - linear @ _PIVOT
+    return np.concatenate([linear, shift[:, :, None]], 2)
 
 
 def move_picture(
@@ -149,7 +201,7 @@ def move_states(
     rows = states.reshape(count, -1, 3).astype(float)
     turned, shown = rows_of(kind, [Row.POSE, Row.BEAD]), rows_of(kind, [Row.DISPLACEMENT])
     placed = turned | rows_of(kind, [Row.POINT])
-    linear = np.array([each.matrix()[:, :2] for each in transforms])
+    linear = _matrices(transforms)[:, :, :2]
     rows[:, placed, :2] = move_points(rows[:, placed, :2], transforms)
     rows[:, shown, :2] = rows[:, shown, :2] @ linear.transpose(0, 2, 1)
     handed, turn = np.array([(each.handed, each.turn) for each in transforms]).T[..., None]
@@ -160,8 +212,9 @@ def move_states(
 
 def move_points(xy: np.ndarray, transforms: Sequence[RigidTransform]) -> np.ndarray:
     """World points (B, n, 2) [m], those of every entry moved by its transform."""
-    matrix = np.array([each.matrix() for each in transforms])
-    origin = np.array([each.grid.to_world(np.zeros(2)) for each in transforms])[:, None]
+    matrix = _matrices(transforms)
+    origins = {each.grid: each.grid.to_world(np.zeros(2)) for each in transforms}
+    origin = np.array([origins[each.grid] for each in transforms])[:, None]
     pixel = np.array([each.grid.pixel_size for each in transforms])[:, None]
     shift = (matrix[:, :, 2] * pixel)[:, None]
     return np.asarray((xy - origin) @ matrix[:, :, :2].transpose(0, 2, 1) + shift + origin)

@@ -14,7 +14,7 @@ from warp_deform.tasks.task import Task
 
 from ..models.gt_state import encode_action
 from ..models.transporter import Batch, Transporter
-from .augmentation import draw_transform, move_actions, move_picture, move_states
+from .augmentation import draw_transform, draw_transforms, move_actions, move_picture, move_states
 from .dataset import Demonstrations
 
 __all__ = ["StateBatch", "check_lifts", "check_view", "image_batch", "state_batch", "task_lifts"]
@@ -124,13 +124,10 @@ def state_batch(
         InputError: a lift is no stage's.
     """
     grid, copies = data.task.grid, data.task.rotated_copies
-    pairs, transforms = [], []
-    for state, action in (data.state(*each) for each in transitions):
-        pairs.append((state, action))
-        if augment:  # drawn between the transitions, which `rng` may draw too
-            transforms.append(draw_transform(action, rng=rng, grid=grid, copies=copies))
+    pairs = [data.state(*each) for each in transitions]
     states, actions = (np.stack(each) for each in zip(*pairs, strict=True))
     if augment:
+        transforms = draw_transforms(actions, rng=rng, grid=grid, copies=copies)
         states = move_states(data.task.ground_truth_rows, states, transforms)
         actions = move_actions(actions, transforms)
     indices = torch.tensor([_lift_index(action, lifts) for action in actions])

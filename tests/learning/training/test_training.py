@@ -178,6 +178,7 @@ def test_without_augmentation_nothing_is_moved(
         raise AssertionError
 
     monkeypatch.setattr("learning.data.batches.draw_transform", never)
+    monkeypatch.setattr("learning.data.batches.draw_transforms", never)
     for agent in "goal-stack", "gt-mlp":
         out = tmp_path / agent
         one = replace(SHORT, steps=1, snapshots=1)
