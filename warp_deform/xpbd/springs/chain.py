@@ -23,6 +23,9 @@ from ..lanes.tape import Kind
 
 __all__ = ["chain", "chain_adjoint"]
 
+BOUNDS = 3
+"""How often springs beyond their bounds are looked for: those held there load their neighbours."""
+
 
 @functools.cache
 def chain(scalar: Any, lanes: int) -> SimpleNamespace:
@@ -30,8 +33,8 @@ def chain(scalar: Any, lanes: int) -> SimpleNamespace:
     springs from `k` on. `measure` takes in the offset of one of them, `solve_chain` leaves their
     multipliers in `lines`.
 
-    What is beyond its strain limit, or below its floor, and would stay so, is brought just there
-    instead, as a rigid rod: a first solution finds these springs, and all is solved anew.
+    What would be beyond its strain limit, or is below its floor and would stay so, is brought just
+    there instead, as a rigid rod: a solution finds these springs, and all is solved anew.
     """
     t = structures(scalar, lanes)
     S, V, V3 = t.S, t.V, t.V3
@@ -91,20 +94,22 @@ def chain(scalar: Any, lanes: int) -> SimpleNamespace:
         bounded = bool(False)
         for s in range(k, k + count):
             i = p0 + springs.ij[s][0]
-            # what is within its bounds now may leave them for a substep: bounding it already would
-            # push, and neighbours would push each other to and fro
             length = lines.length[i]
             left = lines.target[i] + inverse_dt2 * springs.compliance[s] * lines.multiplier[i]
             limit = springs.limit[s]
-            if limit > S(0.0) and any_less(V(limit) - length, S(0.0)):
-                bounded = True
-                beyond = less(V(limit), wp.min(left, length))
+            if limit > S(0.0):
+                beyond = less(V(limit), left) * lines.elastic[i]
+                if any_less(zero - beyond, S(0.0)):
+                    bounded = True
                 lines.target[i] = select(beyond, V(limit), lines.target[i])
                 lines.elastic[i] = select(beyond, zero, lines.elastic[i])
+            # what is above its floor now may go below for a substep: bounding it already would
+            # push, and neighbours would push each other to and fro
             floor = springs.floor[s]
             if any_less(length - V(floor), S(0.0)):
-                bounded = True
-                below = less(wp.max(left, length), V(floor))
+                below = less(wp.max(left, length), V(floor)) * lines.elastic[i]
+                if any_less(zero - below, S(0.0)):
+                    bounded = True
                 lines.target[i] = select(below, V(floor), lines.target[i])
                 lines.elastic[i] = select(below, zero, lines.elastic[i])
         return bounded
@@ -121,8 +126,13 @@ def chain(scalar: Any, lanes: int) -> SimpleNamespace:
     ):
         eliminate(k, count, p0, inverse_dt2, w, springs, lines)
         if springs.limit[k] > S(0.0) or springs.floor[k] > S(0.0):
-            if bound(k, count, p0, inverse_dt2, springs, lines):
-                eliminate(k, count, p0, inverse_dt2, w, springs, lines)
+            r = int(0)
+            while r < wp.static(BOUNDS):
+                r += 1
+                if bound(k, count, p0, inverse_dt2, springs, lines):
+                    eliminate(k, count, p0, inverse_dt2, w, springs, lines)
+                else:
+                    r = wp.static(BOUNDS)
 
     @wp.func
     def project_chain(
