@@ -27,8 +27,9 @@ EARLY = {
     "heap": 4 / 60,
     "ring": 0.1,
     "block": 0.15,
-    "cloth10": 2.1,
-    "cloth25": 2.1,
+    "tower": 0.2,
+    "fold10": 1.3,
+    "fold25": 1.3,
     "crumple10": 0.1,
     "crumple25": 0.1,
     "shell-cube": 0.15,
@@ -38,10 +39,11 @@ EARLY = {
 LIMITS = {
     "links": {"stretch_end": 1.02, "stretch": 1.1, "height_mm": 0.2, "speed": 0.2},
     "block": {"height_mm": 0.2, "speed": 0.05},
+    "tower": {"height_mm": 1.0, "speed": 0.05},
     "soft": {"stretch_end": 1.1, "pierced_percent": 3.0, "below_mm": 1.0, "speed": 0.3},
 }
 """What a believable end of a play does not exceed."""
-_KINDS = {"cable": "links", "heap": "links", "ring": "links", "block": "block"}
+_KINDS = dict.fromkeys(("cable", "heap", "ring"), "links") | {"block": "block", "tower": "tower"}
 OVERLAP_MM = 1.0
 """Of two beads that lie on each other. Point masses of Newton never touch, which is said of them
 instead."""
@@ -70,7 +72,7 @@ def measure_play(
     values["hull_cm2"] = float(np.mean([_hull(end) for end in ends])) if ends.shape[1] > 3 else 0.0
     seen = list(zip(starts, tracks, strict=True))
     if isinstance(first, PeerScene) and first.cable is None:
-        values["height_mm"] = float(1e3 * np.abs(ends[:, 0, 2] - 0.02).max())
+        values["height_mm"] = float(1e3 * np.abs(ends[:, :, 2] - first.rest_heights).max())
         return values
     values["stretch"] = max(start.stretch(frame) for start, track in seen for frame in track)
     values["stretch_end"] = max(start.stretch(track[-1]) for start, track in seen)

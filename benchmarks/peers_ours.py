@@ -18,7 +18,6 @@ from warp_deform.objects import (
     add_box,
     add_cable,
     add_cloth,
-    l_block,
 )
 from warp_deform.peers import PeerScene, SoftScene
 from warp_deform.rollout import GripPath, rollout
@@ -27,7 +26,7 @@ from warp_deform.support.quaternion import quat_from_yaw
 from warp_deform.tasks.bag_physics import BAG_SOLVER
 from warp_deform.tasks.block import BlockNotarget
 from warp_deform.tasks.cable_physics import CABLE_SOLVER
-from warp_deform.tasks.cloth_physics import CLOTH_SOLVER
+from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 
 __all__ = ["OursSettings", "play_ours"]
 
@@ -86,8 +85,9 @@ def _add(builder: newton.ModelBuilder, start: Any) -> SolverConfig:
         if start.cable is not None:
             add_cable(builder, start.cable, start.beads)
             return CABLE_SOLVER
-        x, y, z = (float(v) for v in start.block_position)
-        add_box(builder, l_block(), (x, y, z), yaw=start.block_yaw)
+        assert start.block is not None
+        for (x, y, z), yaw in zip(start.positions.tolist(), start.yaws.tolist(), strict=True):
+            add_box(builder, start.block, (x, y, z), yaw=yaw)
         return BlockNotarget.solver
     if len(start.ring):
         add_bag(builder, BagConfig())
@@ -97,7 +97,7 @@ def _add(builder: newton.ModelBuilder, start: Any) -> SolverConfig:
     add_cloth(
         builder, ClothConfig(rows=rows, columns=rows, edge_contact=EDGE_CONTACT), start.vertices
     )
-    return CLOTH_SOLVER
+    return FABRIC_SOLVER
 
 
 def _play(
@@ -147,8 +147,8 @@ def _place(solver: SolverFusedXPBD, starts: list[Any]) -> None:
     data.reset()
     for w, start in enumerate(starts):
         if isinstance(start, PeerScene) and start.cable is None:
-            turn = quat_from_yaw(start.block_yaw)
-            data.set_bodies(w, np.array([[*start.block_position, *turn]]))
+            turns = quat_from_yaw(start.yaws)
+            data.set_bodies(w, np.column_stack([start.positions, turns]))
             continue
         particles = start.beads if isinstance(start, PeerScene) else start.vertices
         data.lane("particles.x", w)[:] = particles

@@ -17,6 +17,7 @@ from warp_deform.peers.mujoco_soft import MujocoSoftWorld
 from warp_deform.peers.newton_peer import NewtonWorld
 from warp_deform.peers.newton_soft import NewtonSoftWorld
 from warp_deform.peers.pybullet_peer import PyBulletWorld
+from warp_deform.peers.pybullet_soft import PyBulletSoftWorld
 
 __all__ = ["fine_tracks", "play", "starts_of"]
 
@@ -26,7 +27,7 @@ WORLDS = {
     "mujoco": (MujocoWorld, MujocoSoftWorld),
     "newton-vbd": (NewtonWorld, NewtonSoftWorld),
     "newton-xpbd": (NewtonWorld, None),
-    "pybullet": (PyBulletWorld, None),
+    "pybullet": (PyBulletWorld, PyBulletSoftWorld),
 }
 """Of cables and blocks, and of fabrics and bags."""
 

@@ -7,26 +7,28 @@ from typing import Any
 
 import matplotlib
 from peers_measures import believable
-from peers_settings import SCENES
+from peers_settings import SCENES, is_original
 
 __all__ = ["TOLERANCE", "cheapest", "draw", "error", "front", "picks", "table"]
 
 MOST_TIMED = 5
 LANES = "ours, 8 lanes"
 SHIPPED = ", as shipped"
+ORIGINAL = ", as the original"
 TOLERANCE = {
     "cable": 0.5,
     "heap": 7.0,
     "ring": 3.0,
     "block": 0.5,
-    "cloth10": 10.0,
-    "cloth25": 10.0,
+    "tower": 1.0,
+    "fold10": 5.0,
+    "fold25": 5.0,
     "crumple10": 4.0,
     "crumple25": 4.0,
     "shell-cube": 3.0,
 }
 """Error up to which settings count as equal [mm]."""
-_AT_THE_END = ("cable",)  # its places after a second do not depend on chance
+_AT_THE_END = ("cable", "tower")  # places after a second that do not depend on chance
 _COLOURS = {
     "ours": "black",
     LANES: "tab:grey",
@@ -34,6 +36,7 @@ _COLOURS = {
     "newton-vbd": "tab:green",
     "newton-xpbd": "tab:olive",
     "pybullet": "tab:red",
+    "pybullet, as the original": "tab:pink",
 }
 
 
@@ -44,19 +47,22 @@ def error(row: dict[str, Any]) -> float:
 
 
 def label(row: dict[str, Any]) -> str:
-    """The engine, ours in lanes apart."""
+    """The engine; ours in lanes apart, and PyBullet at the settings of the original environment."""
     lanes = row["settings"].get("lanes", 1)
-    return row["engine"] + (f", {lanes} lanes" if lanes > 1 else "")
+    original = ORIGINAL if is_original(row["engine"], row["scene"], row["settings"]) else ""
+    return row["engine"] + (f", {lanes} lanes" if lanes > 1 else original)
 
 
 def front(rows: list[dict[str, Any]], engine: str) -> list[dict[str, Any]]:
     """Of an engine's believable rows those that no other beats in both cost and error.
 
-    Ours keeps all of its steps, alone and in lanes.
+    Ours keeps all of its steps, alone and in lanes, and PyBullet the original's settings.
     """
     mine = [row for row in rows if row["engine"] == engine and row["errors"]["finite"]]
     if engine == "ours":
         return mine
+    original = [row for row in mine if label(row).endswith(ORIGINAL)]
+    mine = [row for row in mine if row not in original]
     best: list[dict[str, Any]] = []
     for row in sorted(filter(believable, mine), key=lambda row: row["ms"]):
         if not best or error(row) < 0.9 * error(best[-1]):
@@ -65,7 +71,7 @@ def front(rows: list[dict[str, Any]], engine: str) -> list[dict[str, Any]]:
         # the cheapest, the most exact, and some between them
         step = (len(best) - 1) / (MOST_TIMED - 1)
         best = [best[round(k * step)] for k in range(MOST_TIMED)]
-    return best
+    return [*best, *original]
 
 
 def cheapest(rows: list[dict[str, Any]], most: float) -> dict[str, Any] | None:
@@ -79,14 +85,16 @@ def picks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
     It is the cheapest believable setting whose error is within the scene's tolerance or, of an
     engine that has none, its most exact believable one; `equal` tells them apart. `least_ms` is of
-    the cheapest believable one, whatever its error. Ours also has rows of its tasks' substep.
+    the cheapest believable one, whatever its error. Ours also has rows of its tasks' substep, and
+    PyBullet one of the original's settings, which need not be believable.
     """
     out = []
     for scene in SCENES:
         timed = [row for row in rows if row["kind"] == "time" and row["scene"] == scene]
         engines: dict[str, list[dict[str, Any]]] = {}
-        for row in filter(believable, timed):
-            engines.setdefault(label(row), []).append(row)
+        for row in timed:
+            if believable(row) or label(row).endswith(ORIGINAL):
+                engines.setdefault(label(row), []).append(row)
         found = {name: cheapest(of, TOLERANCE[scene]) for name, of in engines.items()}
         ours = {name: row["ms"] for name, row in found.items() if row and name.startswith("ours")}
         shipped = {
@@ -99,7 +107,10 @@ def picks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         found |= {name: of[0] for name, of in shipped.items() if error(of[0]) <= TOLERANCE[scene]}
         found |= {name: None for name in shipped if name not in found}
         engines |= shipped
-        least = {name: min(row["ms"] for row in of) for name, of in engines.items()}
+        least = {
+            name: min((row["ms"] for row in of if believable(row)), default=None)
+            for name, of in engines.items()
+        }
         for name, of in engines.items():
             row = found[name] or min(of, key=error)
             out.append(
@@ -108,6 +119,7 @@ def picks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                     "engine": name,
                     "settings": _settings(row),
                     "equal": found[name] is not None,
+                    "believable": believable(row),
                     "ms": row["ms"],
                     "error_mm": error(row),
                     "stretch_end": row["errors"].get("stretch_end"),
@@ -115,10 +127,14 @@ def picks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                     "times_ours": row["ms"] / ours["ours"] if "ours" in ours else None,
                     "times_lanes": row["ms"] / ours[LANES] if LANES in ours else None,
                     "least_ms": least[name],
-                    "least_times_ours": least[name] / least["ours"] if "ours" in least else None,
+                    "least_times_ours": _ratio(least[name], least.get("ours")),
                 }
             )
     return out
+
+
+def _ratio(cost: float | None, ours: float | None) -> float | None:
+    return None if cost is None or ours is None else cost / ours
 
 
 def _as_shipped(row: dict[str, Any]) -> bool:
@@ -163,7 +179,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             f"{row['scene']}, {TOLERANCE[row['scene']]:g} mm",
             row["engine"],
             row["settings"],
-            _cell(row["error_mm"], ".2g") + ("" if row["equal"] else " (more)"),
+            _cell(row["error_mm"], ".2g") + _remark(row),
             _cell(row["stretch_end"], ".3f"),
             _cell(row["pierced_percent"], ".1f"),
             _cell(row["ms"], ".3g"),
@@ -174,6 +190,12 @@ def table(rows: list[dict[str, Any]]) -> str:
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _remark(row: dict[str, Any]) -> str:
+    if not row["believable"]:
+        return " (not believable)"
+    return "" if row["equal"] else " (more)"
 
 
 def _cell(value: float | None, form: str) -> str:

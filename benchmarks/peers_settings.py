@@ -17,15 +17,26 @@ from warp_deform.peers import (
     NewtonSettings,
     NewtonSoftSettings,
     PyBulletSettings,
+    PyBulletSoftSettings,
 )
 
-__all__ = ["ENGINES", "LANES", "SCENES", "STARTS", "fine", "grid", "settings_of"]
+__all__ = [
+    "ENGINES",
+    "LANES",
+    "SCENES",
+    "STARTS",
+    "fine",
+    "grid",
+    "is_original",
+    "settings_of",
+]
 
 LINKS = ("cable", "heap", "ring")
-SHEETS = ("cloth10", "crumple10", "crumple25", "cloth25", "shell-cube")
-SCENES = (*LINKS, "block", *SHEETS)
-STARTS = dict.fromkeys(SCENES, 3) | dict.fromkeys(SHEETS, 2)
-STARTS |= {"crumple25": 1, "cloth25": 1, "shell-cube": 1}
+BLOCKS = ("block", "tower")
+LARGE = ("fold25", "crumple25", "shell-cube")
+SHEETS = ("fold10", "crumple10", *LARGE)
+SCENES = (*LINKS, *BLOCKS, *SHEETS)
+STARTS = dict.fromkeys(SCENES, 3) | dict.fromkeys(SHEETS, 2) | dict.fromkeys(LARGE, 1)
 """Plays of a setting, each from another start."""
 LANES = 8
 OUR_RATES = (120, 240, 600, 1200, 2400, 4800)
@@ -48,7 +59,7 @@ def grid(engine: str, scene: str) -> list[Any]:
 
 def fine(engine: str, scene: str) -> Any:
     """The settings of an engine's own fine solution."""
-    soft, large = scene in SHEETS, scene in ("crumple25", "cloth25", "shell-cube")
+    soft, large = scene in SHEETS, scene in LARGE
     if engine == "ours":
         return OursSettings(hz=9600 if soft else 19200, precision="float64")
     if engine == "mujoco":
@@ -58,7 +69,7 @@ def fine(engine: str, scene: str) -> Any:
     if engine == "newton-vbd" and soft:
         return NewtonSoftSettings(substeps=20 if large else 30, iterations=10, contact_damping=10.0)
     if engine == "newton-vbd":
-        if scene == "block":
+        if scene in BLOCKS:
             return NewtonSettings(solver="vbd", beads="bodies", substeps=80, iterations=10)
         return NewtonSettings(
             solver="vbd",
@@ -70,6 +81,8 @@ def fine(engine: str, scene: str) -> Any:
         )
     if engine == "newton-xpbd":
         return NewtonSettings(solver="xpbd", beads="bodies", substeps=64, iterations=4)
+    if soft:
+        return PyBulletSoftSettings(hz=960 if large else 1920)
     return PyBulletSettings(hz=9600, world="rigid")
 
 
@@ -79,6 +92,14 @@ def settings_of(engine: str, scene: str, values: dict[str, Any]) -> Any:
     return kind(**values)
 
 
+def is_original(engine: str, scene: str, values: dict[str, Any]) -> bool:
+    """Whether the settings that a row tells are those of the original environment."""
+    if engine != "pybullet":
+        return False
+    original = PyBulletSoftSettings() if scene in SHEETS else PyBulletSettings()
+    return bool(settings_of(engine, scene, values) == original)
+
+
 def _ours(scene: str) -> list[OursSettings]:
     return [OursSettings(hz=hz, lanes=lanes) for lanes in (1, LANES) for hz in OUR_RATES]
 
@@ -86,7 +107,7 @@ def _ours(scene: str) -> list[OursSettings]:
 def _mujoco(scene: str) -> list[Any]:
     if scene in SHEETS:
         return _mujoco_soft(scene)
-    if scene == "block":
+    if scene in BLOCKS:
         return [
             MujocoSettings(
                 hz=hz, solver=solver, iterations=count, contact=contact, cone=cone, sleep=sleep
@@ -137,9 +158,10 @@ def _mujoco(scene: str) -> list[Any]:
 
 
 def _mujoco_soft(scene: str) -> list[MujocoSoftSettings]:
-    large = scene in ("cloth25", "crumple25", "shell-cube")
-    rates = (120, 240) if large else (120, 180, 240, 480, 960)
-    counts = (("CG", 10), ("CG", 20), *(() if large else (("CG", 50), ("Newton", 5))))
+    large = scene in LARGE
+    rates = (120, 240, 480) if large else (120, 180, 240, 480, 960)
+    counts = (("CG", 5), ("CG", 10), ("CG", 20))
+    counts += () if large else (("CG", 50), ("Newton", 5))
     first = [
         MujocoSoftSettings(hz=hz, solver=solver, iterations=count, contact=contact)
         for hz, (solver, count), contact in product(rates, counts, (2.0, 4.0))
@@ -164,7 +186,7 @@ def _mujoco_soft(scene: str) -> list[MujocoSoftSettings]:
                 {"stiff": 4.0},
             ),
         )
-        if not (scene not in ("cloth10", "cloth25") and "edges" in change)  # planar sheets only
+        if not (scene not in ("fold10", "fold25") and "edges" in change)  # planar sheets only
     ]
     return [*first, *more]
 
@@ -174,17 +196,17 @@ STIFFNESSES = ((1e3, 10.0), (1e4, 10.0), (1e4, 0.0))  # and damping of contacts
 
 def _newton_vbd(scene: str) -> list[Any]:
     if scene in SHEETS:
-        large = scene in ("cloth25", "crumple25", "shell-cube")
+        large = scene in LARGE
         steps = (4, 10) if large else (2, 4, 6, 10)
         return [
             NewtonSoftSettings(
                 substeps=count, iterations=each, stiffness=stiffness, contact_damping=damping
             )
             for count, each, (stiffness, damping) in product(
-                steps, (2, 6) if large else (2, 4), ((1e4, 10.0),) if large else STIFFNESSES
+                steps, (2, 6) if large else (2, 4), STIFFNESSES[1:2] if large else STIFFNESSES
             )
         ]
-    if scene == "block":
+    if scene in BLOCKS:
         return [
             NewtonSettings(
                 solver="vbd", beads="bodies", substeps=count, iterations=each, contact_stiffness=k
@@ -213,7 +235,7 @@ def _newton_vbd(scene: str) -> list[Any]:
 
 
 def _newton_xpbd(scene: str) -> list[NewtonSettings]:
-    if scene == "block":
+    if scene in BLOCKS:
         return [
             NewtonSettings(solver="xpbd", beads="bodies", substeps=count, iterations=each)
             for count, each in product((2, 4, 8, 16), (2, 4))
@@ -228,13 +250,13 @@ def _newton_xpbd(scene: str) -> list[NewtonSettings]:
 
 def _pybullet(scene: str) -> list[PyBulletSettings]:
     if scene in SHEETS:
-        return []  # at the original's settings it has rows of its own, in `benchmarks/physics.py`
+        return [PyBulletSoftSettings(hz=480), PyBulletSoftSettings(hz=240)]
     return [
         PyBulletSettings(hz=hz, iterations=count, world=world)
         for world, hz, count in product(
             ("rigid", "deformable"), (60, 120, 240, 480, 960), (5, 10, 50)
         )
-        if (world == "rigid" and (scene == "block" or (hz in (240, 480) and count < 50)))
+        if (world == "rigid" and (scene in BLOCKS or (hz in (240, 480) and count < 50)))
         or (hz, count) == (240, 50)
     ]
 

@@ -1,4 +1,4 @@
-"""What a simulated second of a cable, a heap, a ring or the block costs, falling and at rest."""
+"""What a simulated second of a cable, a heap, a ring or blocks costs, falling and at rest."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import newton
 import numpy as np
 
-from ..objects.box import add_box, l_block
+from ..objects.box import add_box
 from ..objects.cable import add_cable
 from ..peers import PeerScene, peer_scene
 from ..solver.solver import SolverFusedXPBD
@@ -45,8 +45,9 @@ def _solver(start: PeerScene, worlds: int, lanes: int) -> SolverFusedXPBD:
     if start.cable is not None:
         add_cable(one, start.cable, start.beads)
     else:
-        x, y, z = (float(v) for v in start.block_position)
-        add_box(one, l_block(), (x, y, z), yaw=start.block_yaw)
+        assert start.block is not None
+        for (x, y, z), yaw in zip(start.positions.tolist(), start.yaws.tolist(), strict=True):
+            add_box(one, start.block, (x, y, z), yaw=yaw)
     builder.replicate(one, worlds)
     config = CABLE_SOLVER if start.cable is not None else BlockNotarget.solver
     return SolverFusedXPBD(builder.finalize(device="cpu"), config, lanes=lanes)
@@ -59,8 +60,8 @@ def _place(solver: SolverFusedXPBD, starts: list[PeerScene]) -> None:
             solver.data.lane("particles.x", world)[:] = start.beads
             solver.data.lane("particles.v", world)[:] = 0.0
         else:
-            turn = quat_from_yaw(start.block_yaw)
-            solver.data.set_bodies(world, np.array([[*start.block_position, *turn]]))
+            turns = quat_from_yaw(start.yaws)
+            solver.data.set_bodies(world, np.column_stack([start.positions, turns]))
 
 
 def _play(scene: str, seconds: float, solver: SolverFusedXPBD, seeds: list[int]) -> Played:

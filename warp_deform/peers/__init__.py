@@ -8,7 +8,7 @@ from .mujoco_soft import MujocoSoftSettings, time_mujoco_soft
 from .newton_peer import NEWTON_SOLVERS, NewtonSettings, newton_settings, time_newton
 from .newton_soft import NewtonSoftSettings, time_newton_soft
 from .pybullet_peer import PyBulletSettings, time_pybullet
-from .pybullet_soft import time_pybullet_soft
+from .pybullet_soft import PyBulletSoftSettings, time_pybullet_soft
 from .registry import PEERS, SOFT_PEERS, check_peer, time_peer
 from .scene import PEER_SCENES, PeerScene, peer_scene
 from .soft_scene import SOFT_SCENES, SoftScene, soft_scene
@@ -27,6 +27,7 @@ __all__ = [
     "PeerScene",
     "PeerTiming",
     "PyBulletSettings",
+    "PyBulletSoftSettings",
     "SoftScene",
     "check_peer",
     "mujoco_settings",

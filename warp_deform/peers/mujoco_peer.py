@@ -13,7 +13,6 @@ from typing import Any, Literal
 import numpy as np
 
 from ..errors import InputError
-from ..objects.box import l_block
 from ..support.extras import install_extra
 from .scene import PeerScene
 from .timing import FRAME_RATE, PeerTiming, measure
@@ -79,6 +78,7 @@ _SETTINGS = {
     "heap": MujocoSettings(hz=480, solver="PGS", iterations=10),
     "ring": replace(_CABLE, hz=480),
     "block": MujocoSettings(hz=120, sleep=True, note="one rigid body of two boxes"),
+    "tower": MujocoSettings(hz=240, sleep=True, note="rigid boxes"),
 }
 """The cheapest believable ones that `benchmarks/peers.py` found."""
 
@@ -153,7 +153,7 @@ class MujocoWorld:
         self._mujoco = import_mujoco()
         self._settings = settings or mujoco_settings(scene.name)
         if scene.cable is None:
-            text = _block(scene, self._settings)
+            text = _blocks(scene, self._settings)
         else:
             text = _cable(scene, self._settings, held)
         self._model = self._mujoco.MjModel.from_xml_string(text)
@@ -216,9 +216,9 @@ def _cable(scene: PeerScene, settings: MujocoSettings, held: int | None = None) 
     )
 
 
-def _block(scene: PeerScene, settings: MujocoSettings) -> str:
-    block = l_block()
-    turn = (np.cos(scene.block_yaw / 2), 0, 0, np.sin(scene.block_yaw / 2))
+def _blocks(scene: PeerScene, settings: MujocoSettings) -> str:
+    block = scene.block
+    assert block is not None
     volumes = [np.prod(part.size) for part in block.parts]
     parts = [
         f'<geom type="box" size="{_numbers(np.divide(part.size, 2))}" '
@@ -226,13 +226,14 @@ def _block(scene: PeerScene, settings: MujocoSettings) -> str:
         f'friction="{block.friction} 0 0"/>'
         for part, volume in zip(block.parts, volumes, strict=True)
     ]
-    return _document(
-        settings,
-        body=f'<body pos="{_numbers(scene.block_position)}" quat="{_numbers(turn)}"><freejoint/>'
-        f"{''.join(parts)}</body>",
-        rest="",
-        table=0.0,
-    )
+    half = scene.yaws / 2
+    turns = np.column_stack([np.cos(half), 0 * half, 0 * half, np.sin(half)])
+    bodies = [
+        f'<body pos="{_numbers(position)}" quat="{_numbers(turn)}"><freejoint/>'
+        f"{''.join(parts)}</body>"
+        for position, turn in zip(scene.positions, turns, strict=True)
+    ]
+    return _document(settings, body="".join(bodies), rest="", table=0.0)
 
 
 def _document(settings: MujocoSettings, *, body: str, rest: str, table: float) -> str:

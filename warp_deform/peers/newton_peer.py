@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import InputError
-from ..objects.box import add_box, l_block
+from ..objects.box import add_box
 from .newton_frame import record_frame
 from .scene import PeerScene
 from .timing import FRAME_RATE, PeerTiming, measure
@@ -92,10 +92,9 @@ def newton_settings(solver: str, scene: str) -> NewtonSettings:
     if scene == "ring" and solver == "xpbd":
         # the closed chain falls stiffly on its edge: the cable's settings stretch it by 5 %
         return replace(settings, substeps=16, iterations=4)
-    if scene == "block":
-        return replace(
-            settings, beads="bodies", substeps=4, iterations=4, note="one rigid body of two boxes"
-        )
+    if scene in ("block", "tower"):
+        note = "one rigid body of two boxes" if scene == "block" else "rigid boxes"
+        return replace(settings, beads="bodies", substeps=4, iterations=4, note=note)
     return settings
 
 
@@ -143,7 +142,9 @@ class NewtonWorld:
         builder.default_shape_cfg.kd = settings.contact_damping or 0.0
         builder.add_ground_plane()
         if scene.cable is None:
-            add_box(builder, l_block(), tuple(scene.block_position), yaw=scene.block_yaw)
+            assert scene.block is not None
+            for (x, y, z), yaw in zip(scene.positions.tolist(), scene.yaws.tolist(), strict=True):
+                add_box(builder, scene.block, (x, y, z), yaw=yaw)
         elif settings.beads == "particles":
             _add_particles(builder, scene, settings)
         else:

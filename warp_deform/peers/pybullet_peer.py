@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 
 from ..errors import InputError
-from ..objects.box import l_block
 from ..support.extras import install_extra
 from .scene import PeerScene
 from .timing import FRAME_RATE, PeerTiming, measure
@@ -35,12 +34,15 @@ class PyBulletSettings:
     """The original opens a deformable world for every task; a rigid one is cheaper."""
 
     def __post_init__(self) -> None:
-        if self.hz < FRAME_RATE or self.hz % FRAME_RATE:
-            raise InputError(
-                f"PyBulletSettings.hz must be a multiple of {FRAME_RATE}, got {self.hz}"
-            )
-        if self.iterations < 1:
-            raise InputError(f"PyBulletSettings.iterations must be positive, got {self.iterations}")
+        check_steps("PyBulletSettings", self.hz, self.iterations)
+
+
+def check_steps(settings: str, hz: int, iterations: int) -> None:
+    """Refuse rates and counts that settings of that name cannot have."""
+    if hz < FRAME_RATE or hz % FRAME_RATE:
+        raise InputError(f"{settings}.hz must be a multiple of {FRAME_RATE}, got {hz}")
+    if iterations < 1:
+        raise InputError(f"{settings}.iterations must be positive, got {iterations}")
 
 
 _MAX_FORCE = 100.0  # [N]
@@ -100,7 +102,7 @@ class PyBulletWorld:
         bullet.setGravity(0, 0, -9.8, **self._client)
         bullet.setTimeStep(1 / settings.hz, **self._client)
         self._add_table()
-        self._bodies = self._add_block(scene) if scene.cable is None else self._add_beads(scene)
+        self._bodies = self._add_blocks(scene) if scene.cable is None else self._add_beads(scene)
 
     def _add_table(self) -> None:
         bullet = self._bullet
@@ -137,23 +139,28 @@ class PyBulletWorld:
             bullet.changeConstraint(joint, maxForce=_MAX_FORCE, **self._client)
         return bodies
 
-    def _add_block(self, scene: PeerScene) -> list[int]:
-        bullet, block = self._bullet, l_block()
+    def _add_blocks(self, scene: PeerScene) -> list[int]:
+        bullet, block = self._bullet, scene.block
+        assert block is not None
         shape = bullet.createCollisionShapeArray(
             shapeTypes=[bullet.GEOM_BOX] * len(block.parts),
             halfExtents=[tuple(side / 2 for side in part.size) for part in block.parts],
             collisionFramePositions=[part.offset for part in block.parts],
             **self._client,
         )
-        body = bullet.createMultiBody(
-            block.mass,
-            shape,
-            basePosition=tuple(scene.block_position),
-            baseOrientation=bullet.getQuaternionFromEuler((0, 0, scene.block_yaw)),
-            **self._client,
-        )
-        bullet.changeDynamics(body, -1, lateralFriction=block.friction, **self._client)
-        return [body]
+        bodies = [
+            bullet.createMultiBody(
+                block.mass,
+                shape,
+                basePosition=tuple(position),
+                baseOrientation=bullet.getQuaternionFromEuler((0, 0, yaw)),
+                **self._client,
+            )
+            for position, yaw in zip(scene.positions, scene.yaws, strict=True)
+        ]
+        for body in bodies:
+            bullet.changeDynamics(body, -1, lateralFriction=block.friction, **self._client)
+        return bodies
 
     def frame(self) -> None:
         """Advance by 1 / FRAME_RATE simulated seconds."""

@@ -10,11 +10,12 @@ of point-to-point constraints of at most 100 N.
 from __future__ import annotations
 
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from .pybullet_peer import import_pybullet
+from .pybullet_peer import check_steps, import_pybullet
 from .soft_scene import SoftScene
 from .soft_timing import measure_soft
 from .timing import FRAME_RATE, PeerTiming
@@ -22,7 +23,6 @@ from .timing import FRAME_RATE, PeerTiming
 __all__ = ["PyBulletSoftWorld"]  # the rest is imported from `warp_deform.peers`
 
 HZ = 480
-_ITERATIONS = 50  # PyBullet's default
 _BEAD_MASS, _BEAD_HALF = 0.01, 0.005  # [kg], [m]
 _MAX_FORCE = 100.0  # [N]
 _CUBE_MASS, _CUBE_HALF = 0.02, 0.018  # [kg], [m]
@@ -32,6 +32,18 @@ _NOTE = (
     "as the original: springs of stiffness 40, which stretch much, self-collision, friction 1; "
     "without the arm, which the original also steps: a weight of given velocity holds the vertex"
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PyBulletSoftSettings:
+    """How PyBullet runs a fabric or a bag; the defaults are the original's."""
+
+    hz: int = HZ
+    """Steps per second; a multiple of the frame rate."""
+    iterations: int = 50
+
+    def __post_init__(self) -> None:
+        check_steps("PyBulletSoftSettings", self.hz, self.iterations)
 
 
 def time_pybullet_soft(scene: str, *, seconds: float | None = None, repeats: int = 3) -> PeerTiming:
@@ -48,7 +60,7 @@ def time_pybullet_soft(scene: str, *, seconds: float | None = None, repeats: int
         seconds=seconds,
         repeats=repeats,
         hz=HZ,
-        iterations=_ITERATIONS,
+        iterations=PyBulletSoftSettings().iterations,
         note=_NOTE,
     )
 
@@ -56,15 +68,16 @@ def time_pybullet_soft(scene: str, *, seconds: float | None = None, repeats: int
 class PyBulletSoftWorld:
     """One fabric or bag in a PyBullet client of its own."""
 
-    def __init__(self, scene: SoftScene) -> None:
+    def __init__(self, scene: SoftScene, settings: PyBulletSoftSettings | None = None) -> None:
+        self._settings = settings = settings or PyBulletSoftSettings()
         self._bullet = bullet = import_pybullet()
         self._client = {"physicsClientId": bullet.connect(bullet.DIRECT)}
         bullet.setPhysicsEngineParameter(
-            enableFileCaching=0, numSolverIterations=_ITERATIONS, **self._client
+            enableFileCaching=0, numSolverIterations=settings.iterations, **self._client
         )
         bullet.resetSimulation(bullet.RESET_USE_DEFORMABLE_WORLD, **self._client)
         bullet.setGravity(0, 0, -_GRAVITY, **self._client)
-        bullet.setTimeStep(1 / HZ, **self._client)
+        bullet.setTimeStep(1 / settings.hz, **self._client)
         self._add_table()
         self._soft = self._add_mesh(scene)
         self._beads = self._add_beads(scene)
@@ -152,13 +165,14 @@ class PyBulletSoftWorld:
         self._tip = self._anchor = None
 
     def frame(self, target: np.ndarray | None = None) -> None:
-        """Advance by eight steps of 1/480 s."""
-        bullet, steps = self._bullet, HZ // FRAME_RATE
+        """Advance by 1 / FRAME_RATE simulated seconds."""
+        bullet, hz = self._bullet, self._settings.hz
+        steps = hz // FRAME_RATE
         for k in range(steps):
             if target is not None and self._tip is not None:
                 tip = bullet.getBasePositionAndOrientation(self._tip, **self._client)[0]
-                velocity = (target - tip) * HZ / (steps - k)
-                velocity[2] += _GRAVITY / HZ  # what the step takes away
+                velocity = (target - tip) * hz / (steps - k)
+                velocity[2] += _GRAVITY / hz  # what the step takes away
                 bullet.resetBaseVelocity(self._tip, tuple(velocity), (0, 0, 0), **self._client)
             bullet.stepSimulation(**self._client)
 

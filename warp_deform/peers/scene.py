@@ -13,16 +13,19 @@ from typing import Literal, get_args
 import numpy as np
 
 from ..errors import InputError
+from ..objects.box import BoxConfig, l_block
 from ..objects.cable import CableConfig, RingConfig, cable_ring
 
 __all__ = ["SceneName"]  # the rest is imported from `warp_deform.peers`
 
-SceneName = Literal["cable", "heap", "ring", "block"]
+SceneName = Literal["cable", "heap", "ring", "block", "tower"]
 PEER_SCENES: tuple[str, ...] = get_args(SceneName)
 
 _CENTRE = (0.5, 0.0)
 _NOISE = 1e-4  # [m]; a perfect stack of spheres stands, and a perfect ring folds in its plane
 _DROP = 0.05  # [m]; clear height under the block
+_CUBES = 5
+_GAP, _ASIDE = 0.005, 0.004  # [m]; clear height under each cube of the tower, and how far it is off
 _ROOM = 0.08  # [m]; radius of the disc that holds a crumpled cable
 _FALL = 0.01  # [m]; clear height under its lowest bead
 _TURN = 1.1  # [rad]; spread of the turn from link to link
@@ -31,28 +34,36 @@ _STEPS = 2000  # tries of a walk before another one begins
 
 @dataclass(frozen=True)
 class PeerScene:
-    """Where everything starts. A scene has either beads or one block.
+    """Where everything starts. A scene has either beads or blocks of one kind.
 
     Attributes:
-        name: "cable", "heap", "ring" or "block".
+        name: "cable", "heap", "ring", "block" or "tower".
         cable: What the beads are; None where the scene has none.
         beads: Bead centres (beads, 3) [m]; neighbours are one spacing apart.
         links: Pairs of linked beads (links, 2).
-        block_position: Origin of the L-block (3,) [m].
-        block_yaw: Its heading [rad].
+        block: What the blocks are; None where the scene has none.
+        positions: Origins of the blocks (blocks, 3) [m], from the lowest one.
+        yaws: Their headings (blocks,) [rad].
     """
 
     name: str
     cable: CableConfig | None
     beads: np.ndarray
     links: np.ndarray
-    block_position: np.ndarray
-    block_yaw: float
+    block: BoxConfig | None
+    positions: np.ndarray
+    yaws: np.ndarray
 
     @property
     def bodies(self) -> int:
         """Number of things that move."""
-        return max(1, len(self.beads))
+        return len(self.beads) + len(self.positions)
+
+    @property
+    def rest_heights(self) -> np.ndarray:
+        """Of the blocks' origins once they lie on the table, and on each other (blocks,) [m]."""
+        assert self.block is not None
+        return -self.block.lowest * (2 * np.arange(len(self.positions)) + 1)
 
     def stretch(self, beads: np.ndarray) -> float:
         """Longest link over its rest length for beads at (beads, 3) [m]; 1 without links."""
@@ -67,7 +78,8 @@ def peer_scene(name: str, *, seed: int = 0) -> PeerScene:
 
     The cable lies crumpled within 8 cm and drops by 1 cm, as it lies between two actions; the heap
     is the same cable as a vertical stack that falls into the tightest tangle there is; the ring
-    stands upright on its edge; the L-block hangs flat 5 cm above the table.
+    stands upright on its edge; the L-block hangs flat 5 cm above the table; five cubes of 4 cm hang
+    above each other, each turned at random and up to 4 mm aside, and fall into a tower that stands.
 
     Raises:
         InputError: there is no scene of that name.
@@ -77,6 +89,8 @@ def peer_scene(name: str, *, seed: int = 0) -> PeerScene:
     rng = np.random.default_rng(seed)
     yaw = float(rng.uniform(0, 2 * np.pi))
     cable: CableConfig | None = None
+    block: BoxConfig | None = None
+    positions, yaws = np.zeros((0, 3)), np.zeros(0)
     beads, links = np.zeros((0, 3)), np.zeros((0, 2), dtype=int)
     if name == "cable":
         cable = CableConfig()
@@ -87,10 +101,16 @@ def peer_scene(name: str, *, seed: int = 0) -> PeerScene:
     elif name == "ring":
         cable = RingConfig()
         beads = _upright_ring(cable, yaw, rng)
+    elif name == "block":
+        block, yaws = l_block(), np.array([yaw])
+        positions = np.array([[*_CENTRE, _DROP - block.lowest]])
+    else:
+        block, yaws = BoxConfig(friction=0.5), rng.uniform(0, 2 * np.pi, _CUBES)
+        positions = _tower(block, rng)
     if cable is not None:
         first = np.arange(cable.beads if cable.closed else cable.beads - 1)
         links = np.column_stack([first, (first + 1) % cable.beads])
-    return PeerScene(name, cable, beads, links, np.array([*_CENTRE, 0.02 + _DROP]), yaw)
+    return PeerScene(name, cable, beads, links, block, positions, yaws)
 
 
 def _crumple(cable: CableConfig, rng: np.random.Generator) -> np.ndarray:
@@ -124,6 +144,12 @@ def _stack(cable: CableConfig, rng: np.random.Generator) -> np.ndarray:
         step = target - beads[i - 1]
         beads[i] = beads[i - 1] + cable.spacing * step / np.linalg.norm(step)
     return beads
+
+
+def _tower(cube: BoxConfig, rng: np.random.Generator) -> np.ndarray:
+    number = np.arange(1, _CUBES + 1)
+    heights = number * _GAP - cube.lowest * (2 * number - 1)
+    return np.column_stack([_CENTRE + rng.uniform(-_ASIDE, _ASIDE, (_CUBES, 2)), heights])
 
 
 def _upright_ring(cable: CableConfig, yaw: float, rng: np.random.Generator) -> np.ndarray:

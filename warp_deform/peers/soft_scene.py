@@ -17,7 +17,16 @@ from ..objects.cloth import ClothConfig, cloth_sheet
 __all__ = ["SoftSceneName"]  # the rest is imported from `warp_deform.peers`
 
 SoftSceneName = Literal[
-    "cloth10", "cloth25", "cloth50", "crumple10", "crumple25", "bag", "bag-cube", "shell-cube"
+    "cloth10",
+    "cloth25",
+    "cloth50",
+    "fold10",
+    "fold25",
+    "crumple10",
+    "crumple25",
+    "bag",
+    "bag-cube",
+    "shell-cube",
 ]
 SOFT_SCENES: tuple[str, ...] = get_args(SoftSceneName)
 
@@ -27,6 +36,9 @@ _CLOTH_MASS = 0.5  # [kg]
 _SETTLE, _FOLD, _LIE = 0.8, 1.3, 1.2  # [s], as `bench.cloth` plays it
 _FOLD_TIMES = (0.0, 0.3, 1.0, _FOLD)  # [s]
 _LIFT, _LOW = 0.08, 0.01  # [m]; heights of the corner above where it lay
+_LAID, _TURNED, _FELL = 0.3, 1.0, 0.7  # [s]; of a fold along an arc: before, while, after
+_WAY, _SKEW = (0.12, 0.16), 0.2  # [m], [rad]; its length, and how far it is off the diagonal
+_ARC = 0.9  # height of that arc, as a share of a half circle's
 _STAND = 0.02  # [m]; clear height under a sheet that falls on its edge
 _ROLL, _LEAN = 0.3, 0.1  # [rad]; how far such a sheet is turned in its plane, and leans
 _CURVE = 0.2  # [m]; radius of the arc that it starts as: how a plane buckles is left to rounding
@@ -98,8 +110,10 @@ def soft_scene(name: str, *, seed: int = 0) -> SoftScene:
     """A start above the table; `seed` draws the direction of the fold or the tilt of the bag.
 
     The sheet of `cloth` falls flat by 3 cm, one corner is carried inwards, and it lies folded; that
-    of `crumple` is arched, falls almost upright on a corner and crumples. The bag falls with its
-    opening up and crumples: `bag` has the original's mesh, `shell-cube` that of the tasks.
+    of `fold` lies flat, and its corner follows the arc on which it turns about a crease without
+    drawing the sheet; that of `crumple` is arched, falls almost upright on a corner and crumples.
+    The bag falls with its opening up and crumples: `bag` has the original's mesh, `shell-cube` that
+    of the tasks.
 
     Raises:
         InputError: there is no scene of that name.
@@ -109,6 +123,8 @@ def soft_scene(name: str, *, seed: int = 0) -> SoftScene:
     rng = np.random.default_rng(seed)
     if name.startswith("cloth"):
         return _sheet(name, int(name.removeprefix("cloth")), rng)
+    if name.startswith("fold"):
+        return _turned_sheet(name, int(name.removeprefix("fold")), rng)
     if name.startswith("crumple"):
         return _upright_sheet(name, int(name.removeprefix("crumple")), rng)
     bag = _bag(name, rng)
@@ -134,6 +150,27 @@ def _sheet(name: str, rows: int, rng: np.random.Generator) -> SoftScene:
         knots=np.array([[0, 0, 0], [0, 0, _LIFT], [*way, _LIFT], [*way, _LOW]]),
         before=_SETTLE,
         after=_LIE,
+    )
+
+
+def _turned_sheet(name: str, rows: int, rng: np.random.Generator) -> SoftScene:
+    """A sheet that lies on the table, and a path of its corner that pulls at nothing else."""
+    flat = _sheet(name, rows, rng)
+    vertices = flat.vertices.copy()
+    vertices[:, 2] = _LOW
+    way, heading = rng.uniform(*_WAY), np.pi / 4 + rng.uniform(-_SKEW, _SKEW)
+    share = np.linspace(0, 1, 21)
+    # without a jerk at either end
+    turn = np.pi * share**2 * (3 - 2 * share)
+    along = way / 2 * (1 - np.cos(turn))
+    height = _ARC * way / 2 * np.sin(turn) + _LOW * turn / np.pi
+    return replace(
+        flat,
+        vertices=vertices,
+        times=_TURNED * share,
+        knots=np.column_stack([along * np.cos(heading), along * np.sin(heading), height]),
+        before=_LAID,
+        after=_FELL,
     )
 
 

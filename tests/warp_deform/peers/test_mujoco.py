@@ -63,7 +63,7 @@ def test_a_block_lands_flat_where_it_was_and_sleep_keeps_it_there():
     scene = peer_scene("block", seed=1)
     ends = [_played(scene, MujocoSettings(hz=240, sleep=sleep))[0] for sleep in (False, True)]
     assert ends[0][2] == pytest.approx(0.02, abs=2e-4)
-    assert np.abs(ends[0][:2] - scene.block_position[:2]).max() < 2e-3
+    assert np.abs(ends[0][:2] - scene.positions[0, :2]).max() < 2e-3
     assert ends[1] == pytest.approx(ends[0], abs=1e-4)
 
 

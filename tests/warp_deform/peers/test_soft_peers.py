@@ -210,7 +210,7 @@ def test_peers_without_self_contact_refuse_soft_scenes(scene):
     for peer in ("newton-xpbd", "newton-vbd-bodies"):
         with pytest.raises(InputError, match=f"{peer} does not run the scene '{scene}'"):
             time_peer(peer, scene)
-    with pytest.raises(InputError, match="cable, heap, ring, block, cloth10"):
+    with pytest.raises(InputError, match="cable, heap, ring, block, tower, cloth10"):
         time_peer("pybullet", scene + "0")
     with pytest.raises(InputError, match="cloth10, cloth25"):
         soft_scene(scene + "0")
