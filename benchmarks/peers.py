@@ -2,13 +2,15 @@
 
     python benchmarks/peers.py search [--scenes cable heap] [--engines mujoco]
     python benchmarks/peers.py time [--scenes cable] [--rounds 5]
+    python benchmarks/peers.py between [--scenes cable]
     python benchmarks/peers.py report [--pictures docs/images/peers.webp]
 
 `search` tries the settings of `peers_settings.py` and appends a row for each to
 `results/peers.jsonl`: its error against the engine's own fine solution, its faults, its cost. What
 has a row is not tried again. `time` takes from each engine what costs least at its error, and times
 all of them in turns, in one process, so that ratios compare neighbours in time; its rows keep the
-least of several rounds. `report` prints the table, and draws error over cost.
+least of several rounds. `between` measures how far the fine solutions of the engines are from ours:
+what they would not agree on at any cost. `report` prints the tables, and draws error over cost.
 
 Costs are milliseconds of process CPU time per simulated second and world, on one thread.
 """
@@ -22,7 +24,7 @@ import peers_report
 from peers_measures import believable, measure_play
 from peers_play import fine_tracks, play, starts_of
 from peers_rows import RESULTS, append, described, key, read
-from peers_settings import ENGINES, SCENES, grid, settings_of
+from peers_settings import ENGINES, SCENES, fine, grid, has_fine, settings_of
 
 from warp_deform.quiet import quiet_warp
 
@@ -34,7 +36,7 @@ MOST_SOFT = 40.0
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     verbs = parser.add_subparsers(dest="verb", required=True)
-    for verb in ("search", "time", "report"):
+    for verb in ("search", "time", "between", "report"):
         each = verbs.add_parser(verb)
         each.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
         each.add_argument("--results", type=Path, default=RESULTS)
@@ -53,9 +55,12 @@ def main() -> None:
     elif options.verb == "time":
         for scene in options.scenes:
             time_front(scene, options.results, options.rounds)
+    elif options.verb == "between":
+        for scene in options.scenes:
+            between(scene, options.results)
     else:
         rows = [row for row in read(options.results) if row["scene"] in options.scenes]
-        print(peers_report.table(rows))
+        print(peers_report.table(rows), peers_report.between_table(rows), sep="\n\n")
         if options.pictures:
             peers_report.draw(rows, options.pictures)
 
@@ -68,7 +73,7 @@ def search(engine: str, scene: str, results: Path) -> None:
         row = {"kind": "search", **described(engine, scene, settings)}
         if key(row) in known:
             continue
-        if reference is None:
+        if reference is None and has_fine(engine, scene):
             reference = fine_tracks(engine, scene)
         tracks, cost = play(engine, scene, settings, most=MOST.get(scene, MOST_SOFT))
         if engine == "ours":
@@ -98,6 +103,18 @@ def time_front(scene: str, results: Path, rounds: int) -> None:
         timed |= {"starts": 1, "rounds": rounds, "ms": least[key(row)]}
         append(timed | {"errors": row["errors"], "believable": believable(row)}, results)
         print(row["engine"], scene, settings, f"{least[key(row)]:.3g} ms", flush=True)
+
+
+def between(scene: str, results: Path) -> None:
+    """Compare the fine solution of each peer with ours."""
+    ours = fine_tracks("ours", scene)
+    for engine in ENGINES:
+        if engine == "ours" or not grid(engine, scene) or not has_fine(engine, scene):
+            continue
+        row = {"kind": "between", **described(engine, scene, fine(engine, scene))}
+        row |= {"errors": measure_play(starts_of(scene), fine_tracks(engine, scene), ours)}
+        append(row, results)
+        print(engine, scene, row["errors"], flush=True)
 
 
 if __name__ == "__main__":

@@ -28,13 +28,14 @@ EARLY = {
     "ring": 0.1,
     "block": 0.15,
     "tower": 0.2,
-    "fold10": 1.3,
-    "fold25": 1.3,
+    "fold10": 1.0,
+    "fold25": 1.0,
     "crumple10": 0.1,
     "crumple25": 0.1,
     "shell-cube": 0.15,
 }
-"""When the error is read [s]: after the first contacts; a fold's when the corner is let go."""
+"""When the error is read [s]: after the first contacts; a fold's when its flap has turned by 140
+degrees, before it lies down."""
 
 LIMITS = {
     "links": {"stretch_end": 1.02, "stretch": 1.1, "height_mm": 0.2, "speed": 0.2},

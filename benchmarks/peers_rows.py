@@ -12,7 +12,7 @@ from typing import Any
 
 from warp_deform.support.revision import running_revision
 
-__all__ = ["RESULTS", "append", "described", "key", "read"]
+__all__ = ["PACKAGES", "RESULTS", "append", "described", "key", "read"]
 
 RESULTS = Path(__file__).parent / "results" / "peers.jsonl"
 PACKAGES = {
@@ -68,6 +68,7 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
+@cache
 def _version(package: str) -> str:
     try:
         return version(package)

@@ -36,9 +36,10 @@ def _row(engine="mujoco", scene="heap", ms=1.0, error=0.5, **errors):
 
 def test_the_docs_show_what_was_measured():
     rows = peers_rows.read()
-    table = peers_report.table(rows)
-    assert table.count("\n") > 10
-    assert table in (ROOT / "docs" / "peers.md").read_text()
+    text = (ROOT / "docs" / "peers.md").read_text()
+    for table in (peers_report.table(rows), peers_report.between_table(rows)):
+        assert table.count("\n") > 8
+        assert table in text
 
 
 def test_rows_are_of_settings_that_are_searched_and_can_be_made_again():
@@ -46,7 +47,8 @@ def test_rows_are_of_settings_that_are_searched_and_can_be_made_again():
         settings = peers_settings.settings_of(row["engine"], row["scene"], row["settings"])
         again = peers_rows.described(row["engine"], row["scene"], settings)
         assert peers_rows.key(again) == peers_rows.key(row)
-        assert row["ms"] > 0 and row["commit"] and row["cpu"] and row["version"]
+        assert row["commit"] and row["cpu"] and row["version"]
+        assert row["kind"] == "between" or row["ms"] > 0
 
 
 def test_an_error_is_the_distance_to_the_fine_solution():
@@ -114,6 +116,40 @@ def test_the_cheapest_of_equal_error_is_picked_on_both_sides():
     assert mujoco["equal"] and mujoco["times_ours"] == pytest.approx(4)
     assert not bullet["equal"] and bullet["times_ours"] == pytest.approx(5)
     assert "20 (more)" in peers_report.table(rows)
+
+
+def test_the_original_s_settings_have_a_row_even_where_they_are_not_believable():
+    rows = [_row("ours", "cable", ms=2.0), _row("pybullet", "cable", ms=9.0, end_mm=0.1)]
+    rows[1]["settings"] = {"hz": 240, "iterations": 10, "world": "rigid"}
+    original = _row("pybullet", "cable", ms=90.0, stretch_end=1.3, end_mm=3.0)
+    original["settings"] = {"hz": 240, "iterations": 50, "world": "deformable"}
+    rows.append(original)
+    assert original in peers_report.front(rows, "pybullet")
+    found = {row["engine"]: row for row in peers_report.picks(rows)}
+    assert found["pybullet"]["ms"] == 9.0 and found["pybullet"]["least_ms"] == 9.0
+    row = found["pybullet, as the original"]
+    assert row["ms"] == 90.0 and not row["believable"] and row["least_ms"] is None
+    assert "3 (not believable)" in peers_report.table(rows)
+
+
+def test_a_tower_s_heights_are_those_of_cubes_on_each_other():
+    starts = [peer_scene("tower", seed=seed) for seed in range(2)]
+    ends = np.array([start.positions for start in starts])[:, None].repeat(60, axis=1)
+    ends[..., 2] = starts[0].rest_heights
+    assert peers_measures.measure_play(starts, ends, None)["height_mm"] == 0
+    ends[1, -1, 4, 2] -= 0.04
+    values = peers_measures.measure_play(starts, ends, None)
+    assert values["height_mm"] == pytest.approx(40)
+    row = _row(scene="tower") | {"errors": values}
+    assert not peers_measures.believable(row)
+
+
+def test_fine_solutions_of_two_engines_are_compared_when_errors_are_read():
+    rows = [_row("mujoco", "cable", error=9.0, end_mm=1.25), _row("mujoco", "ring", error=2.0)]
+    rows += [_row("newton-xpbd", "ring") | {"errors": {"finite": False}}]
+    assert peers_report.between_table(rows).count("\n") == 1
+    table = peers_report.between_table([row | {"kind": "between"} for row in rows])
+    assert table.splitlines()[2:] == ["| cable | 1.2 | - | - | - |", "| ring | 2 | - | none | - |"]
 
 
 def test_a_front_keeps_what_no_other_beats():

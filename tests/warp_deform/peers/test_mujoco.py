@@ -67,6 +67,45 @@ def test_a_block_lands_flat_where_it_was_and_sleep_keeps_it_there():
     assert ends[1] == pytest.approx(ends[0], abs=1e-4)
 
 
+def test_a_tower_stands_and_its_cubes_stay_over_each_other():
+    scene = peer_scene("tower", seed=1)
+    assert scene.bodies == 5 and scene.rest_heights == pytest.approx([0.02, 0.06, 0.1, 0.14, 0.18])
+    above = scene.positions[:, 2] - scene.rest_heights
+    assert above == pytest.approx(0.005 * np.arange(1, 6)), "each falls 5 mm onto the one below"
+    assert np.abs(scene.positions[:, :2] - [0.5, 0]).max() < 0.004
+    end = _played(scene)
+    assert end[:, 2] == pytest.approx(scene.rest_heights, abs=3e-4)
+    assert np.abs(end[:, :2] - scene.positions[:, :2]).max() < 2e-3
+
+
+@pytest.mark.parametrize("rows", [10, 25])
+def test_the_arc_of_a_fold_ends_where_it_mirrors_its_corner(rows):
+    for seed in range(5):
+        scene = soft_scene(f"fold{rows}", seed=seed)
+        assert np.ptp(scene.vertices[:, 2]) == 0 and len(scene.vertices) == rows**2
+        way = np.linalg.norm(scene.knots[-1, :2])
+        assert 0.12 <= way <= 0.16 and scene.knots[-1, 2] == pytest.approx(0.01)
+        assert abs(np.arctan2(*scene.knots[-1, 1::-1]) - np.pi / 4) <= 0.2
+        # nearer to the crease than the corner was, so that nothing is drawn over the table
+        crease = scene.knots[-1] / 2
+        assert np.linalg.norm(scene.knots - crease, axis=1).max() <= 1.02 * way / 2
+        assert np.diff(scene.knots[:, :2] @ scene.knots[-1, :2]).min() > 0
+
+
+def test_a_fold_along_an_arc_does_not_draw_the_sheet():
+    scene = soft_scene("fold10", seed=1)
+    world = MujocoSoftWorld(scene, MujocoSoftSettings(hz=240, iterations=10))
+    lying = scene.vertices
+    _, stretch = play_frames(world, scene, round(60 * (scene.before + scene.held)))
+    folded = world.vertices()
+    assert np.linalg.norm(folded[0, :2] - (lying[0] + scene.knots[-1])[:2]) < 5e-3
+    way = scene.knots[-1, :2]
+    # well beyond the crease
+    still = (lying - lying[0])[:, :2] @ way > 1.2 * way @ way
+    assert still.sum() > 30 and stretch < 1.15
+    assert np.linalg.norm((folded - lying)[still, :2], axis=1).max() < 2e-3
+
+
 def test_a_corner_is_carried_to_where_it_was_told_and_stays_folded():
     scene = soft_scene("cloth10")
     world = MujocoSoftWorld(scene)
