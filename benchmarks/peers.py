@@ -30,7 +30,7 @@ from warp_deform.quiet import quiet_warp
 
 MOST = {"cable": 6.0, "heap": 6.0, "ring": 6.0, "block": 3.0, "tower": 3.0}
 """CPU seconds after which a setting is given up: it is many times dearer than what wins."""
-MOST_SOFT = 40.0
+MOST_SOFT = 60.0
 
 
 def main() -> None:

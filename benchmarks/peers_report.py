@@ -21,12 +21,12 @@ TOLERANCE = {
     "heap": 7.0,
     "ring": 3.0,
     "block": 0.5,
-    "tower": 1.0,
+    "tower": 1.5,
     "fold10": 7.0,
     "fold25": 7.0,
     "crumple10": 4.0,
     "crumple25": 4.0,
-    "shell-cube": 3.0,
+    "shell-cube": 7.0,
 }
 """Error up to which settings count as equal [mm]."""
 _AT_THE_END = ("cable", "tower")  # places after a second that do not depend on chance

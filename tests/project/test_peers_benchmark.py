@@ -20,6 +20,10 @@ import peers_settings
 from warp_deform.peers import peer_scene, soft_scene
 
 
+ONE_RATE = {("pybullet", scene) for scene in ("fold25", "crumple25", "shell-cube")}
+"""The original's alone: a play takes the better part of a minute."""
+
+
 def _row(engine="mujoco", scene="heap", ms=1.0, error=0.5, **errors):
     faults = {"stretch": 1.0, "stretch_end": 1.0, "height_mm": 0.0, "overlap_mm": 0.0, "speed": 0.0}
     settings = {"lanes": 1, "hz": 1200} if engine == "ours" else {"hz": 240, "iterations": 9}
@@ -171,7 +175,7 @@ def test_every_grid_holds_several_steps_and_no_setting_twice(scene):
         grid = peers_settings.grid(engine, scene)
         assert len(grid) == len(set(grid))
         rates = {getattr(s, "hz", getattr(s, "substeps", None)) for s in grid}
-        assert not grid or len(rates) >= 2
+        assert not grid or len(rates) >= 2 or (engine, scene) in ONE_RATE
         assert all(s == replace(s) for s in grid)
         assert peers_settings.fine(engine, scene) not in grid
 

@@ -78,7 +78,7 @@ _SETTINGS = {
     "heap": MujocoSettings(hz=480, solver="PGS", iterations=10),
     "ring": replace(_CABLE, hz=480),
     "block": MujocoSettings(hz=120, sleep=True, note="one rigid body of two boxes"),
-    "tower": MujocoSettings(hz=240, sleep=True, note="rigid boxes"),
+    "tower": MujocoSettings(hz=120, sleep=True, note="rigid boxes"),
 }
 """The cheapest believable ones that `benchmarks/peers.py` found."""
 

@@ -73,7 +73,7 @@ def test_a_tower_stands_and_its_cubes_stay_over_each_other():
     above = scene.positions[:, 2] - scene.rest_heights
     assert above == pytest.approx(0.005 * np.arange(1, 6)), "each falls 5 mm onto the one below"
     assert np.abs(scene.positions[:, :2] - [0.5, 0]).max() < 0.004
-    end = _played(scene)
+    end = _played(scene, MujocoSettings(hz=240))
     assert end[:, 2] == pytest.approx(scene.rest_heights, abs=3e-4)
     assert np.abs(end[:, :2] - scene.positions[:, :2]).max() < 2e-3
 
