@@ -87,7 +87,7 @@ def picks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     It is the cheapest believable setting whose error is within the scene's tolerance or, of an
     engine that has none, its most exact believable one; `equal` tells them apart. `least_ms` is of
     the cheapest believable one, whatever its error. Ours also has rows of its tasks' substep, and
-    PyBullet one of the original's settings, which need not be believable.
+    PyBullet one of the original's settings, believable or not.
     """
     out = []
     for scene in SCENES:
@@ -97,23 +97,21 @@ def picks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             if believable(row) or label(row).endswith(ORIGINAL):
                 engines.setdefault(label(row), []).append(row)
         found = {name: cheapest(of, TOLERANCE[scene]) for name, of in engines.items()}
+        shown = {name: found[name] or _most_exact(of) for name, of in engines.items()}
         ours = {name: row["ms"] for name, row in found.items() if row and name.startswith("ours")}
         shipped = {
-            name + SHIPPED: of
-            for name, rows_of in engines.items()
-            if name.startswith("ours")
-            and (of := [r for r in rows_of if _as_shipped(r)])
-            and of[0] is not found[name]
+            label(row) + SHIPPED: [row]
+            for row in timed
+            if _as_shipped(row) and row is not shown.get(label(row))
         }
-        found |= {name: of[0] for name, of in shipped.items() if error(of[0]) <= TOLERANCE[scene]}
-        found |= {name: None for name in shipped if name not in found}
+        found |= {name: cheapest(of, TOLERANCE[scene]) for name, of in shipped.items()}
         engines |= shipped
         least = {
             name: min((row["ms"] for row in of if believable(row)), default=None)
             for name, of in engines.items()
         }
         for name, of in engines.items():
-            row = found[name] or min(of, key=lambda row: (error(row), row["ms"]))
+            row = found[name] or _most_exact(of)
             out.append(
                 {
                     "scene": scene,
@@ -134,13 +132,17 @@ def picks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return out
 
 
+def _most_exact(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    return min(rows, key=lambda row: (error(row), row["ms"]))
+
+
 def _ratio(cost: float | None, ours: float | None) -> float | None:
     return None if cost is None or ours is None else cost / ours
 
 
 def _as_shipped(row: dict[str, Any]) -> bool:
-    """Whether ours has the substep of its tasks."""
-    return row["settings"]["hz"] == 1200
+    """Whether it is ours, with the substep of its tasks."""
+    return bool(row["engine"] == "ours" and row["settings"]["hz"] == 1200)
 
 
 def _settings(row: dict[str, Any]) -> str:

@@ -19,7 +19,6 @@ import peers_settings
 
 from warp_deform.peers import peer_scene, soft_scene
 
-
 ONE_RATE = {("pybullet", scene) for scene in ("fold25", "crumple25", "shell-cube")}
 """The original's alone: a play takes the better part of a minute."""
 
@@ -133,6 +132,11 @@ def test_the_original_s_settings_have_a_row_even_where_they_are_not_believable()
     assert found["pybullet"]["ms"] == 9.0 and found["pybullet"]["least_ms"] == 9.0
     row = found["pybullet, as the original"]
     assert row["ms"] == 90.0 and not row["believable"] and row["least_ms"] is None
+    # and so has the substep of our tasks
+    assert "ours, as shipped" not in found
+    rows[0] = _row("ours", "cable", ms=2.0, stretch_end=1.3, end_mm=0.1)
+    row = next(row for row in peers_report.picks(rows) if row["engine"] == "ours, as shipped")
+    assert row["ms"] == 2.0 and not row["believable"] and row["times_ours"] is None
     assert "3 (not believable)" in peers_report.table(rows)
 
 
