@@ -167,6 +167,14 @@ def test_a_recorded_newton_frame_moves_like_an_eager_one(monkeypatch):
 
 
 @needs_pybullet
+def test_cubes_fall_into_a_tower_that_stands_in_pybullet_too():
+    scene = peer_scene("tower", seed=2)
+    ends = _heap(PyBulletWorld(scene))
+    assert ends[:, 2] == pytest.approx(scene.rest_heights, abs=1e-3)
+    assert np.abs(ends[:, :2] - scene.positions[:, :2]).max() < 2e-3
+
+
+@needs_pybullet
 @pytest.mark.compiles("newton-vbd")
 def test_the_block_lands_flat_in_every_engine():
     scene = peer_scene("block", seed=1)

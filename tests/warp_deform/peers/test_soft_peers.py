@@ -11,7 +11,13 @@ from fixtures.cloth_scenes import piercing
 from warp_deform import bench
 from warp_deform.bench import cloth as bench_cloth
 from warp_deform.errors import InputError, WarpDeformError
-from warp_deform.peers import SOFT_SCENES, NewtonSoftSettings, soft_scene, time_peer
+from warp_deform.peers import (
+    SOFT_SCENES,
+    NewtonSoftSettings,
+    PyBulletSoftSettings,
+    soft_scene,
+    time_peer,
+)
 from warp_deform.peers.newton_soft import NewtonSoftWorld
 from warp_deform.peers.pybullet_soft import PyBulletSoftWorld
 from warp_deform.peers.soft_timing import measure_soft, play_frames
@@ -125,6 +131,16 @@ def test_newton_s_bag_crumples_around_the_cube():
 
 
 @needs_pybullet
+def test_a_tip_of_pybullet_arrives_at_another_rate_too():
+    scene = soft_scene("fold10")
+    world = PyBulletSoftWorld(scene, PyBulletSoftSettings(hz=240))
+    _after_play(world, scene, scene.before + scene.held)
+    aim = scene.vertices[0] + scene.knots[-1]
+    assert np.linalg.norm((world.vertices()[0] - aim)[:2]) < 2e-3
+    world.close()
+
+
+@needs_pybullet
 def test_pybullet_s_bag_crumples_around_the_cube_and_keeps_its_beads():
     world = _check_bag(PyBulletSoftWorld, 0.3)
     beads = world.beads()
@@ -216,6 +232,9 @@ def test_peers_without_self_contact_refuse_soft_scenes(scene):
         soft_scene(scene + "0")
     with pytest.raises(InputError, match="even"):
         NewtonSoftSettings(substeps=3)
+    for wrong in ({"hz": 100}, {"iterations": 0}):
+        with pytest.raises(InputError, match=f"PyBulletSoftSettings.{next(iter(wrong))}"):
+            PyBulletSoftSettings(**wrong)
 
 
 @needs_pybullet
