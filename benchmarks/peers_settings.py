@@ -74,7 +74,14 @@ def fine(engine: str, scene: str) -> Any:
         )
     if engine == "newton-vbd":
         if scene in BLOCKS:
-            return NewtonSettings(solver="vbd", beads="bodies", substeps=80, iterations=10)
+            return NewtonSettings(
+                solver="vbd",
+                beads="bodies",
+                substeps=32,
+                iterations=10,
+                contact_stiffness=1e4,
+                contact_damping=1.0,
+            )
         return NewtonSettings(
             solver="vbd",
             beads="particles",
@@ -229,19 +236,16 @@ def _newton_vbd(scene: str) -> list[Any]:
     if scene in BLOCKS:
         return [
             NewtonSettings(
-                solver="vbd", beads="bodies", substeps=count, iterations=each, contact_stiffness=k
-            )
-            for count, each, k in product((2, 4, 8), (1, 2), (1e4, 1e5))
-        ] + [
-            NewtonSettings(
                 solver="vbd",
                 beads="bodies",
                 substeps=count,
                 iterations=each,
-                contact_stiffness=1e4,
+                contact_stiffness=stiffness,
                 contact_damping=damping,
             )
-            for count, each, damping in product((4, 8, 16), (2, 8), (10.0, 100.0))
+            for (count, each), stiffness, damping in product(
+                ((2, 1), (2, 2), (4, 2), (8, 2), (8, 4), (16, 8)), (1e3, 1e4), (0.0, 1.0, 10.0)
+            )
         ]
     particles = [
         NewtonSettings(

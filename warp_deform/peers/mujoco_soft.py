@@ -45,7 +45,11 @@ class MujocoSoftSettings(MujocoSettings):
     note: str = _NOTE
 
 
-_SETTINGS = {"crumple10": MujocoSoftSettings(hz=180, iterations=10)}
+_SETTINGS = {
+    "crumple10": MujocoSoftSettings(hz=180, iterations=10),
+    **dict.fromkeys(("fold10", "fold25"), MujocoSoftSettings(hz=120, iterations=10)),
+    **dict.fromkeys(("crumple25", "shell-cube"), MujocoSoftSettings(hz=240, iterations=10)),
+}
 """Of scenes for which a search found cheaper ones than the defaults."""
 
 

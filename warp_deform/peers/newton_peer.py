@@ -144,7 +144,9 @@ class NewtonWorld:
         if scene.cable is None:
             assert scene.block is not None
             for (x, y, z), yaw in zip(scene.positions.tolist(), scene.yaws.tolist(), strict=True):
-                add_box(builder, scene.block, (x, y, z), yaw=yaw)
+                for shape in add_box(builder, scene.block, (x, y, z), yaw=yaw).shapes:
+                    builder.shape_material_ke[shape] = settings.contact_stiffness
+                    builder.shape_material_kd[shape] = settings.contact_damping or 0.0
         elif settings.beads == "particles":
             _add_particles(builder, scene, settings)
         else:
