@@ -22,6 +22,7 @@ from warp_deform.peers import (
 )
 
 __all__ = [
+    "BLOCKS",
     "ENGINES",
     "LANES",
     "SCENES",

@@ -114,7 +114,7 @@ def test_the_cheapest_of_equal_error_is_picked_on_both_sides():
     rows += [_row("pybullet", ms=9.0, error=30.0), _row("pybullet", ms=10.0, error=20.0)]
     for row in rows[-2:]:
         row["settings"]["world"] = "rigid"
-    ours, mujoco, bullet = peers_report.picks(rows)
+    mujoco, bullet, ours = peers_report.picks(rows)
     assert ours["engine"] == "ours" and ours["ms"] == 2.0 and ours["times_ours"] == 1
     assert mujoco["equal"] and mujoco["times_ours"] == pytest.approx(4)
     assert not bullet["equal"] and bullet["times_ours"] == pytest.approx(5)
