@@ -71,7 +71,9 @@ def front(rows: list[dict[str, Any]], engine: str) -> list[dict[str, Any]]:
     if len(best) > MOST_TIMED:
         # the cheapest, the most exact, and some between them
         step = (len(best) - 1) / (MOST_TIMED - 1)
-        best = [best[round(k * step)] for k in range(MOST_TIMED)]
+        kept = [best[round(k * step)] for k in range(MOST_TIMED)]
+        equal = cheapest(best, TOLERANCE[best[0]["scene"]])
+        best = kept if equal is None or equal in kept else [*kept, equal]
     return [*best, *original]
 
 

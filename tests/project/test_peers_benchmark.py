@@ -167,6 +167,11 @@ def test_a_front_keeps_what_no_other_beats():
     many = [replace_ms(_row(error=0.5**k), 1.0 + k) for k in range(30)]
     kept = peers_report.front(many, "mujoco")
     assert len(kept) == peers_report.MOST_TIMED and kept[0] == many[0] and kept[-1] == many[-1]
+    # and that which the table asks for
+    many = [replace_ms(_row(error=20 * 0.8**k), 1.0 + k) for k in range(30)]
+    equal = peers_report.cheapest(many, peers_report.TOLERANCE["heap"])
+    kept = peers_report.front(many, "mujoco")
+    assert equal in kept and len(kept) == peers_report.MOST_TIMED + 1
 
 
 def replace_ms(row, ms):
