@@ -38,7 +38,7 @@ def run(
     seconds: float | None = None,
     repeats: int = 5,
 ) -> dict[str, Any]:
-    """Time `scene` ("cable", "heap", "ring", "block", a fabric or a bag), and `peer` beside it.
+    """Time `scene` ("cable", "heap", "ring", "block", "tower", a sheet or a bag), and `peer` too.
 
     The fabrics are those of `bench.cloth`, with at most 16 worlds (4 of 50 rows); their figure is
     the mean over settling, one fold and lying folded, ours and the peer's.

@@ -235,11 +235,13 @@ class BenchOptions(CommandOptions):
     """Time one simulated second of a scene; compiling is timed apart."""
 
     scene: Literal[
-        "cable", "heap", "ring", "block", "cloth10", "cloth25", "cloth50",
+        "cable", "heap", "ring", "block", "tower", "cloth10", "cloth25", "cloth50",
         "cloth10-edges", "cloth25-edges", "cloth50-edges", "bag", "bag-cube",
     ] = "cable"  # fmt: skip
     """What is simulated."""
-    peer: Literal["pybullet", "newton-vbd", "newton-vbd-bodies", "newton-xpbd"] | None = None
+    peer: (
+        Literal["pybullet", "mujoco", "newton-vbd", "newton-vbd-bodies", "newton-xpbd"] | None
+    ) = None
     """Another simulator to time on the same scene."""
 
 

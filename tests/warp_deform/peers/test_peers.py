@@ -2,14 +2,18 @@
 
 import importlib.util
 import sys
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 
+from warp_deform import bench
+from warp_deform.command.verbs import BenchOptions
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.peers import (
     NEWTON_SOLVERS,
     PEER_SCENES,
+    PEERS,
     NewtonSettings,
     newton_settings,
     peer_scene,
@@ -108,6 +112,13 @@ def test_unknown_names_are_refused():
         NewtonSettings(solver="xpbd", beads="bodies", substeps=3, iterations=2)
     with pytest.raises(InputError, match="iterations"):
         NewtonSettings(solver="xpbd", beads="bodies", substeps=4, iterations=3)
+
+
+def test_the_command_offers_every_scene_and_every_peer():
+    hints = get_type_hints(BenchOptions)
+    assert get_args(hints["scene"]) == bench.SCENES
+    offered = next(each for each in get_args(hints["peer"]) if each is not type(None))
+    assert set(get_args(offered)) == set(PEERS)
 
 
 def test_missing_pybullet_names_the_extra(monkeypatch):
