@@ -239,9 +239,9 @@ class BenchOptions(CommandOptions):
         "cloth10-edges", "cloth25-edges", "cloth50-edges", "bag", "bag-cube",
     ] = "cable"  # fmt: skip
     """What is simulated."""
-    peer: (
-        Literal["pybullet", "mujoco", "newton-vbd", "newton-vbd-bodies", "newton-xpbd"] | None
-    ) = None
+    peer: Literal["pybullet", "mujoco", "newton-vbd", "newton-vbd-bodies", "newton-xpbd"] | None = (
+        None
+    )
     """Another simulator to time on the same scene."""
 
 
