@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import ast
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,8 @@ class Row:
     task: str
     by: str
     settings: dict[str, Any]
+    changed: str
+    """The same in words."""
     first_seed: int
     attempts: int
     successes: int
@@ -59,8 +61,6 @@ class Row:
     """Mean actions of each stage in the successes; None where a task has one stage."""
     ends: dict[str, int]
     """How episodes ended."""
-    actions_solved: list[int] = field(default_factory=list)
-    """Of every success, by seed."""
 
 
 def changed(name: str, settings: dict[str, Any]) -> Task:
@@ -72,6 +72,17 @@ def changed(name: str, settings: dict[str, Any]) -> Task:
         old = values.get(first, getattr(kind, first))  # a wrong name is an AttributeError
         values[first] = replace(old, **{rest: value}) if rest else value
     return type(kind.__name__, (kind,), values)()
+
+
+def words(settings: dict[str, Any]) -> str:
+    """Settings as the table prints them.
+
+    Examples:
+        >>> words({"bag.ring_stiffness": 120.0, "pushes": 0})
+        'bag.ring_stiffness=120; pushes=0'
+    """
+    texts = {n: f"{v:g}" if isinstance(v, int | float) else str(v) for n, v in settings.items()}
+    return "; ".join(f"{name}={text}" for name, text in texts.items()) or "nothing"
 
 
 def measure(name: str, by: str, settings: dict[str, Any], first: int, count: int) -> Row:
@@ -104,6 +115,7 @@ def measure(name: str, by: str, settings: dict[str, Any], first: int, count: int
         task=name,
         by=by,
         settings=settings,
+        changed=words(settings),
         first_seed=first,
         attempts=count,
         successes=len(solved),
@@ -115,7 +127,6 @@ def measure(name: str, by: str, settings: dict[str, Any], first: int, count: int
         opening=float(np.median(openings)) if openings else None,
         stages_solved=stages,
         ends={end: ends.count(end) for end in sorted(set(ends))},
-        actions_solved=[len(run.actions) for run in sorted(solved, key=lambda run: run.seed)],
     )
 
 
@@ -145,9 +156,8 @@ def main() -> None:
 
 
 def _line(row: Row) -> str:
-    says = ", ".join(f"{k}={v}" for k, v in row.settings.items()) or "as it is"
     rate = 100 * row.successes / row.attempts
-    line = f"{row.task} {row.by} {says}: {row.successes}/{row.attempts} = {rate:.1f} %"
+    line = f"{row.task} {row.by} {row.changed}: {row.successes}/{row.attempts} = {rate:.1f} %"
     if row.mean_actions_solved is not None:
         line += f", {row.mean_actions_solved:.2f} +- {row.deviation_solved:.2f} actions"
         line += f" (median {row.median_actions_solved:g})"
