@@ -241,11 +241,14 @@ def _cell(value: float | None, form: str) -> str:
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Error over cost, a panel a scene: lines are what was timed, crosses are not believable."""
+    """Error over cost, a panel a scene: lines are what was timed, crosses are not believable.
+
+    What has no known error is left out.
+    """
     matplotlib.use("Agg")
     from matplotlib import pyplot, ticker
 
-    timed = [row for row in rows if row["kind"] == "time"]
+    timed = [row for row in rows if row["kind"] == "time" and error(row) < float("inf")]
     scenes = [scene for scene in SCENES if any(row["scene"] == scene for row in timed)]
     columns = min(3, len(scenes))
     lines = -(-len(scenes) // columns)
@@ -256,7 +259,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         for name, colour in _COLOURS.items():
             mine = sorted(
                 (row for row in timed if row["scene"] == scene and label(row) == name),
-                key=lambda row: row["ms"],
+                key=lambda row: row["settings"]["hz"] if row["engine"] == "ours" else row["ms"],
             )
             if not mine:
                 continue
@@ -274,6 +277,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         panel.axhline(TOLERANCE[scene], color="0.8", linewidth=0.8, zorder=0)
         panel.set_title(scene)
         panel.grid(which="major", alpha=0.3)
+        panel.tick_params(labelsize=8)
         for axis in (panel.xaxis, panel.yaxis):
             axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
             axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
