@@ -237,7 +237,7 @@ def _error(row: dict[str, Any]) -> str:
 
 
 def _cell(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+    return "-" if value is None else format(value, form if value < 1000 else ",.0f")
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
@@ -282,7 +282,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
             axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
             axis.set_minor_formatter(ticker.NullFormatter())
-    for panel in panels[-1]:
+    for panel in list(panels.flat)[len(scenes) - columns : len(scenes)]:
         panel.set_xlabel("CPU ms per simulated second and world")
     for panel in panels[:, 0]:
         panel.set_ylabel("error, mm")
