@@ -213,22 +213,23 @@ class Served:
             self._in_loop(self._deliver, None if everyone else asked.tab, message)
 
         self._session.stop.clear()
+        urgent = asked.job.do in self._session.urgent
+        if asked.tab is not None and urgent:
+            # before it is done, not after: who says it again has seen what it did, and means more
+            asked.tab.urges = False
         try:
             self._session.do(asked.job, post)
         except WarpDeformError as error:
             post(_note(str(error)), everyone=False)
-        if asked.tab is not None:
-            self._in_loop(self._done, asked)
+        if asked.tab is not None and not urgent:
+            self._in_loop(self._done)
 
     def _in_loop(self, call: Callable[..., Any], *arguments: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed: nobody listens any more
             self._loop.call_soon_threadsafe(call, *arguments)
 
-    def _done(self, asked: _Asked) -> None:
-        if asked.tab is not None and asked.job is not None and asked.job.do in self._session.urgent:
-            asked.tab.urges = False
-        else:
-            self._waiting -= 1
+    def _done(self) -> None:
+        self._waiting -= 1
 
     def _greet(self, tab: _Tab, messages: list[bytes]) -> None:
         if tab in self._tabs:

@@ -218,6 +218,24 @@ def test_what_is_urgent_waits_for_nothing_that_waits(server, tab):
         assert hear(tab, "halted")["total"] == before + MOST_JOBS - 1
 
 
+def test_what_is_urgent_and_said_again_while_it_is_done_is_done_again(server, tab, monkeypatch):
+    """The first may have answered a question, and the second be meant for what moves now."""
+    do, go_on = server.session.do, threading.Event()
+
+    def slowly(job, post):
+        do(job, post)
+        assert go_on.wait(20)
+
+    monkeypatch.setattr(server.session, "do", slowly)
+    say(tab, do="halt")
+    hear(tab, "halted")  # it is in hand still
+    say(tab, do="halt")
+    say(tab, do="add", number="many")
+    hear(tab, "note")  # what was said before that has been taken
+    go_on.set()
+    hear(tab, "halted")
+
+
 def test_a_tab_that_does_not_read_is_cut_off_and_greeted_anew(server, tab):
     """No other tab waits for it, and no more than so many messages are kept for it."""
     with server.tab(max_queue=1) as deaf:
