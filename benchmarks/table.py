@@ -4,9 +4,9 @@
                                [--work FOLDER] [--out FOLDER] [--list]
 
 A cell is a task, an agent, a number of demonstrations and a seed of training. Results are written
-under OUT/runs when a cell ends, and a cell with a result is left out: the command goes on after an
-interruption, and on another machine with nothing but OUT. Runs and demonstrations are in WORK. Two
-processes may share both, with different tasks.
+under OUT/runs when a cell ends, and a cell with a result on the present version of its task is left
+out: the command goes on after an interruption, and on another machine with nothing but OUT. Runs
+and demonstrations are in WORK. Two processes may share both, with different tasks.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ from learning_results import check_in
 from learning.evaluation.paper_results import read_paper
 from learning.policy.policy import AGENTS
 from learning.report.report import write_report
+from learning.runs.folder import RunFolder
 from learning.sweep import Collecting, Evaluating, SweepConfig, run_sweep
 from warp_deform.errors import WarpDeformError
+from warp_deform.tasks.registration import env_id
 
 RESULTS = Path("benchmarks/results/table")
 DEMOS = (10, 100, 1)
@@ -87,15 +89,24 @@ def missing(
     out: Path,
     steps: int | None = None,
 ) -> list[Cell]:
-    """Cells of the paper's table without a result: few demonstrations of cheap tasks first."""
+    """Cells of the paper's table without a result on the present version of their task.
+
+    Few demonstrations of cheap tasks first.
+    """
     paper = read_paper()
     kept = out / "runs"
     return [
         (task, agent, count, seed)
         for seed, count, task, agent in product(seeds, demos, tasks, agents)
         if agent in paper.agents(task)
-        and not (kept / folder_of((task, agent, count, seed), steps)).exists()
+        and not is_of(kept / folder_of((task, agent, count, seed), steps), task)
     ]
+
+
+def is_of(folder: Path, task: str) -> bool:
+    """Whether a folder has a result on the present version of a task."""
+    run = RunFolder(folder)
+    return run.report.exists() and run.read_report().get("environment") == env_id(task)
 
 
 def fill(cell: Cell, options: argparse.Namespace) -> bool:

@@ -19,6 +19,7 @@ from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
 from warp_deform.support.progress import progress_bar
 from warp_deform.support.revision import running_revision
+from warp_deform.tasks.registration import env_id
 
 from ..policy.policy import load_policy
 from ..runs.folder import RunFolder, write_json
@@ -61,7 +62,8 @@ def evaluate_run(
     `selected`: the step chosen; `test`: its results on test seeds; `paper`: None, or the best of
     the snapshots' results by the paper's protocol, and in its `snapshots` all of them by step.
     Step 0, the untrained network, is played for the learning curve and never chosen; `videos`:
-    paths, where asked for; `measure`: what the paper's table shows for the task, and `published`:
+    paths, where asked for; `environment`: the task's Gymnasium id, whose version rises with its
+    physics and rules; `measure`: what the paper's table shows for the task, and `published`:
     its number [%], None where it has none; `revision`: what evaluated; `training_cpu_seconds`.
     See `summary.summarise` for a result's keys.
 
@@ -150,6 +152,7 @@ def evaluate_run(
     demos, agent = len(settings["demonstrations"]), settings["agent"]["agent"]
     report: dict[str, Any] = {
         "task": task,
+        "environment": env_id(task),
         "agent": agent,
         "preset": settings["preset"],
         "steps": settings["schedule"]["steps"],

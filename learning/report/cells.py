@@ -22,12 +22,14 @@ from typing import Any
 import numpy as np
 
 from warp_deform.errors import InputError
-from warp_deform.tasks.registry import TASKS
+from warp_deform.tasks.registration import env_id
+from warp_deform.tasks.registry import TASKS, is_known
 
 from ..evaluation.paper_results import PARTIAL_SCORE, SUCCESS, PaperResults, partial_credit
 from ..evaluation.summary import wilson
 
-__all__ = ["Cell", "CurvePoint", "RunResult", "check_run", "pool", "version_notes"]
+__all__ = ["Cell", "CurvePoint", "RunResult", "check_run", "environment_notes", "pool",
+           "version_notes"]  # fmt: skip
 
 _ALIKE = ("agent", "schedule", "augment", "processes", "device", "patience")
 """Settings that runs of a cell have in common."""
@@ -150,6 +152,18 @@ def version_notes(runs: Sequence[RunResult]) -> list[str]:
     return notes
 
 
+def environment_notes(runs: Sequence[RunResult]) -> list[str]:
+    """A line for every run that was tested on another version of its task than the present one."""
+    return [
+        f"{run.task}, {run.agent}, {run.demos} demonstrations, seed {run.seed}: tested on "
+        f"{tested}, which is {env_id(run.task)} now"
+        for run in runs
+        if (tested := run.info.get("environment")) is not None
+        and is_known(run.task)
+        and tested != env_id(run.task)
+    ]
+
+
 def _grouped(
     runs: Sequence[RunResult],
 ) -> dict[tuple[str, str, str, int], list[RunResult]]:
@@ -185,6 +199,7 @@ def _compared(run: RunResult) -> dict[str, Any]:
     compared = {key: settings.get(key) for key in _ALIKE}
     schedule = settings["schedule"]
     compared["schedule"] = {key: each for key, each in schedule.items() if key not in _SPREAD}
+    compared["environment"] = info.get("environment")
     compared["test episodes"] = info["test"]["n_episodes"]
     compared["validation episodes"] = info["snapshots"][str(info["selected"])]["n_episodes"]
     if settings.get("validate"):

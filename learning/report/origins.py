@@ -25,6 +25,7 @@ def origin(run: RunResult) -> dict[str, Any]:
     return {
         "run": str(run.path),
         "task": run.task,
+        "environment": info.get("environment"),
         "agent": run.agent,
         "demos": run.demos,
         "variant": run.variant,

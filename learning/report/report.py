@@ -10,7 +10,7 @@ from typing import Any
 from warp_deform.errors import InputError
 
 from ..evaluation.paper_results import read_paper
-from .cells import pool, version_notes
+from .cells import environment_notes, pool, version_notes
 from .curves import draw_curves
 from .origins import origin
 from .read import read_runs
@@ -40,7 +40,7 @@ def write_report(paths: Sequence[Path], out: Path | None) -> Report:
     runs, notes = read_runs(paths)
     paper = read_paper()
     cells = pool(runs, paper)
-    notes += version_notes(runs)
+    notes += version_notes(runs) + environment_notes(runs)
     files: list[Path] = []
     made = [origin(run) for run in runs]
     text = markdown_text(cells, paper, notes, made=made)

@@ -13,6 +13,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import table
 
 from learning.evaluation.paper_results import read_paper
+from learning.runs.folder import RunFolder, write_json
 
 
 def test_the_table_has_the_papers_cells(tmp_path: Path) -> None:
@@ -23,26 +24,23 @@ def test_the_table_has_the_papers_cells(tmp_path: Path) -> None:
     assert sorted(cells) == sorted((*key, 0) for key in paper.values)
 
 
-def test_a_cell_is_filled_once_and_then_left_out(
+def test_a_cell_is_filled_once_and_again_when_its_task_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["--tasks", "block-notarget", "--agents", "gt-mlp", "--demos", "1", "2"]
-    arguments += ["--steps", "4", "--episodes", "1", "--work", str(tmp_path / "work")]
-    arguments += ["--out", str(tmp_path / "out")]
-    elsewhere, here = (
-        tmp_path / "out" / "runs" / f"block-notarget-gt-mlp-{n}-0-4-steps" for n in (1, 2)
-    )
+    arguments = ["--tasks", "block-notarget", "--agents", "gt-mlp", "--steps", "4"]
+    arguments += ["--episodes", "1", "--work", str(tmp_path / "work"), "--out", str(tmp_path)]
+    cell = RunFolder(tmp_path / "runs" / "block-notarget-gt-mlp-2-0-4-steps")
 
     def left() -> list[str]:
         capsys.readouterr()
-        monkeypatch.setattr(sys, "argv", ["table.py", *arguments, "--list"])
+        monkeypatch.setattr(sys, "argv", ["table.py", *arguments, "--demos", "1", "2", "--list"])
         table.main()
         return capsys.readouterr().out.split()
 
     assert left() == ["block-notarget-gt-mlp-1-0", "block-notarget-gt-mlp-2-0"]
-    elsewhere.mkdir(parents=True)
-    monkeypatch.setattr(sys, "argv", ["table.py", *arguments])
+    monkeypatch.setattr(sys, "argv", ["table.py", *arguments, "--demos", "2"])
     table.main()
-    assert {"eval_info.json", "episodes.csv", "run.json"} <= {path.name for path in here.iterdir()}
-    assert not any(elsewhere.iterdir()), "nothing is trained for it again"
-    assert left() == []
+    assert {"eval_info.json", "episodes.csv", "run.json"} <= {p.name for p in cell.path.iterdir()}
+    assert left() == ["block-notarget-gt-mlp-1-0"]
+    write_json(cell.report, cell.read_report() | {"environment": "WarpDeform/BlockNotarget-v0"})
+    assert left() == ["block-notarget-gt-mlp-1-0", "block-notarget-gt-mlp-2-0"]

@@ -24,6 +24,7 @@ from learning.report.report import write_report
 from learning.report.tables import compared
 from warp_deform.command.main import main
 from warp_deform.errors import InputError
+from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import TASKS
 
 LINE, RING = "cable-line-notarget", "cable-ring"
@@ -78,6 +79,7 @@ def write_run(
     snapshots = {"0": [0.0] * 4, "2000": [0.5] * 4, "4000": [1.0, 1.0, 0.5, 0.5]}
     report = {
         "task": task,
+        "environment": env_id(task),
         "agent": agent,
         "preset": "fast",
         "demos": demos,
@@ -235,6 +237,7 @@ def test_steps_are_told_where_they_are_not_the_presets(tmp_path: Path) -> None:
     [
         ({"device": "cuda"}, {}, "device"),
         ({"augment": False}, {}, "augment"),
+        ({}, {"environment": "WarpDeform/CableLineNotarget-v1"}, "environment"),
         ({}, {"test": result(LINE, [1.0] * 5)}, "test episodes"),
         ({}, {"snapshots": {"4000": result(LINE, [1.0] * 5)}}, "validation episodes"),
         ({}, {"paper": {**PLAYED_TOO, "stage_rule": "privileged"}}, "who chooses the lift"),
@@ -259,6 +262,16 @@ def test_other_versions_are_noted(tmp_path: Path) -> None:
     assert "torch, 2.13.0, 9.9.9" in note and "10 demonstrations" in note
     report = write_report([tmp_path], None)
     assert report.data["notes"] == [note] and note in report.text
+
+
+def test_a_result_of_an_earlier_version_of_the_task_is_noted(tmp_path: Path) -> None:
+    write_run(tmp_path / "a")
+    write_run(tmp_path / "b", demos=100, environment="WarpDeform/CableLineNotarget-v0")
+    write_run(tmp_path / "c", demos=1, environment=None)  # of a release that did not say
+    report = write_report([tmp_path], None)
+    (note,) = report.data["notes"]
+    assert "100 demonstrations" in note and "CableLineNotarget-v0" in note
+    assert env_id(LINE) in note and note in report.text
 
 
 def test_a_privileged_lift_is_labelled(tmp_path: Path) -> None:
