@@ -250,6 +250,7 @@ def _training(
         warmup=min(usual.warmup, steps // 4),
         shares=tuple(map(float, shares)),
         validate=validate,
+        confirm=validate,
     )
     return TrainConfig(
         task=config.task,

@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +90,12 @@ def is_evaluated(run: RunFolder, step: int, protocol: Protocol) -> bool:
 
 
 def stopped_early(run: RunFolder) -> bool:
-    """Whether a run's validation ends its training: a snapshot solved every episode.
+    """Whether a run's validation ends its training: a snapshot solved every episode it was given.
 
-    Or, where the run has a `patience`, none for so long solved more than all before or had a better
-    mean score. By what is kept in the folder,
-    for the versions that trained; nothing is played.
+    Where the schedule has a `confirm`, those are so many more for a snapshot that solved all that
+    every snapshot plays. Or, where the run has a `patience`, none for so long solved more than all
+    before or had a better mean score. By what is kept in the folder, for the versions that trained;
+    nothing is played.
 
     Raises:
         InputError: this is no run's folder, or a file is damaged.
@@ -104,16 +105,19 @@ def stopped_early(run: RunFolder) -> bool:
     if not episodes:
         return False
     protocol = Protocol(split="validation", episodes=episodes)
+    longer = replace(protocol, episodes=episodes + settings["schedule"].get("confirm", 0))
     values = []
     for step in filter(None, run.steps()):
         results = _Results(run, step, protocol, by=settings.get("versions"))
         if results.whole:
-            summary = summarise(
-                [results.played[seed] for seed in protocol.seeds], task=results.task
-            )
-            if summary["n_success"] == episodes:
-                return True
-            values.append((summary["n_success"], summary["mean_score"]))
+            played = [results.played[seed] for seed in protocol.seeds]
+            solved = sum(each.success for each in played)
+            if solved == episodes:
+                further = [results.played.get(seed) for seed in longer.seeds[episodes:]]
+                if all(each is not None and each.success for each in further):
+                    return True
+                solved += sum(each is not None and each.success for each in further)
+            values.append((solved, summarise(played, task=results.task)["mean_score"]))
     waited, most = 0, (-1, -math.inf)
     for solved, score in values:
         waited = 0 if solved > most[0] or score > most[1] else waited + 1

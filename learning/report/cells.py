@@ -33,7 +33,7 @@ __all__ = ["Cell", "CurvePoint", "RunResult", "check_run", "environment_notes", 
 
 _ALIKE = ("agent", "schedule", "augment", "processes", "device", "patience")
 """Settings that runs of a cell have in common."""
-_SPREAD = ("snapshots", "doubling", "shares", "validate", "patience")
+_SPREAD = ("snapshots", "doubling", "shares", "validate", "confirm", "patience")
 """Of a schedule: when snapshots are taken, and what they play, which is compared by itself."""
 _VERSIONS = ("warp-deform", "torch")
 
@@ -204,6 +204,7 @@ def _compared(run: RunResult) -> dict[str, Any]:
     compared["validation episodes"] = info["snapshots"][str(info["selected"])]["n_episodes"]
     if settings.get("validate"):
         compared["validation episodes in training"] = settings.get("validate")
+        compared["further ones that confirm"] = schedule.get("confirm", 0)
     if paper is not None:
         compared["who chooses the lift by the paper's protocol"] = paper["stage_rule"]
     return compared

@@ -51,6 +51,11 @@ class TrainConfig(TrainSettings):
                 f"patience is {self.patience} and validate 0; stopping early needs validation "
                 "episodes, 1 or more"
             )
+        if self.confirm and not plan.validate:
+            raise InputError(
+                f"confirm is {self.confirm} and validate 0; there is nothing to confirm without "
+                "validation episodes"
+            )
         if self.precision not in PRECISIONS:
             raise InputError(
                 f"precision is {self.precision!r}; it must be one of {list(PRECISIONS)}"
@@ -68,7 +73,7 @@ class TrainConfig(TrainSettings):
         plan = self.schedule or preset_schedule(
             self.preset, task=self.task, demos=demos, sees_state=self._sees_state
         )
-        changed = ("steps", "batch", "lr", "snapshots", "validate")
+        changed = ("steps", "batch", "lr", "snapshots", "validate", "confirm")
         wanted: dict[str, Any] = {
             name: getattr(self, name) for name in changed if getattr(self, name) is not None
         }
@@ -77,6 +82,8 @@ class TrainConfig(TrainSettings):
         if self.validate is None and self.hold_out:
             wanted["validate"] = 0
         plan = replace(plan, **wanted)
+        if not plan.validate:
+            plan = replace(plan, confirm=0)
         patience = plan.patience if self.patience is None else self.patience
         return replace(plan, patience=(patience or None) if plan.validate else None)
 

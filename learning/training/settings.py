@@ -56,9 +56,12 @@ class TrainMethod:
     """Number of snapshots, evenly spread. By default, `paper` keeps 10, and `fast` keeps one after
     7.5, 15, 30, 60 and 100 % of the steps."""
     validate: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
-    """Validation episodes that every snapshot plays. Training ends when a snapshot solves them all,
-    and `eval` does not play them again. By default, 20 for `fast` (0 with --hold-out) and 0 for
-    `paper`."""
+    """Validation episodes that every snapshot plays. Training ends when a snapshot solves them all
+    and those of --confirm, and `eval` does not play them again. By default, 20 for `fast` (0 with
+    --hold-out) and 0 for `paper`."""
+    confirm: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
+    """Further validation episodes for a snapshot that solved all of --validate: only one that
+    solves these too ends training. By default, 40 for `fast` and 0 for `paper`."""
     patience: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
     """Also stop after this many snapshots in a row that brought nothing; 0: never. This needs
     validation. By default, 2 for `fast` agents over pictures, and 0 for others."""

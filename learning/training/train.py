@@ -62,7 +62,7 @@ class TrainReport:
         steps: taken in all, of planned_steps
         snapshots: the steps of which there are snapshots
         validation: of snapshots on validation episodes, `n_success`, `n_episodes`, `mean_score` by
-            step
+            step; one that solved all that every snapshot plays has played more, see `confirm`
         chosen: the step whose snapshot did best on them, as `eval` would choose; None without them
         loss: mean over the last logged steps [nat]
         held_out: that of snapshots on held-out demonstrations by step [nat]
@@ -122,7 +122,12 @@ def train(config: TrainConfig) -> TrainReport:
         agent = agent.to(device)
         held_out = HeldOut(agent, data.spared(config.hold_out)) if config.hold_out else None
         validation = Validation(
-            run, episodes=plan.validate, process=process, trained=data.seeds, task=config.task
+            run,
+            episodes=plan.validate,
+            confirm=plan.confirm,
+            process=process,
+            trained=data.seeds,
+            task=config.task,
         )
         if not run.settings.exists():
             _rehearse(config, data, agent, plan, device)

@@ -6,6 +6,7 @@ It says when training has nothing left to gain, and reports how good the policy 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ..runs.folder import RunFolder
@@ -26,6 +27,7 @@ class Validation:
     Args:
         run: whose snapshots; its settings say what ends training
         episodes: of validation seeds that each plays; 0: nothing is played, and nothing ends
+        confirm: further ones that a snapshot plays which solved all of these
         process: of rank 0 plays, others wait
         trained: seeds of the demonstrations
         task: its name
@@ -35,23 +37,32 @@ class Validation:
     """
 
     def __init__(
-        self, run: RunFolder, *, episodes: int, process: Process, trained: Iterable[int], task: str
+        self,
+        run: RunFolder,
+        *,
+        episodes: int,
+        confirm: int,
+        process: Process,
+        trained: Iterable[int],
+        task: str,
     ) -> None:
         self._run, self._process = run, process
         self._protocol: Protocol | None = None
         self.note = ""
         """How the snapshot that played last did, in a few words."""
         self.results: dict[int, dict[str, Any]] = {}
-        """`n_success`, `n_episodes` and `mean_score` of snapshots by step."""
+        """`n_success`, `n_episodes` and `mean_score` of snapshots by step, over all they played."""
         self.chosen: int | None = None
-        """Step of the snapshot that did best, see `evaluation.summary.best`."""
+        """Step of the snapshot that did best in the episodes that all played, see
+        `evaluation.summary.best`."""
         self._task = task
         self._evaluations: dict[int, Evaluation] = {}
         if episodes:
             from ..evaluation.protocol import Protocol, check_splits  # loads the simulator
 
             self._protocol = Protocol(split="validation", episodes=episodes)
-            check_splits(trained, [self._protocol], task=task)
+            self._longer = replace(self._protocol, episodes=episodes + confirm)
+            check_splits(trained, [self._longer], task=task)
 
     def evaluate(self, steps: Sequence[int]) -> bool:
         """Evaluate the snapshots of these steps; returns whether training ends with the last."""
@@ -63,6 +74,8 @@ class Validation:
         for step in steps if self._process.rank == 0 else ():
             evaluation = evaluate_snapshot(self._run, step, self._protocol)
             self._evaluations[step], summary = evaluation, evaluation.summary
+            if summary["n_success"] == summary["n_episodes"]:
+                summary = evaluate_snapshot(self._run, step, self._longer).summary
             self.chosen = best(list(self._evaluations.values()), task=self._task).step
             self.results[step] = {name: summary[name] for name in _REPORTED}
             self.note = (

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import pytest
@@ -24,10 +24,10 @@ TASK = "cable-line-notarget"
 
 
 class Episodes:
-    """Plays for a policy that solves all from a step on."""
+    """Plays for a policy that solves all but what is hard from a step on."""
 
-    def __init__(self, solves_from: int) -> None:
-        self.solves_from = solves_from
+    def __init__(self, solves_from: int, hard: Collection[tuple[int, int]] = ()) -> None:
+        self.solves_from, self.hard = solves_from, hard
         self.played: list[tuple[int, int]] = []
 
     def __call__(self, chunk: evaluating._Chunk) -> Iterator[PlayedEpisode]:
@@ -35,6 +35,7 @@ class Episodes:
         for seed in chunk.seeds:
             self.played.append((step, seed))
             solved = step >= self.solves_from or seed % 2 == 0
+            solved = solved and (step, seed) not in self.hard
             yield PlayedEpisode(
                 seed, solved, 1.0 if solved else 0.5, 3, "", None if solved else "other"
             )
@@ -61,10 +62,11 @@ def test_the_plain_commands_stop_when_all_is_solved(
     report = json.loads(said.out)
     assert report["snapshots"] == [1, 2] and report["stopped_early"]
     assert report["chosen"] == 2
-    assert [each["n_success"] for each in report["validation"].values()] == [10, 20]
-    assert episodes.played == [(step, 50_000 + n) for step in (1, 2) for n in range(20)]
+    assert [each["n_success"] for each in report["validation"].values()] == [10, 60]
+    seeds = [(1, 20), (2, 60)]
+    assert episodes.played == [(step, 50_000 + n) for step, count in seeds for n in range(count)]
     assert [line.split(":")[0] for line in said.err.splitlines()] == [f"train {TASK}"] * 2
-    assert "validation 20 of 20 solved, mean score 1.000" in said.err
+    assert "validation 60 of 60 solved, mean score 1.000" in said.err
 
     # the same command again changes nothing and plays nothing
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
@@ -78,6 +80,21 @@ def test_the_plain_commands_stop_when_all_is_solved(
     tested = json.loads(capsys.readouterr().out)
     assert tested["selected"] == 2 and tested["test"]["n_success"] == 4
     assert episodes.played == [(2, 10_000 + n) for n in range(4)], "validation was played before"
+
+
+def test_what_the_first_episodes_cannot_tell_the_further_ones_do(
+    commands: tuple[list[str], list[str], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Twenty of twenty are no end of the training where one of the next forty is not solved."""
+    train, _, _ = commands
+    episodes = Episodes(solves_from=2, hard={(2, 50_059), (5, 50_058), (5, 50_059), (10, 50_020)})
+    monkeypatch.setattr(evaluating, "_play_chunk", episodes)
+    assert main(train) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [each["n_success"] for each in report["validation"].values()] == [10, 59, 58, 59]
+    assert report["stopped_early"] and report["patience"] == 2, "neither 58 nor 59 is a gain"
 
 
 def test_what_is_not_solved_is_trained_to_the_end(

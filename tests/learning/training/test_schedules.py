@@ -102,6 +102,17 @@ def test_patience_is_the_presets_unless_nothing_is_played(tmp_path: Path) -> Non
     assert patience(preset="paper", validate=3, patience=1) == 1
 
 
+def test_what_confirms_is_the_presets_unless_nothing_is_played(tmp_path: Path) -> None:
+    def confirm(**changes: Any) -> int:
+        settings = {"task": "cable-ring", "agent": "transporter", "preset": "fast"} | changes
+        return TrainConfig(data=tmp_path, out=tmp_path, **settings).plan(10).confirm
+
+    assert confirm() == 40 and confirm(agent="gt-mlp") == 40 and confirm(validate=7) == 40
+    assert confirm(confirm=3) == 3 and confirm(confirm=0) == 0
+    assert confirm(validate=0) == 0 and confirm(hold_out=3) == 0 and confirm(preset="paper") == 0
+    assert confirm(preset="paper", validate=3, confirm=2) == 2
+
+
 @pytest.mark.parametrize("shares", [(0.5,), (0.0, 1.0), (0.5, 1.5)])
 def test_shares_end_with_the_last_step(shares: tuple[float, ...]) -> None:
     with pytest.raises(InputError, match="shares are"):

@@ -281,6 +281,8 @@ def test_damaged_and_foreign_snapshots_are_refused(
         ({"threads": 0}, "threads is 0; it must be 1 or more"),
         ({"validate": -3}, "validate is -3; it must be 0 or more"),
         ({"patience": 2}, "patience is 2 and validate 0; .* needs validation episodes, 1 or more"),
+        ({"confirm": 2}, "confirm is 2 and validate 0; there is nothing to confirm"),
+        ({"confirm": -1, "validate": 1}, "confirm is -1; it must be 0 or more"),
         ({"patience": -1, "validate": 1}, "patience is -1; it must be 0 or more"),
         ({"precision": "half"}, "precision is 'half'; it must be one of"),
         ({"device": "tpu"}, "device is 'tpu'; it must be 'cpu' or 'cuda'"),

@@ -51,6 +51,7 @@ CHANGED: dict[str, tuple[list[str], Any]] = {
     "lr": (["0.5"], 0.5),
     "snapshots": (["4"], 4),
     "validate": (["7"], 7),
+    "confirm": (["9"], 9),
     "patience": (["6"], 6),
     "precision": (["float32"], "float32"),
     "device": (["cuda"], "cuda"),
@@ -114,7 +115,7 @@ def test_a_flag_of_train_changes_its_setting_alone(
 ) -> None:
     words, value = CHANGED[name]
     agent = ["--agent", "transporter"] if name == "precision" else []
-    others = ["--validate", "1"] if name == "patience" else []
+    others = ["--validate", "1"] if name in ("confirm", "patience") else []
     seen: list[TrainConfig] = []
 
     def record(config: TrainConfig) -> None:
