@@ -3,7 +3,7 @@
     python benchmarks/swings.py [--tasks TASK...] [--methods METHOD...] [--seconds S...]
                                 [--goals N] [--out FILE]
 
-Goals are those of 32 test seeds from 10,000. One row a task, method and budget, in CPU seconds of
+Goals are those of 200 test seeds from 10,000. One row a task, method and budget, in CPU seconds of
 the process a goal: mean score of `whip`, and distance and shares within 10, 5, 2 and 1 cm of
 `whip-target`. All rows of a call come from one process, on one thread. Rows of other tasks, methods
 and budgets stay in the file.
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=["whip", "whip-target"])
     parser.add_argument("--methods", nargs="+", default=list(METHODS))
     parser.add_argument("--seconds", nargs="+", type=float, default=[0.2], help="a goal")
-    parser.add_argument("--goals", type=int, default=32)
+    parser.add_argument("--goals", type=int, default=200)
     options = parser.parse_args()
     torch.set_num_threads(1)
     rows = {}
@@ -52,14 +52,14 @@ def main() -> None:
         problem = SwingProblem(task, range(10_000, 10_000 + options.goals))
         nothing = np.zeros((options.goals, 1, *problem.shape))
         problem.evaluate(nothing)  # this and the next line compile kernels
-        problem.slopes(nothing[:, 0])
+        problem.gradients(nothing[:, 0], np.arange(options.goals))
         for method in options.methods:
             for seconds in options.seconds:
                 found = optimize(problem, method, seconds=seconds * options.goals)
                 row = {
                     "task": task, "method": method, "seconds": seconds, "goals": options.goals,
-                    **told(task, found.losses), "plans": found.evaluations, "slopes": found.slopes,
-                    "unusable": found.unusable,
+                    **told(task, found.losses), "plans": round(found.evaluations),
+                    "gradients": round(found.gradients), "unusable": found.unusable,
                     "cpu_s_a_goal": found.cpu_seconds / options.goals, "load": os.getloadavg()[0],
                 }  # fmt: skip
                 rows[task, method, seconds] = row

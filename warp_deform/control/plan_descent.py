@@ -1,8 +1,11 @@
 """Methods that descend: Adam on all goals side by side, and L-BFGS on each.
 
-Derivatives of a swing are exact, and chaotic: those by the first knots may be 10,000 times as long
-as those by the last. What can be trusted is their direction. So Adam gets each plan's derivatives
+Gradients of a swing are exact, and chaotic: those by the first knots may be 10,000 times as long
+as those by the last. What can be trusted is their direction. So Adam gets each plan's gradient
 with the length 1, and the best plan on the way is kept, not the last.
+
+Many a descent ends in a hollow that is not the deepest. So once all have descended, the worst of
+them start again from another plan, and the worst after these, and so on.
 
 Sources: Kingma and Ba, "Adam", ICLR 2015, by torch. Liu and Nocedal, "On the limited memory BFGS
 method", 1989, by SciPy.
@@ -22,6 +25,8 @@ _LR = 0.15
 """Adam's step size at first; it falls linearly to nothing."""
 _BETAS = (0.7, 0.95)
 """Of its running means: short ones, for derivatives change their size a hundredfold on the way."""
+_STAGES = ((1.0, 0.45), (0.5, 0.67), (0.3, 0.8), (0.2, 0.93), (0.1, 1.0))
+"""Share of the goals that descend, the worst ones, and the share of the budget spent after it."""
 _LOST = 1e6
 """What a plan that a guard ends counts for a line search, which needs a number."""
 
@@ -29,22 +34,38 @@ _LOST = 1e6
 def adam(search: Search) -> None:
     """Descend from the best plans so far, with what is left of the budget.
 
+    The worst start again from those that were drawn first, one after the other.
+    """
+    search.refine()
+    whole, begun = 1.0 - search.share, search.share
+    for number, (share, until) in enumerate(_STAGES):
+        count = max(1, round(share * search.problem.goals))
+        goals = np.sort(np.argsort(-search.losses, kind="stable")[:count])
+        plans = search.numbers[goals]
+        if number and search.first is not None:
+            again = search.first[:, min(number, search.first.shape[1] - 1)]
+            plans = search.refined(again)[goals]
+        _descend(search, goals, plans, until=begun + until * whole)
+
+
+def _descend(search: Search, goals: np.ndarray, start: np.ndarray, *, until: float) -> None:
+    """Adam for some goals, from plans (n, K, 3) until so much of the budget is spent.
+
     A plan that a guard ends goes back to the best one.
     """
     import torch
 
-    search.refine()
-    plans = torch.tensor(search.numbers)
+    plans = torch.tensor(start)
     optimizer = torch.optim.Adam([plans], lr=_LR, betas=_BETAS)
-    rounds = Rounds(search, first=not search.history)
+    rounds = Rounds(search, until, first=not search.history)
     while rounds.goes_on():
         optimizer.param_groups[0]["lr"] = _LR * (1.0 - rounds.done)
-        losses, slopes = search.descend(plans.numpy().copy())
-        lengths = np.linalg.norm(slopes, axis=(1, 2), keepdims=True)
-        plans.grad = torch.from_numpy(slopes / np.maximum(lengths, 1e-300))
+        losses, gradients = search.descend(plans.numpy().copy(), goals)
+        lengths = np.linalg.norm(gradients, axis=(1, 2), keepdims=True)
+        plans.grad = torch.from_numpy(gradients / np.maximum(lengths, 1e-300))
         optimizer.step()
         lost = np.isinf(losses)
-        plans[torch.from_numpy(lost)] = torch.from_numpy(search.numbers[lost])
+        plans[torch.from_numpy(lost)] = torch.from_numpy(search.numbers[goals[lost]])
 
 
 def lbfgs(search: Search) -> None:
@@ -61,10 +82,10 @@ def lbfgs(search: Search) -> None:
     ]
     for thread in threads:
         thread.start()
-    rounds = Rounds(search, first=not search.history)
+    rounds, goals = Rounds(search, first=not search.history), np.arange(search.problem.goals)
     try:
         while queries.all_asked() and rounds.goes_on():
-            queries.answer(*search.descend(queries.points.copy()))
+            queries.answer(*search.descend(queries.points.copy(), goals))
     finally:
         queries.stop()
         for thread in threads:
@@ -84,7 +105,7 @@ class _Queries:
 
     def __init__(self, start: np.ndarray) -> None:
         self.points = start.copy()
-        self._losses, self._slopes = np.zeros(len(start)), np.zeros_like(start)
+        self._losses, self._gradients = np.zeros(len(start)), np.zeros_like(start)
         self._turn = threading.Condition()
         self._waiting = [False] * len(start)
         self._over = [False] * len(start)
@@ -104,7 +125,7 @@ class _Queries:
                 self._turn.wait_for(lambda: self._stopped or not self._waiting[goal])
                 if self._stopped:
                     raise _Stopped
-                return float(self._losses[goal]), self._slopes[goal].ravel().copy()
+                return float(self._losses[goal]), self._gradients[goal].ravel().copy()
 
         try:
             minimize(ask, self.points[goal].ravel(), jac=True, method="L-BFGS-B")
@@ -123,11 +144,11 @@ class _Queries:
             )
             return not all(self._over)
 
-    def answer(self, losses: np.ndarray, slopes: np.ndarray) -> None:
+    def answer(self, losses: np.ndarray, gradients: np.ndarray) -> None:
         """Tell everyone who asks."""
         with self._turn:
             self._losses = np.where(np.isfinite(losses), losses, _LOST)
-            self._slopes = slopes
+            self._gradients = gradients
             self._waiting = [False] * len(self._waiting)
             self._turn.notify_all()
 

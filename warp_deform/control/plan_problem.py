@@ -10,10 +10,10 @@ import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["OptimizedPlans", "PlanProblem", "SlopedProblem"]
+__all__ = ["DifferentiableProblem", "OptimizedPlans", "PlanProblem"]
 
-SLOPE = 2.5
-"""What a plan with its derivatives costs, in plans."""
+GRADIENT = 2.5
+"""What a plan with its gradient costs, in plans."""
 
 
 class PlanProblem(Protocol):
@@ -31,8 +31,8 @@ class PlanProblem(Protocol):
         """Losses (G, N) of plans with these free numbers (G, N, K, 3); inf where a guard fires."""
 
 
-class SlopedProblem(PlanProblem, Protocol):
-    """A problem with derivatives."""
+class DifferentiableProblem(PlanProblem, Protocol):
+    """A problem with gradients."""
 
     def refined(self, numbers: np.ndarray) -> np.ndarray:
         """Numbers (G, K', 3), as many as there is use for, of the plans that have (G, K, 3).
@@ -40,8 +40,12 @@ class SlopedProblem(PlanProblem, Protocol):
         A search wants few numbers, a descent many: they leave it more ways to go.
         """
 
-    def slopes(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Losses (G,) of plans (G, K, 3), inf where a guard fires, and their derivatives."""
+    def gradients(self, numbers: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Losses (n,) of plans (n, K, 3), inf where a guard fires, and their gradients (n, K, 3).
+
+        Args:
+            goals: the numbers of n different goals that the plans are for, ascending
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +54,11 @@ class OptimizedPlans:
 
     Attributes:
         numbers: free numbers of the best plans (G, K, 3); methods that descend have more of them
-            than the problem's shape says, see `SlopedProblem.refined`
+            than the problem's shape says, see `DifferentiableProblem.refined`
         losses: of these (G,); inf where every plan made a guard fire
-        evaluations: plans that were evaluated for each goal, with derivatives or without
-        slopes: of these, plans with derivatives
-        unusable: of all goals, plans whose derivatives were not all finite numbers, or of a state
+        evaluations: plans that were evaluated, with gradients or without: mean over the goals
+        gradients: of these, plans with gradients
+        unusable: of all goals, plans whose gradients were not all finite numbers, or of a state
             that a guard has found wrong: nothing was learnt from them
         cpu_seconds: process time that the search took
         history: best losses so far (R, G) after every round
@@ -62,8 +66,8 @@ class OptimizedPlans:
 
     numbers: np.ndarray
     losses: np.ndarray
-    evaluations: int
-    slopes: int
+    evaluations: float
+    gradients: float
     unusable: int
     cpu_seconds: float
     history: np.ndarray
@@ -74,14 +78,20 @@ class Search:
 
     Args:
         seconds: of the process's CPU time; None: as many as it takes
-        evaluations: for each goal at most; one with derivatives counts `SLOPE`. None: any number
+        evaluations: for each goal at most, in the mean; one with its gradient counts `GRADIENT`.
+            None: any number
+
+    Attributes:
+        first: what was drawn first: free numbers (G, N, K, 3), the best plans first
     """
 
     def __init__(self, problem: PlanProblem, seconds: float | None, evaluations: int | None):
         self.problem, self.seconds, self.most = problem, seconds, evaluations
         self.numbers = np.zeros((problem.goals, *problem.shape))
         self.losses = np.full(problem.goals, np.inf)
-        self.evaluations = self.slopes = self.unusable = 0
+        self.first: np.ndarray | None = None
+        self.evaluations = self.gradients = 0.0
+        self.unusable = 0
         self.history = list[np.ndarray]()
         self._rows = np.arange(problem.goals)
         self._begun = time.process_time()
@@ -95,7 +105,7 @@ class Search:
     def share(self) -> float:
         """Of the budget, what is spent."""
         if self.most is not None:
-            return (self.evaluations + (SLOPE - 1) * self.slopes) / self.most
+            return (self.evaluations + (GRADIENT - 1) * self.gradients) / self.most
         assert self.seconds is not None, "there is one budget"
         return self.spent / self.seconds
 
@@ -103,40 +113,49 @@ class Search:
         """Losses (G, N) of plans (G, N, K, 3); the best are kept."""
         losses = np.asarray(self.problem.evaluate(numbers))
         self.evaluations += numbers.shape[1]
-        return self._noted(numbers, losses)
+        if self.first is None:
+            order = np.argsort(losses, axis=1, kind="stable")
+            self.first = np.take_along_axis(numbers, order[:, :, None, None], axis=1)
+        return self._noted(self._rows, numbers, losses)
+
+    def refined(self, numbers: np.ndarray) -> np.ndarray:
+        """The same plans with the numbers that a descent wants."""
+        return cast(DifferentiableProblem, self.problem).refined(numbers)
 
     def refine(self) -> None:
         """Go on with more numbers of the same plans."""
-        self.numbers = cast(SlopedProblem, self.problem).refined(self.numbers)
+        self.numbers = self.refined(self.numbers)
 
-    def descend(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Losses (G,) of plans (G, K, 3) and their derivatives, 0 where they are of no use."""
-        losses, slopes = cast(SlopedProblem, self.problem).slopes(numbers)
-        self.evaluations += 1
-        self.slopes += 1
-        losses = self._noted(numbers[:, None], np.asarray(losses)[:, None])[:, 0]
-        usable = np.isfinite(losses) & np.isfinite(slopes).all(axis=(1, 2))
+    def descend(self, numbers: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Losses (n,) of plans (n, K, 3) for these goals, and gradients, 0 where of no use."""
+        problem = cast(DifferentiableProblem, self.problem)
+        losses, gradients = problem.gradients(numbers, goals)
+        self.evaluations += len(goals) / len(self._rows)
+        self.gradients += len(goals) / len(self._rows)
+        losses = self._noted(goals, numbers[:, None], np.asarray(losses)[:, None])[:, 0]
+        usable = np.isfinite(losses) & np.isfinite(gradients).all(axis=(1, 2))
         self.unusable += int((~usable).sum())
-        return losses, np.where(usable[:, None, None], slopes, 0.0)
+        return losses, np.where(usable[:, None, None], gradients, 0.0)
 
-    def _noted(self, numbers: np.ndarray, losses: np.ndarray) -> np.ndarray:
+    def _noted(self, goals: np.ndarray, numbers: np.ndarray, losses: np.ndarray) -> np.ndarray:
         losses = np.where(np.isfinite(losses), losses, np.inf)
-        best = losses.argmin(axis=1)
-        better = losses[self._rows, best] < self.losses
-        self.losses[better] = losses[self._rows, best][better]
-        self.numbers[better] = numbers[self._rows, best][better]
+        rows, best = np.arange(len(goals)), losses.argmin(axis=1)
+        better = losses[rows, best] < self.losses[goals]
+        self.losses[goals[better]] = losses[rows, best][better]
+        self.numbers[goals[better]] = numbers[rows, best][better]
         self.history.append(self.losses.copy())
         return losses
 
-    def check_slopes(self, method: str) -> None:
-        """Refuse a method that needs derivatives, where the problem has none.
+    def check_gradients(self, method: str) -> None:
+        """Refuse a method that needs gradients, where the problem has none.
 
         Raises:
             InputError: it has none.
         """
-        if not hasattr(self.problem, "slopes"):
+        if not hasattr(self.problem, "gradients"):
             raise InputError(
-                f"the method {method} needs a problem with slopes(numbers); cem needs none"
+                f"the method {method} needs a problem with gradients(numbers, goals); cem needs "
+                "none"
             )
 
 

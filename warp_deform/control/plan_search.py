@@ -2,7 +2,7 @@
 
 A `PlanProblem` has G goals, for each of which a plan is searched, and evaluates many plans at once:
 in the lanes of one simulator that is what costs least. Methods see free numbers, K x 3 a plan (see
-`smooth_plans`), and losses. Those of `plan_descent` also see derivatives; those here need none.
+`smooth_plans`), and losses. Those of `plan_descent` also see gradients; those here need none.
 
 Sources: cross-entropy method: Rubinstein, "The Cross-Entropy Method for Combinatorial and
 Continuous Optimization", 1999. CMA-ES: Hansen and Ostermeier, "Completely Derandomized
@@ -86,28 +86,28 @@ def _random(search: Search, rng: np.random.Generator, population: int) -> None:
 
 
 def _drawn_once(search: Search, rng: np.random.Generator, population: int) -> None:
-    """One round of draws: from the best of them a method descends."""
-    shape = (search.problem.goals, population, *search.problem.shape)
+    """Two rounds of draws at once: from the best of them a method descends."""
+    shape = (search.problem.goals, 2 * population, *search.problem.shape)
     search.evaluate(rng.normal(0.0, _SPREAD, shape))
 
 
 def _adam(search: Search, rng: np.random.Generator, population: int) -> None:
-    """Adam from the best of one round of draws."""
-    search.check_slopes("adam")
+    """Adam from the best draws."""
+    search.check_gradients("adam")
     _drawn_once(search, rng, population)
     adam(search)
 
 
 def _lbfgs(search: Search, rng: np.random.Generator, population: int) -> None:
-    """L-BFGS from the best of one round of draws."""
-    search.check_slopes("lbfgs")
+    """L-BFGS from the best draw."""
+    search.check_gradients("lbfgs")
     _drawn_once(search, rng, population)
     lbfgs(search)
 
 
 def _cem_adam(search: Search, rng: np.random.Generator, population: int) -> None:
     """A search with part of the budget, then Adam from the best that it has found."""
-    search.check_slopes("cem+adam")
+    search.check_gradients("cem+adam")
     _cem(search, rng, population, share=_SEARCHES)
     adam(search)
 
@@ -141,15 +141,15 @@ def optimize(
     depends on the machine. One round is made in any case.
 
     Args:
-        method: "cem", "cmaes", "random"; with derivatives "adam", "lbfgs", and "cem+adam", which
+        method: "cem", "cmaes", "random"; with gradients "adam", "lbfgs", and "cem+adam", which
             searches with 40 % of the budget and descends with the rest
         seconds: of the process's CPU time, for all goals together
-        evaluations: plans for each goal at most; one with derivatives counts 2.5
+        evaluations: plans for each goal at most, in the mean; one with its gradient counts 2.5
         population: plans a round for each goal
         seed: of the draws
 
     Raises:
-        InputError: there is no such method, not exactly one budget, or no derivatives for a
+        InputError: there is no such method, not exactly one budget, or no gradients for a
             method that needs them.
         WarpDeformError: the method's package is not installed.
     """
@@ -169,7 +169,7 @@ def optimize(
         numbers=search.numbers,
         losses=search.losses,
         evaluations=search.evaluations,
-        slopes=search.slopes,
+        gradients=search.gradients,
         unusable=search.unusable,
         cpu_seconds=search.spent,
         history=np.array(search.history),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
+from ..rollout.differentiable import DifferentiableRollout
 from ..rollout.rollouts import GripPath, rollout
 from .control_task import ControlTask
 from .control_worlds import ControlWorlds
@@ -16,8 +17,6 @@ from .smooth_plans import KNOTS, actions_of, numbers_of, tensor_actions_of
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from ..rollout.tensor_control import TensorControlLoop
 
 __all__: list[str] = []  # `warp_deform.control` is the import path of what is here
 
@@ -67,7 +66,7 @@ class SwingProblem:
         self._positions, self._velocities = np.stack(positions), np.stack(velocities)
         self._floors = np.array(floors)
         self._knot_times = self._times()
-        self._loop: TensorControlLoop | None = None
+        self._run: DifferentiableRollout | None = None
 
     def _starts(self, seeds: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray, float, object]]:
         """Positions, velocities, lowest height of the tip and layout of every seed."""
@@ -120,13 +119,11 @@ class SwingProblem:
         return of, np.concatenate([self._ends(of[part], actions[part]) for part in parts])
 
     def _ends(self, of: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        solver, held, worlds = self._solver, self._held, list(range(len(of)))
+        solver, worlds = self._solver, list(range(len(of)))
         steps = self._led(of, actions)
-        places = self._positions[of, held].astype(float)
-        knots = np.stack([places, *steps, steps[-1]], axis=1)
         self._put(of)
         seconds = self._control.horizon * self._control.control.loop.seconds
-        paths = {w: GripPath(self._knot_times, knots[w], particle=held) for w in worlds}
+        paths = self._paths(of, steps)
         runs = rollout(solver, worlds, paths=paths, least=2 * seconds, most=seconds)
         ends = np.stack([solver.particle_q(w).astype(float) for w in worlds])
         limits = solver.config.limits
@@ -141,6 +138,12 @@ class SwingProblem:
         self._targets.floors[worlds] = self._floors[of]
         self._targets.place(worlds, np.pad(places, ((0, 0), (0, 1))))
         return [self._targets.follow(worlds, rows)[:, -1, :3] for rows in actions.swapaxes(0, 1)]
+
+    def _paths(self, of: np.ndarray, steps: list[np.ndarray]) -> dict[int, GripPath]:
+        """Of worlds whose tips are told to be (n, 3) [m] at the ends of T steps."""
+        places = self._positions[of, self._held].astype(float)
+        knots = np.stack([places, *steps, steps[-1]], axis=1)
+        return {w: GripPath(self._knot_times, k, particle=self._held) for w, k in enumerate(knots)}
 
     def _put(self, of: np.ndarray) -> None:
         """Put worlds to the starts of goals."""
@@ -158,48 +161,42 @@ class SwingProblem:
         """Numbers (G, T, 3), three a step, of the plans that have numbers (G, K, 3)."""
         return numbers_of(numbers, self._control.horizon)
 
-    def slopes(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Losses (G,) of plans (G, K, 3), one a goal, and their derivatives (G, K, 3).
+    def gradients(self, numbers: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Losses (n,) of plans (n, K, 3) for these goals (n,), and their gradients (n, K, 3).
 
         The losses have the bits of `evaluate`. Where a guard fires they are inf, and the
-        derivatives mean nothing.
+        gradients mean nothing.
         """
         room = self._control.worlds.count
         parts = [
-            self._sloped(np.arange(first, min(first + room, len(numbers))), numbers)
-            for first in range(0, len(numbers), room)
+            self._gradients(goals[first : first + room], numbers[first : first + room])
+            for first in range(0, len(goals), room)
         ]
-        losses, slopes = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return losses, slopes
+        losses, gradients = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return losses, gradients
 
-    def _sloped(self, of: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _gradients(self, of: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A plan is one launch, forth and back: what is led through N steps has the same bits."""
         import torch
 
-        from ..rollout.tensor_control import TensorControlLoop
-
-        rate = self._control.config.rate
-        loop = self._loop = self._loop or TensorControlLoop(self._solver, rate=rate)
-        worlds = list(range(len(of)))
-        sent = np.stack(self._led(of, self.actions(numbers[of])))
-        free = torch.tensor(numbers[of], dtype=torch.float64, requires_grad=True)
-        ways = self._tensor_ways(of, tensor_actions_of(free, self._control.horizon))
-        # the values of the environment, to the bit; the derivatives of torch
-        ways = torch.from_numpy(sent) + (ways - ways.detach())
+        worlds, steps = list(range(len(of))), self._led(of, self.actions(numbers))
         self._put(of)
-        loop.begin(worlds)
-        for w in worlds:
-            loop.hold(w, particle=self._held)
-        for way in ways:
-            state = loop.advance(way)
-        loop.end()
-        layouts = [self.layouts[goal] for goal in of]
-        ends = state.positions.double()
-        bodies = torch.zeros((len(of), 0, 7), dtype=torch.float64)
-        losses = self.task.losses(layouts, [], ends, bodies)
-        (slopes,) = torch.autograd.grad(losses.sum(), free)
+        run = self._run = self._run or DifferentiableRollout(self._solver)
+        seconds = self._control.horizon * self._control.control.loop.seconds
+        ends = run.forward(worlds, [seconds], paths=self._paths(of, steps))[:, -1]
+        places = torch.from_numpy(ends.astype(float)).requires_grad_()
+        losses = self._losses_of(of, places)
+        (by_places,) = torch.autograd.grad(losses.sum(), places)
+        ways = run.backward(by_places[:, None].numpy(), parts=False).way_points
+        by_ways = np.stack([ways[w] for w in worlds], axis=1)
+        by_ways[-2] += by_ways[-1]  # the last target stands there twice
+        free = torch.tensor(numbers, dtype=torch.float64, requires_grad=True)
+        told = self._tensor_ways(of, tensor_actions_of(free, self._control.horizon))
+        (gradients,) = torch.autograd.grad(told, free, torch.from_numpy(by_ways[1:-1]))
         out = losses.detach().numpy().copy()
-        out[[w for w in worlds if w in loop.problems]] = np.inf
-        return np.where(np.isfinite(out), out, np.inf), slopes.numpy()
+        limits = self._solver.config.limits
+        out[[bool(run.watch[w].problems(w, limits)) for w in worlds]] = np.inf
+        return np.where(np.isfinite(out), out, np.inf), gradients.numpy()
 
     def _tensor_ways(self, of: np.ndarray, moves: Tensor) -> Tensor:
         """Targets of the tips (T, n, 3) [m] for actions (n, T, 3), as `TipTargets` makes them."""
@@ -219,8 +216,11 @@ class SwingProblem:
     def _losses(self, of: np.ndarray, ends: np.ndarray) -> np.ndarray:
         import torch
 
-        layouts = [self.layouts[g] for g in of]
         with torch.no_grad():
-            q = torch.zeros((len(ends), 0, 7), dtype=torch.float64)
-            losses = self.task.losses(layouts, [], torch.from_numpy(ends), q).numpy()
+            losses = self._losses_of(of, torch.from_numpy(ends)).numpy()
         return np.where(np.isfinite(losses), losses, np.inf)
+
+    def _losses_of(self, of: np.ndarray, ends: Tensor) -> Tensor:
+        """Losses (n,) of particles (n, P, 3) for goals."""
+        bodies = ends.new_zeros((len(ends), 0, 7))
+        return self.task.losses([self.layouts[goal] for goal in of], [], ends, bodies)

@@ -218,10 +218,10 @@ class TrajectoryProblem:
 
     # -- derivatives
 
-    def slopes(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Loss (1,) of the plan (1, K, 3), and its derivatives by the displacements.
+    def gradients(self, numbers: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Loss (1,) of the plan (1, K, 3), and its gradient by the displacements.
 
-        The loss has the bits of `evaluate`. Derivatives are those of the same path with what was
+        The loss has the bits of `evaluate`. The gradient is that of the same path with what was
         taken held, by the part that the displacements have in it; pace and smoothing have none.
         """
         import torch
@@ -237,9 +237,9 @@ class TrajectoryProblem:
             sent.append(self.control.targets.sent([0])[0])
         walk = self._ended([run])[0]
         loss = self.loss(walk)
-        slopes = np.zeros_like(numbers)
+        gradients = np.zeros_like(numbers)
         if walk.measures is None:
-            return np.array([loss]), slopes
+            return np.array([loss]), gradients
         free = torch.tensor(numbers[0, 1:], dtype=torch.float64, requires_grad=True)
         basis = np.concatenate(
             [self._basis(plan.path, fine=False), self._basis(plan.path, fine=True)], axis=1
@@ -255,8 +255,8 @@ class TrajectoryProblem:
         least = max(before.loss, LEAST_LOSS)
         wanted = left.clamp(min=LEAST_LOSS) / least + rough / max(before.roughness, 1e-9)
         (by,) = torch.autograd.grad(wanted, free)
-        slopes[0, 1:] = by.numpy()
-        return np.array([loss]), slopes
+        gradients[0, 1:] = by.numpy()
+        return np.array([loss]), gradients
 
     def _rough(self, actions: np.ndarray, way: Tensor) -> Tensor:
         """`roughness` of actions, with derivatives by the displacements of targets (T + 1, 3)."""

@@ -99,7 +99,7 @@ def test_a_block_that_is_let_go_early_beats_nothing(demos: Path) -> None:
     assert not dropped.beats(problem.recorded) and problem.loss(dropped) > 2.0
 
 
-def test_slopes_of_a_swing_are_those_of_its_losses() -> None:
+def test_the_gradient_of_a_swing_is_that_of_its_losses() -> None:
     control = ControlWorlds("whip-target", 8, lanes=8)
     # gentle, for in a wild one differences mean nothing
     plan = 0.25 * smooth_plan(np.random.default_rng(3), 20) + np.array([0.0, 0.0, 0.2])
@@ -107,7 +107,7 @@ def test_slopes_of_a_swing_are_those_of_its_losses() -> None:
     before = problem.recorded.measures
     assert before is not None
     numbers = problem.refined(np.zeros((1, *problem.shape)))
-    loss, slopes = problem.slopes(numbers)
+    loss, gradients = problem.gradients(numbers, np.arange(1))
     assert loss[0] == problem.evaluate(numbers[:, None])[0, 0]
     # what is descended is the sum of two of the ratios
     rng, step = np.random.default_rng(0), 0.1
@@ -120,7 +120,7 @@ def test_slopes_of_a_swing_are_those_of_its_losses() -> None:
         return float(measures.over(before)[1:].sum())
 
     there = (wanted(1) - wanted(-1)) / (2 * step)
-    assert there == pytest.approx(float((slopes * way).sum()), rel=0.02)
+    assert there == pytest.approx(float((gradients * way).sum()), rel=0.02)
 
 
 def test_bad_input_ends_in_one_line(
