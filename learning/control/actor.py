@@ -10,10 +10,12 @@ from torch import Tensor, nn
 
 from warp_deform.control.smooth_plans import smooth_plan
 from warp_deform.control.tensor_worlds import TensorControlWorlds
+from warp_deform.errors import InputError
 
 __all__ = [
     "Actor",
     "BoundedSlopes",
+    "PlanActor",
     "RunningNorm",
     "as_actions",
     "layers",
@@ -103,6 +105,49 @@ class Actor(nn.Module):
     def forward(self, seen: Tensor) -> Tensor:
         """Actions (W, 4): u / sqrt(1 + |u|^2), of a length below 1, and 1."""
         return as_actions(self.moves(seen))
+
+
+class PlanActor(nn.Module):
+    """The first observation of an episode in, its actions out, step by step: it looks no further.
+
+    Args:
+        size: numbers of an observation, the last of which says how much of the episode is over
+        hidden: of the layers in between
+        steps: of an episode T
+    """
+
+    def __init__(self, size: int, hidden: tuple[int, ...] = (256, 256, 256), *, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+        self.norm = RunningNorm(size)
+        self.network = layers((size, *hidden, 3 * steps))
+        last = self.network[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            last.weight *= _QUIET
+            last.bias.copy_(torch.tensor(_LIFT).repeat(steps))
+        self._plans: Tensor | None = None
+
+    def plans(self, first: Tensor) -> Tensor:
+        """Numbers (W, T, 3) of the moves of episodes that begin so (W, D), not yet bounded."""
+        numbers: Tensor = self.network(self.norm(first))
+        return numbers.reshape(len(first), self.steps, 3)
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Actions (W, 4) of the plans that began with each row's first observation.
+
+        Raises:
+            InputError: it was not shown how an episode begins.
+        """
+        step = (seen[:, -1] * self.steps).round().long().clamp(0, self.steps - 1)
+        begins = step == 0
+        if self._plans is None or len(self._plans) != len(seen):
+            if not begins.all():
+                raise InputError("a plan begins with its episode: show its first observation")
+            self._plans = self.plans(seen)
+        elif begins.any():
+            self._plans = torch.where(begins[:, None, None], self.plans(seen), self._plans)
+        return as_actions(self._plans[torch.arange(len(seen)), step])
 
 
 def as_actions(moves: Tensor) -> Tensor:

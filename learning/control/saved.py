@@ -3,34 +3,39 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
 from warp_deform.errors import InputError
 
 from ..runs.folder import RunFolder, read_snapshot
-from .actor import Actor
+from .actor import Actor, PlanActor
 
 __all__ = ["load_actor", "save_actor"]
 
-_METHODS = ("apg", "shac")
+_METHODS = ("apg", "plan", "shac")
 
 
-def save_actor(folder: Path, actor: Actor, *, task: str, method: str, updates: int) -> Path:
+def save_actor(
+    folder: Path, actor: Actor | PlanActor, *, task: str, method: str, updates: int
+) -> Path:
     """Write an actor after so many updates into a folder, each file whole or not at all.
 
     Args:
-        method: that trained it, "apg" or "shac"
+        method: that trained it, "apg", "shac" or "plan"
     """
     run = RunFolder(folder)
     run.create()
     sizes = [each.in_features for each in actor.network if isinstance(each, nn.Linear)]
-    config = {"size": sizes[0], "hidden": sizes[1:]}
+    config: dict[str, Any] = {"size": sizes[0], "hidden": sizes[1:]}
+    if isinstance(actor, PlanActor):
+        config["steps"] = actor.steps
     record = {"agent": {"task": task, "agent": method, "config": config}}
     return run.write_snapshot(updates, actor.state_dict(), record)
 
 
-def load_actor(path: Path) -> tuple[Actor, str]:
+def load_actor(path: Path) -> tuple[Actor | PlanActor, str]:
     """The actor of a snapshot's file, and the task that it was trained for.
 
     Raises:
@@ -41,7 +46,13 @@ def load_actor(path: Path) -> tuple[Actor, str]:
     try:
         if about["agent"] not in _METHODS:
             raise ValueError(f"it is of the agent {about['agent']}")
-        actor = Actor(about["config"]["size"], tuple(about["config"]["hidden"]))
+        config = about["config"]
+        size, hidden = config["size"], tuple(config["hidden"])
+        actor: Actor | PlanActor
+        if about["agent"] == "plan":
+            actor = PlanActor(size, hidden, steps=config["steps"])
+        else:
+            actor = Actor(size, hidden)
         actor.load_state_dict(weights)
         if not all(bool(each.isfinite().all()) for each in weights.values()):
             raise ValueError("its weights are not finite")

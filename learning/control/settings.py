@@ -16,7 +16,7 @@ from warp_deform.support.flag_range import COUNT, SEED, FlagRange
 
 __all__ = ["ControlTrainSettings", "GradientMethod"]
 
-GradientMethod = Literal["apg", "shac"]
+GradientMethod = Literal["apg", "shac", "plan"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,8 @@ class ControlTrainSettings:
     """Name of a task that a suction tip plays, or of one that is made for control, as whip-target.
     What would be moved first is held from the start."""
     method: GradientMethod = "apg"
-    """Gradients of whole episodes (apg), or of short horizons with a critic (shac)."""
+    """Gradients of whole episodes (apg), or of short horizons with a critic (shac), or of plans: a
+    network that plans a whole swing from its first observation (plan)."""
     minutes: Annotated[float, arg(metavar="M"), FlagRange(0.01, 1e5)] = 5.0
     """CPU minutes for the updates, as far as the costs measured at the beginning tell. Validation
     is not covered."""
@@ -35,8 +36,9 @@ class ControlTrainSettings:
     """Number of updates, in place of --minutes."""
     worlds: Annotated[int, arg(metavar="N"), FlagRange(1, 4096)] = 32
     """Episodes of an update, side by side."""
-    episodes: Annotated[int, arg(metavar="N"), FlagRange(1, 10_000)] = 512
-    """Seeds from 0 on among which an update draws its episodes; not fewer than --worlds."""
+    episodes: Annotated[int | None, arg(metavar="N"), FlagRange(1, 10_000)] = None
+    """Seeds from 0 on among which an update draws its episodes; not fewer than --worlds. By
+    default, 512, and 2048 for plan."""
     horizon: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Control steps of an episode. By default, the task's; 200 for tasks of the benchmark."""
     lr: Annotated[float | None, arg(metavar="LR"), FlagRange(1e-12, 1e3)] = None

@@ -19,8 +19,9 @@ from warp_deform.support.progress import progress_bar
 from ..evaluation.protocol import FIRST_SEED
 from ..runs.log import LINE_STEPS, TrainingLog
 from ..training.processes import join_processes
-from .actor import Actor
+from .actor import Actor, PlanActor
 from .apg import Apg, ApgConfig
+from .plan import Plan, PlanConfig
 from .play import play_control
 from .run import ControlRun
 from .saved import load_actor, save_actor
@@ -29,14 +30,22 @@ from .shac import Shac, ShacConfig
 
 __all__ = ["ControlTrainConfig", "ControlTrainReport", "Learner", "make_learner", "train_control"]
 
+_METHODS: dict[str, tuple[type[ApgConfig | ShacConfig | PlanConfig], int]] = {
+    "apg": (ApgConfig, 512),
+    "shac": (ShacConfig, 512),
+    "plan": (PlanConfig, 2048),
+}
+"""Settings of each method, and episodes among which its updates draw by default."""
 _TIMED = 3
 """Updates that are timed to plan the others."""
 
 
 class Learner(Protocol):
-    """What every method is: see `Apg` and `Shac`."""
+    """What every method is: see `Apg`, `Shac` and `Plan`."""
 
-    actor: Actor
+    @property
+    def actor(self) -> Actor | PlanActor:
+        """What is trained."""
 
     def update(self, number: int) -> dict[str, float]:
         """One update of the weights, counted from 1; `loss`, `gradient`, and more."""
@@ -52,17 +61,17 @@ class Learner(Protocol):
 class ControlTrainConfig(ControlTrainSettings):
     """The settings of a run, checked, and what a program alone can choose."""
 
-    own: ApgConfig | ShacConfig | None = None
+    own: ApgConfig | ShacConfig | PlanConfig | None = None
     """Of the method, in place of its defaults; `lr` changes it."""
     progress: bool = True
     """Tell of it on stderr, see `warp_deform.support.progress`."""
 
     def __post_init__(self) -> None:
-        if self.method not in ("apg", "shac"):
-            raise InputError(f"method is {self.method!r}; it must be 'apg' or 'shac'")
-        if self.episodes < self.worlds:
+        if self.method not in _METHODS:
+            raise InputError(f"method is {self.method!r}; it must be one of {', '.join(_METHODS)}")
+        if self.drawn < self.worlds:
             raise InputError(
-                f"an update draws {self.worlds} of {self.episodes} episodes; give --episodes "
+                f"an update draws {self.worlds} of {self.drawn} episodes; give --episodes "
                 f"{self.worlds} or more, or fewer --worlds"
             )
         if self.updates is not None and self.updates < self.snapshots:
@@ -70,14 +79,19 @@ class ControlTrainConfig(ControlTrainSettings):
                 f"{self.updates} updates do not make {self.snapshots} snapshots; take fewer"
             )
 
-    def method_config(self) -> ApgConfig | ShacConfig:
+    @property
+    def drawn(self) -> int:
+        """Episodes among which an update draws."""
+        return self.episodes or _METHODS[self.method][1]
+
+    def method_config(self) -> ApgConfig | ShacConfig | PlanConfig:
         """The settings of the method in force."""
-        own = self.own or (ApgConfig() if self.method == "apg" else ShacConfig())
+        own = self.own or _METHODS[self.method][0]()
         return own if self.lr is None else replace(own, lr=self.lr)
 
     def deciding(self) -> dict[str, Any]:
         """What a run is known by, in JSON types."""
-        said = asdict(self)
+        said = {**asdict(self), "episodes": self.drawn}
         for name in ("out", "progress", "own", "lr"):
             del said[name]
         if self.updates is not None:
@@ -195,9 +209,11 @@ def make_learner(
 ) -> Learner:
     """The method's actor in training, before its first update."""
     method = config.method_config()
-    options = {"episodes": config.episodes, "updates": updates, "seed": config.seed}
+    options = {"episodes": config.drawn, "updates": updates, "seed": config.seed}
     if isinstance(method, ApgConfig):
         return Apg(worlds, method, **options)
+    if isinstance(method, PlanConfig):
+        return Plan(worlds, method, **options)
     return Shac(worlds, method, **options)
 
 
@@ -211,8 +227,8 @@ def _planned(config: ControlTrainConfig, worlds: TensorControlWorlds) -> int:
         learner.update(1)
         costs.append(time.process_time() - began)
     began = time.process_time()
-    worlds.reset({slot: (config.worlds + slot) % config.episodes for slot in range(config.worlds)})
-    starts = (time.process_time() - began) * (config.episodes / config.worlds - 1)
+    worlds.reset({slot: (config.worlds + slot) % config.drawn for slot in range(config.worlds)})
+    starts = (time.process_time() - began) * (config.drawn / config.worlds - 1)
     seconds = 60 * config.minutes - starts
     count = int(seconds / statistics.median(costs))
     # whole lines of the log, which says what they cost

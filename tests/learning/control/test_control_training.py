@@ -50,19 +50,20 @@ def killed_at(number: int, monkeypatch: pytest.MonkeyPatch, kind: type = Apg) ->
     monkeypatch.setattr(kind, "update", dies)
 
 
-@pytest.mark.parametrize("method", ["apg", "shac"])
+@pytest.mark.parametrize("method", ["apg", "shac", "plan"])
 def test_killed_and_called_again_it_ends_with_the_same_weights(
     method: str, whole: Path, tmp_path: Path, often: None,
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    flags = ["--worlds", "8", "--episodes", "8", "--horizon", "2", "--updates", "4",
-             "--snapshots", "2", "--validate", "8", "--method", method]  # fmt: skip
-    if method == "shac":
+    flags = ["--worlds", "8", "--episodes", "8", "--updates", "4", "--snapshots", "2",
+             "--validate", "8", "--method", method]  # fmt: skip
+    flags += [] if method == "plan" else ["--horizon", "2"]
+    if method != "apg":
         whole = tmp_path / "whole"
         assert main(["train-control", "whip-target", "--out", str(whole), *flags]) == 0
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        killed_at(4, patch, training.Shac if method == "shac" else Apg)
+        killed_at(4, patch, {"apg": Apg, "shac": training.Shac, "plan": training.Plan}[method])
         assert main(["train-control", "whip-target", "--out", str(out), *flags]) == 130
     assert "updates up to 2 are kept, the same command goes on" in capfd.readouterr().err
     assert main(["train-control", "whip-target", "--out", str(out), *flags, "--json"]) == 0

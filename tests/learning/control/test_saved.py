@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from learning.control.actor import Actor
+from learning.control.actor import Actor, PlanActor
 from learning.control.saved import load_actor, save_actor
 from warp_deform.errors import InputError
 
@@ -21,6 +21,14 @@ def test_a_saved_actor_acts_the_same_to_the_bit(tmp_path: Path) -> None:
     assert sorted(each.name for each in path.parent.iterdir()) == [
         "step_00000004.json", "step_00000004.safetensors"
     ]  # fmt: skip
+
+
+def test_a_saved_plan_is_the_same_to_the_bit(tmp_path: Path) -> None:
+    actor, first = PlanActor(5, (8, 8), steps=7), torch.randn(20, 5)
+    first[:, -1] = 0.0
+    actor.norm.update(3.0 * first + 1.0)
+    again, _ = load_actor(save_actor(tmp_path, actor, task="whip", method="plan", updates=4))
+    assert isinstance(again, PlanActor) and torch.equal(again(first), actor(first))
 
 
 def test_what_is_no_actor_is_refused(tmp_path: Path) -> None:
