@@ -70,11 +70,11 @@ class FoldShirt(Task):
 
 
 def main(seeds: range) -> None:
-    worlds = Worlds(FoldShirt(), len(seeds), lanes=len(seeds))
+    worlds = Worlds(FoldShirt(), 8, lanes=8)
     for _, run in play(worlds, seeds, act=demonstrator("mpc"), look=Worlds.score):
         print(f"seed {run.seed}: {run.ended}, scores", *(f"{score:.2f}" for score in run.rows))
 
 
 if __name__ == "__main__":
     quiet_warp()
-    main(range(4))
+    main(range(2))

@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--out", default=tempfile.mkdtemp(), help="folder; a new one")
     out = parser.parse_args().out
     for command in (
-        f"demo cable-gather -n 2 --workers 2 --out {out}/demos --video {out}/demo.mp4",
+        f"demo cable-gather -n 2 --workers 1 --out {out}/demos --video {out}/demo.mp4",
         f"replay {out}/demos --verify",
         f"train cable-gather --agent gt-mlp --data {out}/demos --out {out}/run "
         "--steps 50 --snapshots 1",

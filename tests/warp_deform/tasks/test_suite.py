@@ -178,8 +178,8 @@ def test_demonstrator_solves_most_of_a_few_seeds_within_the_limit(name: str) -> 
         reports = side.step({i: a for i, a in actions.items() if a is not None})
         assert all(isinstance(report.outcome, Outcome) for report in reports.values())
         running = {i for i in reports if not side.solved(i) and episodes[i].physics_ok}
-        if not running:
-            break
+        if not running or sum(side.solved(slot) for slot in seeds) >= least:
+            break  # the others could only add to it
     assert sum(side.solved(slot) for slot in seeds) >= least
 
 
