@@ -223,6 +223,7 @@ class DifferentiableRollout:
             )
         for k, w in enumerate(self._worlds):
             if name == "inverse_masses":
+                data.edits += 1
                 data.lane("particles.w0", w)[:] = values[k]
                 data.lane("particles.w", w)[:] = values[k]
             else:

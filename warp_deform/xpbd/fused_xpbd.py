@@ -113,6 +113,7 @@ class FusedXPBD:
             place = self.data.per_world(f"group.{name}", world)
             if (place != place.dtype.type(value)).any():
                 self.data.wake(world)
+                self.data.edits += 1
             place[:] = value
 
     def set_duration(
@@ -153,6 +154,7 @@ class FusedXPBD:
 
     def _gravity(self) -> None:
         gravity = self.model.gravity.numpy()
+        self.data.edits += 1
         for w in range(self.data.world_count):
             self.data.per_world("group.gravity", w)[:] = gravity[min(w, len(gravity) - 1)][:, None]
             self.data.wake(w)

@@ -22,6 +22,7 @@ from warp_deform.rollout import (
 )
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
+from warp_deform.xpbd.packing.parts import set_parts
 
 CABLE = CableConfig(beads=10)
 CUBE = BoxConfig(mass=0.05, friction=0.8)
@@ -308,3 +309,48 @@ def test_it_runs_the_bits_of_a_control_loop_and_worlds_begin_again() -> None:
     # what began again does not depend on where it was before
     assert x.grad[0].any()
     assert not x.grad[1].any()
+
+
+def test_what_is_changed_between_steps_counts_from_the_next_on() -> None:
+    """As in a `ControlLoop`, to the bit; and each step goes back with what it was run with."""
+    held, ends, gradients = 1, [], []
+    for kind in (ControlLoop, TensorControlLoop):
+        solver = cables(1)
+        start, knots = solver.particle_q(0), ways(solver, 0, held)
+        targets = torch.from_numpy(knots[:, None]).requires_grad_()
+        loop = kind(solver)
+        loop.begin([0])
+        loop.hold(0, particle=held)
+        for step in range(STEPS):
+            if step == 2:
+                solver.set_world(0, damping=2.0, table_friction=0.05)
+                set_parts(
+                    solver.data, 0, "rest_lengths", 0.95 * solver.data.topologies[0].spring_length
+                )
+            state = loop.advance(targets[step] if kind is TensorControlLoop else knots[step, None])
+        ends.append(solver.particle_q(0))
+        if kind is TensorControlLoop:
+            (gradient,) = torch.autograd.grad(loss(state), targets)
+            gradients.append(gradient.numpy())
+        loop.end()
+    assert np.array_equal(*ends) and not np.array_equal(ends[0], start)
+
+    def value(shift: float) -> float:
+        solver = cables(1)
+        loop = TensorControlLoop(solver)
+        loop.begin([0])
+        loop.hold(0, particle=held)
+        moved = torch.from_numpy(knots[:, None] + shift * way)
+        for step in range(STEPS):
+            if step == 2:
+                solver.set_world(0, damping=2.0, table_friction=0.05)
+                set_parts(
+                    solver.data, 0, "rest_lengths", 0.95 * solver.data.topologies[0].spring_length
+                )
+            state = loop.advance(moved[step])
+        loop.end()
+        return float(loss(state))
+
+    way = gradients[0] / np.linalg.norm(gradients[0])
+    measured = (value(1e-7) - value(-1e-7)) / 2e-7
+    assert measured == pytest.approx(np.linalg.norm(gradients[0]), rel=1e-4)

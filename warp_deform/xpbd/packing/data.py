@@ -58,6 +58,8 @@ class SolverData(PackedWorlds):
         pairs_per_particle: int = 48,
     ) -> None:
         super().__init__(model, scalar=scalar, lanes=lanes)
+        self.edits = 0
+        """How often what the worlds are made of was changed, for those who keep a copy of it."""
         self._fill_topologies(pairs_per_particle)
         add_sheets(self, pairs_per_particle)
         self._fill_particles()
@@ -298,6 +300,7 @@ class SolverData(PackedWorlds):
             raise ValueError(
                 f"body {body} has {len(shapes)} boxes; only a single one can be changed"
             )
+        self.edits += 1
         views, row = self.views, self.body_rows(world).start + body
         start = int(views["group.shape_start"][group]) + lane * len(owner)
         views["shapes.half"][start + shapes[0]] = np.asarray(size) / 2

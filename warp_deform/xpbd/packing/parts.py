@@ -48,6 +48,7 @@ def set_parts(data: SolverData, world: int, name: str, values: np.ndarray) -> No
     if not np.isfinite(values).all() or not ((values > 0) | (may_be_zero & (values == 0))).all():
         raise InputError(f"{name} must be positive numbers, got {values.min()}")
     springs, particles = _rows(data, k)
+    data.edits += 1
     if name == "radii":
         data.views["topology.radius"][particles] = values
         start = data.views["topology.pair_start"]

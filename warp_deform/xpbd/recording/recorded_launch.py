@@ -72,6 +72,7 @@ class RecordedLaunch(ContinuedLaunch):
         self._taken = [name for name in INPUTS if name not in self.arrays]
         self.arrays |= {name: data.arrays[name].like() for name in self._taken}
         self._inputs: dict[str, np.ndarray] = {}
+        self._edits = -1
         self._checkpoints = Checkpoints(data, self._control, self.arrays)
         self._room = TapeRoom(data, self._control)
         self._parts: dict[int, _Part] = {}
@@ -106,6 +107,7 @@ class RecordedLaunch(ContinuedLaunch):
 
     def _take_inputs(self) -> None:
         """Take over what the scenes are made of now."""
+        self._edits = self.data.edits
         for name in self._taken:
             self.arrays[name].view[...] = self.data.views[name]
         if not self._inputs or any(
@@ -115,7 +117,7 @@ class RecordedLaunch(ContinuedLaunch):
             self._inputs = {name: self.arrays[name].view.copy() for name in self._taken}
 
     def _run_kernel(self, *, begins: bool) -> None:
-        if begins:
+        if begins or self._edits != self.data.edits:
             self._take_inputs()
         if begins or not self.recording:
             super()._run_kernel(begins=begins)
