@@ -1,31 +1,41 @@
 """Ports of published control tasks: what doing nothing, chance, a script and searches come to.
 
-    python benchmarks/ports.py [--tasks TASK...] [--methods METHOD...] [--evaluations N]
+    python benchmarks/ports.py [--tasks TASK...] [--methods METHOD...] [--goals N] [--seconds S]
 
-Goals are those of 4 test seeds from 10,000; means over them. "idle" does nothing, "random" draws
-actions evenly, one plan a seed, "script" is `FoldPlayer` or `SpreadPlayer` with fixed picks, where
-a task has one, "cem" and "cmaes" are `optimize` over the plans of `EpisodeProblem`. A total is the
-sum of the scores of all steps, DLO-Lab's return; a score is that of the end; away is the task's
-loss at the end; solved and guards are shares at the end. Rows of other tasks and methods stay in
-the file.
+Goals are those of test seeds from 10,000; scores, totals and losses are means over them. "idle"
+does nothing, "chance" draws actions evenly, one plan a goal, "script" is `FoldPlayer` or
+`SpreadPlayer` with fixed picks, where a task has one. "random", "cem" and "cmaes" are `optimize`
+over the plans of `EpisodeProblem`, with S CPU seconds a goal. A total is the sum of the scores of
+all steps, DLO-Lab's return; a score is that of the end; away is the task's loss at the end.
+`solved` and `guards` count goals. What has a row is left out, so the command goes on after an
+interruption; two processes may share OUT, with different tasks, if one merges their rows.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warp_deform.control import EpisodeProblem, optimize
 from warp_deform.control.episode_problem import PlayedPlans
 from warp_deform.control.plan_players import FoldPlayer, Player, SpreadPlayer
+from warp_deform.support.revision import running_revision
 
-GOALS = 4
-TASKS = ("push-cable", "fold-fabric-3", "unfold-fabric-1", "unfold-fabric-3", "gather")
-CORNERS = np.array([[-1, -1, -0.1, -0.1], [1, -1, 0.1, -0.1], [-1, 1, -0.1, 0.1]])
-"""Picks and places of fold-fabric-3, see `FoldPlayer`."""
+TASKS = (
+    "push-cable", "fold-fabric-1", "fold-fabric-3", "unfold-fabric-1", "unfold-fabric-3", "gather"
+)  # fmt: skip
+SEARCHES = ("random", "cem", "cmaes")
+METHODS = ("idle", "chance", "script", *SEARCHES)
+CORNERS = {
+    "fold-fabric-1": np.array([[-1, -1, 1, 1]]),
+    "fold-fabric-3": np.array([[-1, -1, -0.1, -0.1], [1, -1, 0.1, -0.1], [-1, 1, -0.1, 0.1]]),
+}
+"""Picks and places that fold, see `FoldPlayer`."""
 
 
 class Chance:
@@ -51,66 +61,80 @@ class Idle(Chance):
 
 
 def told(played: PlayedPlans) -> dict[str, float]:
-    """Means over the goals."""
+    """Means over the goals, and counts of goals."""
+    usable = np.isfinite(played.losses)
     return {
         "score": float(played.scores.mean()),
         "total": float(played.returns.mean()),
-        "away": float(np.nanmean(played.losses)) if np.isfinite(played.losses).any() else -1.0,
-        "solved": float(played.solved.mean()),
-        "guards": float((~np.isfinite(played.losses)).mean()),
+        "away": float(played.losses[usable].mean()) if usable.any() else -1.0,
+        "solved": int(played.solved.sum()),
+        "guards": int((~usable).sum()),
     }
 
 
-def played_by(problem: EpisodeProblem, method: str, evaluations: int) -> tuple[PlayedPlans, float]:
-    """What a method's plans come to, and what it took in CPU seconds."""
-    usual, numbers = problem.player, np.arange(GOALS, dtype=float)[:, None, None]
-    if method in ("cem", "cmaes"):
-        found = optimize(problem, method, evaluations=evaluations)
-        return problem.play(range(GOALS), found.numbers), found.cpu_seconds
+def played_by(
+    problem: EpisodeProblem, task: str, method: str, seconds: float
+) -> tuple[PlayedPlans, dict[str, float]]:
+    """What a method's plans come to, and what it took: evaluations and CPU seconds a goal."""
+    goals, usual = range(problem.goals), problem.player
+    if method in SEARCHES:
+        found = optimize(problem, method, seconds=seconds * problem.goals)
+        took = {
+            "evaluations": found.evaluations,
+            "cpu_s_a_goal": found.cpu_seconds / problem.goals,
+        }
+        return problem.play(goals, found.numbers), took
+    numbers = np.arange(problem.goals, dtype=float)[:, None, None]
     player: Player = Idle() if method == "idle" else Chance()
     if method == "script":
         assert isinstance(usual, FoldPlayer), "others have no script"
-        numbers, player = np.zeros((GOALS, *usual.shape)), usual
-        if usual.flat == "particle_q":
-            numbers += CORNERS
+        numbers, player = np.zeros((problem.goals, *usual.shape)), usual
+        if task in CORNERS:
+            numbers += CORNERS[task]
         else:
             player = SpreadPlayer(usual.control, usual.flat, usual.columns, usual.shape[0])
     problem.player = player
-    played = problem.play(range(GOALS), numbers)
+    played = problem.play(goals, numbers)
     problem.player = usual
-    return played, 0.0
+    return played, {"evaluations": 0, "cpu_s_a_goal": 0.0}
 
 
 def main() -> None:
+    """Measure what has no row yet."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/ports.jsonl"))
     parser.add_argument("--tasks", nargs="+", default=TASKS, choices=TASKS)
-    parser.add_argument("--methods", nargs="+", default=["idle", "random", "script", "cem"])
-    parser.add_argument("--evaluations", type=int, default=100)
+    parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
+    parser.add_argument("--goals", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=5.0, help="CPU seconds a goal to search")
     parser.add_argument("--plans", type=Path, help="folder for what was found, as .npy")
     options = parser.parse_args()
-    rows = {}
-    if options.out.exists():
-        for line in options.out.read_text().splitlines():
-            row = json.loads(line)
-            rows[row["task"], row["method"]] = row
+    lines = options.out.read_text().splitlines() if options.out.exists() else []
+    rows = {key(row): row for row in map(json.loads, lines)}
     for task in options.tasks:
-        problem = EpisodeProblem(task, range(10_000, 10_000 + GOALS))
+        problem: EpisodeProblem | None = None
         for method in options.methods:
-            if method == "script" and "fabric" not in task:
-                continue
-            played, seconds = played_by(problem, method, options.evaluations)
-            searched = options.evaluations if seconds else 0
             row = {
-                "task": task, "method": method, "goals": GOALS, "evaluations": searched,
-                **told(played), "cpu_s_a_goal": seconds / GOALS,
+                "task": task, "method": method, "goals": options.goals,
+                "seconds": options.seconds if method in SEARCHES else 0.0,
             }  # fmt: skip
-            rows[task, method] = row
+            if key(row) in rows or (method == "script" and "fabric" not in task):
+                continue
+            seeds = range(10_000, 10_000 + options.goals)
+            problem = problem or EpisodeProblem(task, seeds)
+            played, took = played_by(problem, task, method, options.seconds)
+            row |= {**told(played), **took, "revision": asdict(running_revision())}
+            rows[key(row)] = row
             print(json.dumps(row), flush=True)
             if options.plans:
                 np.save(options.plans / f"{task}-{method}.npy", played.actions)
-            lines = [json.dumps(rows[key]) for key in sorted(rows)]
-            options.out.write_text("\n".join(lines) + "\n")
+            written = [json.dumps(rows[each]) for each in sorted(rows)]
+            options.out.write_text("\n".join(written) + "\n")
+
+
+def key(row: dict[str, Any]) -> tuple[str, str, float]:
+    """What a row is the only one of."""
+    return row["task"], row["method"], row["seconds"]
 
 
 if __name__ == "__main__":
