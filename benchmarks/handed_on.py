@@ -69,8 +69,8 @@ def played(name: str, episodes: int) -> dict[str, Any]:
     return {
         "policy": name, "environment": result["environment"], "agent": result["agent"],
         "demos": result["demos"], "n_success": test["n_success"], "n_episodes": test["n_episodes"],
-        "low": low, "high": high, "mean_score": test["mean_score"],
-        "mean_actions": test["mean_actions"],
+        "low": low, "high": high, "n_success_enclosed": test["n_success_enclosed"],
+        "mean_score": test["mean_score"], "mean_actions": test["mean_actions"],
         "bytes": sum(file.stat().st_size for file in (POLICIES / name).rglob("*.safetensors")),
         "revision": result["revision"],
     }  # fmt: skip
