@@ -3,8 +3,8 @@
     python benchmarks/bags_at_rest.py [--bags 40] [--out benchmarks/results/bags_at_rest.json]
 
 Bags are thrown and come to rest. Then 1.5 s go by: once as they are, and once from the same places
-in a solver without sleep, at once and after some seconds without sleep. A bag's movement is that of
-its worst vertex.
+and from rest in a solver without sleep, at once and after some seconds without sleep. A bag's
+movement is that of its worst vertex.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ def main() -> None:
     parser.add_argument("--bags", type=int, default=40, help="a multiple of 8")
     parser.add_argument("--out", type=Path, help="a JSON file for the rows")
     options = parser.parse_args()
+    if options.bags < LANES or options.bags % LANES:
+        parser.error(f"--bags is a multiple of {LANES}, not {options.bags}")
     quiet_warp()
     awake, _ = bag_solver(LANES, lanes=LANES, solver=replace(BAG_SOLVER, sleep_speed=0.0))
     moved: dict[str, list[float]] = {}

@@ -7,8 +7,8 @@ does nothing, "chance" draws actions evenly, one plan a goal, "script" is `FoldP
 `SpreadPlayer` with fixed picks, where a task has one. "random", "cem" and "cmaes" are `optimize`
 over the plans of `EpisodeProblem`, with S CPU seconds a goal. A total is the sum of the scores of
 all steps, DLO-Lab's return; a score is that of the end; away is the task's loss at the end.
-`solved` and `guards` count goals. What has a row is left out, so the command goes on after an
-interruption; two processes may share OUT, with different tasks, if one merges their rows.
+`solved` and `guards` count goals. What has a row of as many goals and seconds is left out, so the
+command goes on after an interruption.
 """
 
 from __future__ import annotations
@@ -132,9 +132,9 @@ def main() -> None:
             options.out.write_text("\n".join(written) + "\n")
 
 
-def key(row: dict[str, Any]) -> tuple[str, str, float]:
+def key(row: dict[str, Any]) -> tuple[str, str, int, float]:
     """What a row is the only one of."""
-    return row["task"], row["method"], row["seconds"]
+    return row["task"], row["method"], row["goals"], row["seconds"]
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import ports
 
 
-def test_each_row_is_measured_once(tmp_path, monkeypatch, capsys) -> None:
+def test_each_row_is_measured_once(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "rows.jsonl"
     arguments = ["--tasks", "push-cable", "--goals", "2", "--seconds", "0.1", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", ["ports.py", *arguments, "--methods", "idle", "random"])
@@ -23,5 +23,6 @@ def test_each_row_is_measured_once(tmp_path, monkeypatch, capsys) -> None:
     assert (random["method"], random["evaluations"], random["seconds"]) == ("random", 25, 0.1)
     # the best of 25 draws beats doing nothing, by the loss that they are chosen by
     assert random["away"] < idle["away"] and random["goals"] == idle["goals"] == 2
+    assert ports.key(idle) != ports.key(idle | {"goals": 20}), "other goals are another row"
     monkeypatch.setattr(ports, "EpisodeProblem", lambda *_: pytest.fail("it has its rows"))
     ports.main()
