@@ -39,7 +39,8 @@ class SolverConfig:
     rest_seconds: float = 0.05
     """At rest for so long ends a world's rollout [s]."""
     viscosity: float = 0.0
-    """Rate at which neighbours in a fabric take on one velocity, but for its turning [1/s]."""
+    """Rate at which neighbours in a fabric take on one velocity, but for its turning [1/s]; refused
+    where it would be unstable with the fabrics' meshes and the substep."""
     sleep_speed: float = 0.0
     """Particles of fabrics with a lower mean speed fall asleep where something carries them [m/s];
     0: none does."""

@@ -6,6 +6,7 @@ states nor its steps.
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from .group_launch import GroupLaunch
 from .guards import PhysicsError, Problem, WatchValues
 from .kernels.forward import forward_kernel
 from .packing.data import WATCHED, SolverData
+from .packing.topology import greatest_loss, pieces
 from .springs.viscosity import DAMP_EVERY
 
 __all__ = ["FOREVER", "FusedXPBD"]
@@ -85,6 +87,7 @@ class FusedXPBD:
         self._launch_settings: Any = None
         self._cached_settings: tuple[Any, Any] | None = None
         self._gravity()
+        self._viscous_share(self.config.viscosity, DAMP_EVERY * self.config.dt)
         # padded lanes divide by their stiffness as well
         self.data.views["group.stiffness"][:] = 1.0
         self.activate()
@@ -241,7 +244,7 @@ class FusedXPBD:
         settings.margin = config.margin
         settings.rest_speed = config.rest_speed
         settings.damp_every = damp_every
-        settings.viscous = -math.expm1(-config.viscosity * damp_every * dt)
+        settings.viscous = self._viscous_share(config.viscosity, damp_every * dt)
         settings.sleep = config.sleep_speed
         settings.sleep_after = config.sleep_seconds
         settings.wake = config.wake_speed
@@ -252,6 +255,28 @@ class FusedXPBD:
         settings.particle_stride = int(data.group_particle[-1])
         settings.body_stride = int(data.group_body[-1])
         return settings
+
+    def _viscous_share(self, viscosity: float, seconds: float) -> float:
+        """Share of their relative velocity that neighbours lose in so many seconds."""
+        share = -math.expm1(-viscosity * seconds)
+        most = self._greatest_loss if share > 0.0 else 1.0
+        if share > most:
+            raise InputError(
+                f"a viscosity of {viscosity:g}/s would shake these fabrics apart: with this "
+                f"substep it may be {-math.log1p(-most) / seconds:.3g}/s at most"
+            )
+        return share
+
+    @functools.cached_property
+    def _greatest_loss(self) -> float:
+        """Largest share that neighbours of any fabric may lose at once, by the model's masses."""
+        data, inverse = self.data, self.model.particle_inv_mass.numpy().astype(float)
+        alike = {
+            (k, inverse[ids].tobytes()): (data.topologies[k], inverse[ids])
+            for k, ids in zip(data.world_topology, data.particle_ids, strict=True)
+        }
+        losses = [greatest_loss(pairs, w) for top, w in alike.values() for pairs in pieces(top)]
+        return min(losses, default=math.inf)
 
     def _recorded(self, settings: Any) -> GroupLaunch:
         """A recorded launch: three times cheaper to repeat than an eager one."""

@@ -23,6 +23,7 @@ from fixtures.solver_scenes import (
     velocities,
 )
 
+from warp_deform.errors import InputError
 from warp_deform.objects import (
     BoxConfig,
     CableConfig,
@@ -139,6 +140,28 @@ def test_viscosity_conserves_both_momenta_of_what_is_free(kind: str) -> None:
     assert ends["on"][2] < 0.99 * ends["off"][2]
     # springs have answered the turn by a hair's breadth
     assert ends["turning"][2] == pytest.approx(ends["turning off"][2], rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["fabric", "bag"])
+def test_a_viscosity_that_would_shake_a_fabric_apart_is_refused(kind: str) -> None:
+    """What is just below the limit calms every motion; a hundredth above it the solver says no."""
+    config = replace(SOLVERS[kind], sleep_speed=0.0, max_speed=1e3, limits=LOOSE)
+    with pytest.raises(InputError, match=r"at most$") as refused:
+        aloft(kind, 1.0, replace(config, viscosity=1e3))
+    most = float(str(refused.value).split()[-3].removesuffix("/s"))
+    with pytest.raises(InputError):
+        aloft(kind, 1.0, replace(config, viscosity=1.01 * most))
+    solver = aloft(kind, 1.0, replace(config, viscosity=0.99 * most))
+    with pytest.raises(InputError):
+        solver.run(1, dt=2 * DT)
+    set_gravity(solver, 0, np.zeros(3))
+    moves = np.random.default_rng(3).normal(0, 0.1, positions(solver).shape)
+    solver.data.lane("particles.v", 0)[:] = moves
+    energies = [momenta(solver)[2]]
+    for _ in range(5):
+        solver.run(round(0.2 / DT))
+        energies.append(momenta(solver)[2])
+    assert energies[-1] < 0.05 * energies[0] and max(energies) == energies[0]
 
 
 def test_nothing_sleeps_where_there_is_no_weight() -> None:

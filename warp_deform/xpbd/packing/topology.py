@@ -7,19 +7,21 @@ apart from where they start and how heavy they are; such worlds can share SIMD l
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 
 import newton
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.linalg import eigsh
 
 from ...errors import InputError
 from ...objects.attributes import NAMESPACE, SpringMode
 from ..springs.tether import NO_TETHER
 from .sheets import Sheets
 
-__all__ = ["WorldTopology", "pieces", "read_worlds", "runs", "tethers"]
+__all__ = ["WorldTopology", "greatest_loss", "pieces", "read_worlds", "runs", "tethers"]
 
 _RUN_OF_A_PASS = 10
 _BENDING = (int(SpringMode.BEND), int(SpringMode.BEAM))
@@ -170,6 +172,24 @@ def pieces(topology: WorldTopology) -> list[np.ndarray]:
     graph = csr_array((np.ones(len(ij)), (ij[:, 0], ij[:, 1])), shape=size)
     piece = connected_components(graph, directed=False)[1][ij[:, 0]]
     return [ij[piece == p] for p in np.unique(piece)]
+
+
+def greatest_loss(pairs: np.ndarray, w: np.ndarray) -> float:
+    """Largest share of their relative velocity that neighbours (N, 2) may lose at once.
+
+    With more, the fastest change of sign from neighbour to neighbour would grow. All lose by the
+    velocities before, so that v' = v - share W A v with the inverse masses w (P,) of the piece's
+    particles and the Laplacian A of the pairs, weighted by their reduced masses.
+    """
+    i, j = pairs.T
+    mass = 1.0 / np.maximum(w[i] + w[j], 1e-9)
+    ends = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
+    values = np.concatenate([mass, mass, -mass, -mass]) * np.sqrt(w[ends[0]] * w[ends[1]])
+    if not values.any():
+        return math.inf
+    matrix = csr_array((values, ends), shape=(len(w), len(w)))
+    start = np.cos(np.arange(len(w)))
+    return 2.0 / float(eigsh(matrix, 1, which="LA", v0=start, return_eigenvectors=False)[0])
 
 
 def _slices(worlds: np.ndarray, count: int, what: str) -> list[np.ndarray]:
