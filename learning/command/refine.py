@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from tyro.conf import arg
@@ -47,6 +48,8 @@ class RefineOptions(RefineSettings, CommandOptions):
     horizon: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """With --trajectories: control steps after which picks and places are given up that are led at
     20 Hz. By default the environment's, 200 for tasks of the benchmark."""
+    video: Annotated[Path | None, arg(metavar="FILE")] = None
+    """With --trajectories: film two refined episodes beside their originals into this MP4."""
 
 
 def refine(options: RefineOptions) -> Outcome:
@@ -59,7 +62,7 @@ def refine(options: RefineOptions) -> Outcome:
     quiet_warp()
     if options.trajectories:
         return _trajectories(options)
-    _refuse(options, ("evaluations", "horizon"), "goes with --trajectories")
+    _refuse(options, ("evaluations", "horizon", "video"), "goes with --trajectories")
     if options.method not in get_args(_OfActions):
         raise InputError(f"--method {options.method} goes with --trajectories")
     if options.way_points:
@@ -87,13 +90,18 @@ def _refuse(options: RefineOptions, names: Sequence[str], why: str) -> None:
 
 def _trajectories(options: RefineOptions) -> Outcome:
     """Refine demonstrations at 20 Hz."""
+    from ..refinement.film import check_filmed, film_refined
     from ..refinement.trajectories import TrajectoryConfig, refine_trajectories
 
     others = ("accept", "depth", "budget", "lifts", "way_points")
     _refuse(options, others, "does not go with --trajectories")
     if options.method in ("enumerate", "gradient"):
         raise InputError(f"--method {options.method} does not go with --trajectories")
+    if options.video is not None:
+        check_filmed(options.source, options.video)
     report = refine_trajectories(options.configure(TrajectoryConfig))
+    if options.video is not None:
+        film_refined(options.source, options.out, options.video)
     count = report.episodes
     text = (
         f"{options.out}: {report.improved} of {count} episodes improved; control steps "

@@ -21,6 +21,7 @@ from ..support.progress import progress_bar
 from ..tasks.registry import task as find_task
 from ..worlds.loop import SLOTS, SOLVED, play, worlds_for
 from .control_demos import ControlChunk, attempt_control_chunk, check_control, describe_control
+from .control_video import film_control
 from .folder import Attempt, Collection, append_attempt, check_seeds
 from .goals import load_goals
 from .recording import observe, record, task_config
@@ -129,7 +130,10 @@ def collect(config: CollectConfig) -> CollectReport:
         collection.keep(set(successes))
     report = _report(config, successes, attempts, time.perf_counter() - began)
     if config.video is not None and successes:
-        film(config.out, config.video, seeds=successes[:FILMED])
+        if config.control:
+            film_control([config.out], config.video, seeds=successes[:FILMED])
+        else:
+            film(config.out, config.video, seeds=successes[:FILMED])
     return report
 
 

@@ -53,8 +53,6 @@ def check_control(settings: CollectSettings) -> None:
         raise InputError(
             f"with --control the demonstrator is scripted or visible, not {settings.demonstrator}"
         )
-    if settings.video is not None:
-        raise InputError("--video films picks and places; leave it out with --control")
     if settings.horizon is not None and settings.horizon < 1:
         raise InputError(f"horizon is {settings.horizon}; it must be 1 control step or more")
     if settings.evaluations < 1:

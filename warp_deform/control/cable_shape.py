@@ -43,6 +43,10 @@ class CableShapeControl(ControlTask):
         """The layout with the goal where a plan has led."""
         return replace(layout, targets=self.aimed_at(particle_q))
 
+    def marks(self, layout: Layout) -> np.ndarray:
+        """The goal itself."""
+        return np.array(layout.targets, dtype=float)
+
     def losses(
         self,
         layouts: Sequence[Layout],

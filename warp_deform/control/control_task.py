@@ -64,6 +64,10 @@ class ControlTask(Task):
         """The layout whose goal is the state that a plan has led to, particles (P, 3) [m]."""
         raise TypeError(f"{self.name} has no goal that a plan leads to")
 
+    def marks(self, layout: Layout) -> np.ndarray:
+        """Points of the goal (n, 3) [m] that a film shows where no zone tells it."""
+        return np.zeros((0, 3))
+
 
 def horizon_of(task: Task, config: ControlConfig) -> int:
     """Control steps of an episode of `task`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ..objects.bag import Bag
 from ..objects.box import Box
 from ..objects.cable import Cable
 from ..objects.cloth import Cloth
-from ..objects.colors import TABLE
+from ..objects.colors import TABLE, Color
 from ..objects.scene_object import SceneObject
 from ..objects.zone import Zone
 
@@ -136,4 +136,21 @@ class Drawables:
             link_particle=np.array([k[:2] for k in links], np.int32).reshape(-1, 2),
             link_radius=np.array([k[2] for k in links], np.float32),
             link_segment=np.array([k[3] for k in links], np.int32),
+        )
+
+    def marked(self, first: int, count: int, radius: float, color: Color) -> Drawables:
+        """The same with spheres of one colour at further particles, `count` from `first` on."""
+        segment = max((ids.stop for ids in self.segments), default=FIRST_SEGMENT)
+        if segment > 255:
+            raise ValueError("no segmentation id is left for marks")
+        palette = self.palette.copy()
+        palette[segment] = color
+        more = np.arange(first, first + count, dtype=np.int32)
+        return replace(
+            self,
+            sphere_particle=np.concatenate([self.sphere_particle, more]),
+            sphere_radius=np.append(self.sphere_radius, np.full(count, radius, np.float32)),
+            sphere_segment=np.append(self.sphere_segment, np.full(count, segment, np.int32)),
+            palette=palette,
+            segments=(*self.segments, range(segment, segment + 1)),
         )

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from learning.refinement.film import check_filmed, film_refined
 from learning.refinement.refine import REFINED, REFINEMENT
 from learning.refinement.trajectories import (
     TrajectoryConfig,
@@ -150,3 +151,30 @@ def test_picks_and_places_are_led_first(tmp_path: Path, capsys: pytest.CaptureFi
     (info,) = EpisodeReader(out, control=True).infos()
     assert info.control is not None and info.extra[REFINEMENT]["demonstrator"] == "scripted"
     assert verify(out, workers=1)["mismatches"] == 0
+
+
+def test_a_film_shows_what_was_refined_beside_what_it_was(
+    demos: Path, refined: tuple[Path, TrajectoryReport], tmp_path: Path
+) -> None:
+    import imageio.v2 as imageio
+
+    path = tmp_path / "new" / "film.mp4"
+    check_filmed(demos, path)
+    film_refined(demos, refined[0], path)
+    assert imageio.get_reader(path).get_data(0).shape == (540, 1440, 3)
+
+
+def test_a_film_that_cannot_be_is_refused_before_anything_is_refined(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picks = tmp_path / "picks"
+    collect(CollectConfig(task=BLOCK, episodes=1, seed=6, out=picks, workers=1))
+    for source, flags, said in (
+        (picks, ["--trajectories", "--video", "f.mp4"], "picks and places"),
+        (demos, ["--trajectories", "--video", "f.gif"], "must end with .mp4"),
+        (demos, ["--video", "f.mp4"], "--video goes with --trajectories"),
+    ):
+        out = tmp_path / "out"
+        assert main(["refine", str(source), "--out", str(out), *flags]) == 2
+        error = capsys.readouterr().err
+        assert said in error and error.count("\n") == 1 and not out.exists()

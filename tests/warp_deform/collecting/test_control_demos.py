@@ -13,7 +13,9 @@ import pytest
 import warp_deform  # noqa: F401  (registers the ids)
 from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.collecting.control_runs import ControlRun, without_idle_end
+from warp_deform.collecting.control_video import film_control
 from warp_deform.collecting.replay import verify
+from warp_deform.collecting.video import FPS, STILL_SECONDS
 from warp_deform.command.main import main
 from warp_deform.control.control_worlds import ControlWorlds
 from warp_deform.control.tip_demonstrator import TipDemonstrator
@@ -25,7 +27,7 @@ from warp_deform.episodes import (
     EpisodeWriter,
     Step,
 )
-from warp_deform.errors import InputError
+from warp_deform.errors import InputError, WarpDeformError
 
 BLOCK, SEEDS = "block-notarget", (6, 7)
 
@@ -128,6 +130,45 @@ def test_growing_keeps_what_was_there_and_a_file_survives_reading(
     assert files(copies) == files(demos)
 
 
+def test_a_film_shows_every_row_and_the_goal_of_a_swing(
+    demos: Path, swing: Path, tmp_path: Path
+) -> None:
+    import imageio.v2 as imageio
+
+    path = tmp_path / "film.mp4"
+    film_control([demos, demos], path, seeds=[6], names=["one", "two"], size=(90, 160))
+    frames = np.stack([np.asarray(frame) for frame in imageio.get_reader(path)])
+    steps = EpisodeReader(demos, control=True).read(6).info.actions
+    seconds = steps / 20 + 2 * STILL_SECONDS
+    assert frames.shape[1:] == (90, 320, 3)
+    assert len(frames) / FPS == pytest.approx(seconds, abs=2.5 / FPS)
+    halves = frames[:, 30:, :160].astype(int), frames[:, 30:, 160:].astype(int)
+    assert np.abs(halves[0] - halves[1]).mean() < 2.0
+    moved = np.abs(np.diff(halves[0], axis=0)).max(axis=(1, 2, 3))
+    still = round(STILL_SECONDS * FPS)
+    assert (moved[2 : still - 2] < 40).all() and np.median(moved[still:-still]) > 60
+    seed = EpisodeReader(swing).seeds[0]
+    film_control([swing], path, seeds=[seed], size=(270, 480))
+    red, green, blue = (np.asarray(imageio.get_reader(path).get_data(0)).astype(int)[..., :3]).T
+    assert ((green > red + 60) & (green > blue + 60)).sum() >= 2, "the target is a green dot"
+
+
+def test_a_film_of_what_is_no_control_or_starts_otherwise_is_refused(
+    demos: Path, tmp_path: Path
+) -> None:
+    episode = EpisodeReader(demos, control=True).read(6)
+    first = dataclasses.replace(episode.steps[0], state_hash="0" * 32)
+    other = tmp_path / "other"
+    EpisodeWriter(other).write(dataclasses.replace(episode, steps=(first, *episode.steps[1:])))
+    with pytest.raises(WarpDeformError, match="start of seed 6 comes out differently"):
+        film_control([other], tmp_path / "film.mp4", seeds=[6])
+    picks = tmp_path / "picks"
+    collect(CollectConfig(task=BLOCK, episodes=1, seed=6, out=picks, workers=1))
+    with pytest.raises(InputError, match="no control at a fixed rate"):
+        film_control([picks], tmp_path / "film.mp4", seeds=[EpisodeReader(picks).seeds[0]])
+    assert not list(tmp_path.glob("*film*"))
+
+
 def test_what_takes_picks_and_places_refuses_control_in_one_line(
     demos: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -144,7 +185,7 @@ def test_what_takes_picks_and_places_refuses_control_in_one_line(
         (["--horizon", "30"], "--horizon goes with --control"),
         (["--pictures"], "--pictures goes with --control"),
         (["--control", "--demonstrator", "mpc"], "scripted or visible"),
-        (["--control", "--video", "f.mp4"], "--video films picks and places"),
+        (["--control", "--video", "f.gif"], "must end with .mp4"),
         (["--control", "--control-mode", "tip_velocity"], "tip_velocity"),
     ],
 )
