@@ -11,6 +11,7 @@ _HOME = {
     "ControlWorlds": ".control_worlds",
     "METHODS": ".plan_search",
     "EpisodeProblem": ".episode_problem",
+    "LedProblem": ".led_problem",
     "SwingProblem": ".swing_problem",
     "TensorControlWorlds": ".tensor_worlds",
     "TrajectoryProblem": ".trajectory_problem",

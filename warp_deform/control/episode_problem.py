@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError
+from ..tasks.task import Layout
 from ..worlds.state import WorldState
 from .control_task import ControlTask
 from .control_worlds import ControlWorlds
@@ -48,6 +49,7 @@ class _Start:
     """What an episode goes on from."""
 
     state: WorldState
+    layout: Layout
     asked: np.ndarray
     floor: float
     grip: tuple[int | None, int | None]
@@ -90,13 +92,14 @@ class EpisodeProblem:
             raise InputError(f"{found.name} is not made for control, so it has no plans")
         self.task, self.seeds = found, [int(seed) for seed in seeds]
         self.player = player or _player(found)
-        self._starts = [self._start(seed) for seed in self.seeds]
+        self.starts = [self._start(seed) for seed in self.seeds]
 
     def _start(self, seed: int) -> _Start:
         control = self.control
         control.reset({0: seed})
         return _Start(
             control.worlds.state(0),
+            control.worlds.episodes[0].layout,
             control.targets.asked[0].copy(),
             float(control.targets.floors[0]),
             control.grips[0],
@@ -112,11 +115,17 @@ class EpisodeProblem:
         """Of the free numbers of a plan."""
         return self.player.shape
 
+    def player_of(self, numbers: np.ndarray) -> Player:
+        """Who plays plans (n, K, M): the player, or motions with three free numbers in K steps."""
+        if numbers.shape[-2:] == self.player.shape:
+            return self.player
+        return SmoothPlayer(self.control.horizon, numbers.shape[-2])
+
     def evaluate(self, numbers: np.ndarray) -> np.ndarray:
         """Losses (G, N) of plans (G, N, *shape); inf where a guard fires."""
         count, each = numbers.shape[:2]
         of = np.repeat(np.arange(count), each)
-        played = self.play(of, numbers.reshape(-1, *self.shape))
+        played = self.play(of, numbers.reshape(-1, *numbers.shape[2:]))
         losses = played.losses
         if isinstance(self.task, LedCable):
             lacks = 1.0 - played.returns / self.control.horizon
@@ -136,19 +145,18 @@ class EpisodeProblem:
         control, slots = self.control, list(range(len(of)))
         worlds, solver = control.worlds, control.worlds.solver
         for slot, goal in zip(slots, of, strict=True):
-            start = self._starts[goal]
+            start = self.starts[goal]
             worlds.restore(slot, start.state)
             control.targets.place([slot], start.asked[None])
             control.targets.floors[slot], control.grips[slot] = start.floor, start.grip
         layouts = [worlds.episodes[slot].layout for slot in slots]
-        self.player.begin(numbers, layouts)
+        player = self.player_of(numbers)
+        player.begin(numbers, layouts)
         rows, returns = [], np.zeros(len(of))
         pays = isinstance(self.task, LedCable)
         for step in range(control.horizon):
             particle_q = np.stack([solver.particle_q(slot) for slot in slots])
-            row = np.clip(
-                self.player.rows(step, control.targets.asked[slots, :3], particle_q), -1, 1
-            )
+            row = np.clip(player.rows(step, control.targets.asked[slots, :3], particle_q), -1, 1)
             rows.append(row)
             control.lead(slots, row)
             if pays:

@@ -12,7 +12,7 @@ from .modes import ControlConfig
 from .push_cable import push_actions
 from .smooth_plans import actions_of
 
-__all__ = ["FoldPlayer", "Player", "PushPlayer", "SmoothPlayer", "SpreadPlayer"]
+__all__ = ["FoldPlayer", "OpenPlayer", "Player", "PushPlayer", "SmoothPlayer", "SpreadPlayer"]
 
 _FOLD_STEPS = 60
 _OVER, _DOWN, _CARRY, _WAIT, _GO = 12, 16, 48, 53, 60
@@ -36,7 +36,29 @@ class Player(Protocol):
         """Actions (n, 4) of a step, with the tips at (n, 3) and the particles at (n, P, 3) [m]."""
 
 
-class SmoothPlayer:
+class OpenPlayer:
+    """What a plan does is fixed when it begins: three numbers of every step, and a tip that holds.
+
+    Attributes:
+        shape: of the free numbers of a plan
+    """
+
+    shape: tuple[int, int]
+
+    def moves(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> np.ndarray:
+        """The first three numbers (n, T, 3) of the actions of plans (n, *shape), one a world."""
+        raise NotImplementedError
+
+    def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
+        """See `Player`."""
+        self._moves = self.moves(numbers, layouts)
+
+    def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
+        """See `Player`."""
+        return np.pad(self._moves[:, step], ((0, 0), (0, 1)), constant_values=1.0)
+
+
+class SmoothPlayer(OpenPlayer):
     """Motions that change smoothly, of a tip that holds on.
 
     Args:
@@ -47,16 +69,12 @@ class SmoothPlayer:
     def __init__(self, steps: int, knots: int = 10) -> None:
         self.steps, self.shape = steps, (knots, 3)
 
-    def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
-        """See `Player`."""
-        self._moves = actions_of(numbers, self.steps)
-
-    def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
-        """See `Player`."""
-        return np.pad(self._moves[:, step], ((0, 0), (0, 1)), constant_values=1.0)
+    def moves(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> np.ndarray:
+        """See `OpenPlayer`; of any number of knots."""
+        return actions_of(numbers, self.steps)
 
 
-class PushPlayer:
+class PushPlayer(OpenPlayer):
     """Straight pushes of a box; numbers are where each begins, and by how much it goes [10 cm].
 
     They begin around the middle of the cable, as it lies at first.
@@ -65,9 +83,9 @@ class PushPlayer:
     def __init__(self, control: ControlConfig, pushes: int = 6) -> None:
         self.control, self.shape = control, (pushes, 4)
 
-    def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
-        """See `Player`."""
-        self._moves = np.stack(
+    def moves(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> np.ndarray:
+        """See `OpenPlayer`."""
+        return np.stack(
             [self._actions(plan, each) for plan, each in zip(numbers, layouts, strict=True)]
         )
 
@@ -75,10 +93,6 @@ class PushPlayer:
         begins = layout.particle_q[:, :2].mean(axis=0) + 0.1 * plan[:, :2]
         ends = np.stack([begins, begins + 0.1 * plan[:, 2:]], axis=1)
         return push_actions(layout.body_q[0, :2], ends, self.control)
-
-    def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
-        """See `Player`."""
-        return np.pad(self._moves[:, step], ((0, 0), (0, 1)), constant_values=1.0)
 
 
 class FoldPlayer:

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from warp_deform.control import CONTROL_TASKS, ControlWorlds, EpisodeProblem
-from warp_deform.control.plan_players import carry_rows
+from warp_deform.control import (
+    CONTROL_TASKS,
+    ControlConfig,
+    ControlWorlds,
+    EpisodeProblem,
+    LedProblem,
+    SwingProblem,
+    optimize,
+)
+from warp_deform.control.plan_players import FoldPlayer, carry_rows
 from warp_deform.control.push_cable import push_actions
 from warp_deform.control.registry import control_task
 from warp_deform.errors import InputError
@@ -164,3 +172,57 @@ def test_what_has_no_plans_is_said() -> None:
         EpisodeProblem("cable-ring", [0])
     with pytest.raises(InputError, match="multiple of 8"):
         EpisodeProblem("gather", [0], worlds=3)
+
+
+# -- gradients of what is held
+
+
+def test_the_gradients_of_a_held_cable_are_those_of_a_swing() -> None:
+    """Another chain of code to the same derivatives: one launch, and a loop of control steps."""
+    led = LedProblem("whip-target", [3, 4], worlds=8)
+    swing = SwingProblem("whip-target", [3, 4], worlds=8)
+    numbers = swing.refined(np.random.default_rng(0).normal(0, 1, (2, *swing.shape)))
+    losses, gradients = led.gradients(numbers, np.arange(2))
+    expected, known = swing.gradients(numbers, np.arange(2))
+    np.testing.assert_array_equal(losses, expected)
+    np.testing.assert_array_equal(led.evaluate(numbers[:, None])[:, 0], expected)
+    np.testing.assert_allclose(gradients, known, atol=1e-5 * np.abs(known).max())
+
+
+def test_the_gradients_of_pushes_are_those_of_their_losses() -> None:
+    """By differences over the last steps alone: what comes before makes them chaotic."""
+    problem = LedProblem("push-cable", [10_003], worlds=8)
+    rng = np.random.default_rng(0)
+    # one whose box still pushes at the end
+    plans = problem.refined(rng.normal(0, 0.3, (4, *problem.shape))[3:])
+    tried = problem.play([0], plans)
+    assert np.isfinite(tried.losses).all() and plans.shape == (1, 120, 3)
+    losses, gradients = problem.gradients(plans, np.arange(1))
+    assert losses[0] == pytest.approx(tried.losses[0], rel=1e-6)
+    for last in (2, 5):
+        way = np.zeros_like(plans)
+        way[:, -last:] = rng.normal(size=(1, last, 3))
+        way *= 3e-3 / np.linalg.norm(way)
+        ahead, behind = problem.evaluate(np.stack([plans + way, plans - way], axis=1))[0]
+        by_way = float((gradients * way).sum())
+        assert by_way != 0.0
+        assert (ahead - behind) / 2 == pytest.approx(by_way, rel=0.1)
+
+
+def test_a_descent_from_pushes_loses_nothing_and_plays_as_it_says() -> None:
+    problem = LedProblem("push-cable", [10_000, 10_001], worlds=8)
+    found = optimize(problem, "cem+adam", evaluations=60, population=8, seed=1)
+    assert found.gradients > 0 and found.numbers.shape == (2, 120, 3)
+    assert (np.diff(found.history, axis=0) <= 0).all()
+    np.testing.assert_allclose(problem.play([0, 1], found.numbers).losses, found.losses, rtol=1e-6)
+    searched = optimize(problem, "cem", evaluations=16, population=8, seed=1)
+    refined = problem.refined(searched.numbers)
+    played = [problem.play([0, 1], numbers).losses for numbers in (searched.numbers, refined)]
+    np.testing.assert_allclose(*played, rtol=1e-6)
+
+
+def test_gradients_are_refused_where_there_are_none() -> None:
+    with pytest.raises(InputError, match="may take and let go"):
+        LedProblem("fold-fabric-1", [0], worlds=8)
+    with pytest.raises(InputError, match="depend on what is seen"):
+        LedProblem("push-cable", [0], worlds=8, player=FoldPlayer(ControlConfig(), "targets", 2, 1))
