@@ -211,11 +211,11 @@ def test_the_gradients_of_pushes_are_those_of_their_losses() -> None:
 
 def test_a_descent_from_pushes_loses_nothing_and_plays_as_it_says() -> None:
     problem = LedProblem("push-cable", [10_000, 10_001], worlds=8)
-    found = optimize(problem, "cem+adam", evaluations=60, population=8, seed=1)
+    found = optimize(problem, "cem+adam", evaluations=14, population=4, seed=1)
     assert found.gradients > 0 and found.numbers.shape == (2, 120, 3)
     assert (np.diff(found.history, axis=0) <= 0).all()
     np.testing.assert_allclose(problem.play([0, 1], found.numbers).losses, found.losses, rtol=1e-6)
-    searched = optimize(problem, "cem", evaluations=16, population=8, seed=1)
+    searched = optimize(problem, "cem", evaluations=8, population=4, seed=1)
     refined = problem.refined(searched.numbers)
     played = [problem.play([0, 1], numbers).losses for numbers in (searched.numbers, refined)]
     np.testing.assert_allclose(*played, rtol=1e-6)
