@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -36,7 +37,7 @@ class Player(Protocol):
         """Actions (n, 4) of a step, with the tips at (n, 3) and the particles at (n, P, 3) [m]."""
 
 
-class OpenPlayer:
+class OpenPlayer(abc.ABC):
     """What a plan does is fixed when it begins: three numbers of every step, and a tip that holds.
 
     Attributes:
@@ -45,9 +46,9 @@ class OpenPlayer:
 
     shape: tuple[int, int]
 
+    @abc.abstractmethod
     def moves(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> np.ndarray:
         """The first three numbers (n, T, 3) of the actions of plans (n, *shape), one a world."""
-        raise NotImplementedError
 
     def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
         """See `Player`."""
