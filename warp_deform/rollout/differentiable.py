@@ -16,7 +16,6 @@ from ..xpbd.guards import WatchValues
 from ..xpbd.lanes.tape import Kind
 from ..xpbd.packing.parts import PARTS, set_parts
 from ..xpbd.recording.recorder import Recorder
-from ..xpbd.springs.viscosity import DAMP_EVERY
 from .rollouts import GripPath, prepare
 from .world_rows import WorldRows
 
@@ -99,7 +98,7 @@ class DifferentiableRollout:
         memory: int = 2**30,
         sleep: bool = True,
         dt: float | None = None,
-        damp_every: int = DAMP_EVERY,
+        damp_every: int | None = None,
     ) -> None:
         self.solver = solver
         self.recorder = Recorder(

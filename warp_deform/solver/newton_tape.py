@@ -19,7 +19,6 @@ from ..rollout.differentiable import DifferentiableRollout
 from ..rollout.rollouts import GripPath
 from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
-from ..xpbd.springs.viscosity import damp_every
 
 __all__ = ["TapedStep", "recording", "refuse_lost_derivatives", "unrecorded"]
 
@@ -138,9 +137,8 @@ class TapedStep:
         for kind in np.unique(topologies):
             worlds = [int(w) for w in np.flatnonzero(topologies == kind)]
             held = {w: path for w, path in paths.items() if w in worlds}
-            rollout = DifferentiableRollout(
-                solver, storage="full", dt=dt, damp_every=damp_every(steps)
-            )
+            every = solver.damp_every(steps, dt=dt)
+            rollout = DifferentiableRollout(solver, storage="full", dt=dt, damp_every=every)
             rollout.forward(worlds, [steps * dt], paths=held)
             values |= {w: rollout.watch[w] for w in worlds}
             self._runs.append((worlds, rollout, held))

@@ -15,7 +15,6 @@ from ..objects.attributes import NAMESPACE, register_attributes
 from ..xpbd.config import SolverConfig
 from ..xpbd.fused_xpbd import FOREVER, FusedXPBD
 from ..xpbd.guards import WatchValues
-from ..xpbd.springs.viscosity import damp_every
 from .newton_tape import TapedStep, recording, refuse_lost_derivatives, unrecorded
 from .stepping import grip_from_control, substeps
 
@@ -171,7 +170,8 @@ class SolverFusedXPBD(FusedXPBD, SolverBase):
         else:
             self.set_duration(FOREVER, FOREVER)
             self.activate()
-            values = self.run(steps, dt=substep, damp_every=damp_every(steps))
+            every = self.damp_every(steps, dt=substep)
+            values = self.run(steps, dt=substep, damp_every=every)
         self.write_state(state_out)
         return values
 

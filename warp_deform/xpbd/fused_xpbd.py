@@ -87,7 +87,7 @@ class FusedXPBD:
         self._launch_settings: Any = None
         self._cached_settings: tuple[Any, Any] | None = None
         self._gravity()
-        self._viscous_share(self.config.viscosity, DAMP_EVERY * self.config.dt)
+        self._viscous_share(self.config.viscosity, self.damp_every() * self.config.dt)
         # padded lanes divide by their stiffness as well
         self.data.views["group.stiffness"][:] = 1.0
         self.activate()
@@ -188,7 +188,7 @@ class FusedXPBD:
         *,
         record_every: int = 0,
         dt: float | None = None,
-        damp_every: int = DAMP_EVERY,
+        damp_every: int | None = None,
     ) -> list[WatchValues]:
         """Launch up to `max_steps` substeps; returns the guards' values by world.
 
@@ -198,15 +198,16 @@ class FusedXPBD:
         Args:
             dt: length of a substep [s], None: as configured. What is given per second, or in
                 seconds, is turned into shares and numbers of these substeps.
-            damp_every: substeps between two visits of viscosity, from the first one on; launches
-                that follow on each other need a divisor of `max_steps`
+            damp_every: substeps between two visits of viscosity, from the first one on; None: as
+                many as `damp_every` says
         """
         data = self.data
         frames = -(-max_steps // record_every) if record_every else 0
         if frames > data.frame_room:
             data.reserve_frames(frames)
             self._launch = None
-        settings = self._settings(max_steps, record_every, dt or self.config.dt, damp_every)
+        dt = dt or self.config.dt
+        settings = self._settings(max_steps, record_every, dt, damp_every or self.damp_every(dt=dt))
         data.clear_watch()
         inputs = {}
         if self.bundles is not None:
@@ -255,6 +256,20 @@ class FusedXPBD:
         settings.particle_stride = int(data.group_particle[-1])
         settings.body_stride = int(data.group_body[-1])
         return settings
+
+    def damp_every(self, steps: int = 0, *, dt: float | None = None) -> int:
+        """Substeps between two visits of viscosity: `DAMP_EVERY`, or what all the meshes bear.
+
+        Args:
+            steps: of a launch that others follow, which has its share: a divisor of it
+            dt: length of a substep [s], None: as configured
+        """
+        viscosity, dt = self.config.viscosity, dt or self.config.dt
+        numbers = [every for every in range(DAMP_EVERY, 0, -1) if steps % every == 0]
+        if viscosity == 0.0:
+            return numbers[0]
+        most = self._greatest_loss
+        return next((n for n in numbers if -math.expm1(-viscosity * n * dt) <= most), 1)
 
     def _viscous_share(self, viscosity: float, seconds: float) -> float:
         """Share of their relative velocity that neighbours lose in so many seconds."""

@@ -40,6 +40,7 @@ from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.block import BlockNotarget
 from warp_deform.tasks.cable_physics import CABLE_SOLVER
 from warp_deform.tasks.cloth_physics import FABRIC, FABRIC_SOLVER
+from warp_deform.xpbd.springs.viscosity import DAMP_EVERY
 
 DT = 1 / 1200
 SHELL = ClothConfig(
@@ -162,6 +163,27 @@ def test_a_viscosity_that_would_shake_a_fabric_apart_is_refused(kind: str) -> No
         solver.run(round(0.2 / DT))
         energies.append(momenta(solver)[2])
     assert energies[-1] < 0.05 * energies[0] and max(energies) == energies[0]
+
+
+@pytest.mark.parametrize("kind", ["fabric", "bag"])
+def test_viscosity_is_visited_as_often_as_the_mesh_asks_for(kind: str) -> None:
+    """Rarely in the tasks, at every substep where that is so long or the viscosity so high."""
+    config = replace(SOLVERS[kind], sleep_speed=0.0, max_speed=1e3, limits=LOOSE)
+    usual = aloft(kind, 1.0, config)
+    assert usual.damp_every() == usual.damp_every(60) == DAMP_EVERY
+    assert usual.damp_every(50) == 2, "a launch that others follow has its share"
+    # the peers' coarsest setting, with the tasks' viscosity
+    assert 1 <= usual.damp_every(dt=1 / 120) < DAMP_EVERY
+    thick = aloft(kind, 1.0, replace(config, viscosity=8 * config.viscosity))
+    assert 1 <= thick.damp_every() < DAMP_EVERY
+    set_gravity(thick, 0, np.zeros(3))
+    moves = np.random.default_rng(3).normal(0, 0.1, positions(thick).shape)
+    thick.data.lane("particles.v", 0)[:] = moves
+    before = momenta(thick)[2]
+    thick.run(round(0.2 / DT))
+    assert momenta(thick)[2] < 0.5 * before
+    recorded = DifferentiableRollout(thick).recorder._settings
+    assert recorded.damp_every == thick.damp_every() and recorded.viscous > 0
 
 
 def test_nothing_sleeps_where_there_is_no_weight() -> None:

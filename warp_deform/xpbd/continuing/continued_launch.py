@@ -15,7 +15,6 @@ from ..packing.data import KERNEL_ARGUMENTS
 from ..packing.mirrored import Mirrored
 from ..packing.topology import tethers
 from ..springs.tether import NO_TETHER
-from ..springs.viscosity import damp_every
 from .guard_notes import GuardNotes
 from .lane_runs import LaneRuns
 from .lasting_grips import LastingGrips
@@ -332,7 +331,7 @@ class ContinuedLaunch:
 
     def settings(self, substeps: int) -> Any:
         """The kernel's settings for so many substeps."""
-        every = damp_every(self.substeps)
+        every = self.solver.damp_every(self.substeps, dt=self.dt)
         return self.solver._new_settings(self.solver.config, substeps, 0, self.dt, every)
 
     def particles(self, name: str, worlds: Sequence[int] | None) -> np.ndarray:

@@ -18,7 +18,6 @@ from ..kernels.forward import forward_kernel
 from ..lanes.tape import COUNTERS, STATE
 from ..packing.data import KERNEL_ARGUMENTS
 from ..packing.mirrored import Mirrored
-from ..springs.viscosity import DAMP_EVERY
 from .checkpoint import Checkpoints
 from .derivatives import Derivatives
 from .sweep_arena import SWEPT, contact_notes
@@ -88,11 +87,11 @@ class Recorder:
         memory: int = 2**30,
         sleep: bool = True,
         dt: float | None = None,
-        damp_every: int = DAMP_EVERY,
+        damp_every: int | None = None,
     ) -> None:
         self.solver, self.storage = solver, check_storage(storage)
         self.memory, self.sleep = memory, sleep
-        self.dt, self.damp_every = dt or solver.config.dt, damp_every
+        self.dt, self._damp_every = dt or solver.config.dt, damp_every
         data = solver.data
         self._variant = data.variant
         self._settings = self._new_settings()
@@ -293,7 +292,8 @@ class Recorder:
     def _new_settings(self) -> Any:
         # one of its own: it is changed here and between launches
         self._config = self.solver.config
-        settings = self.solver._new_settings(self.solver.config, 0, 0, self.dt, self.damp_every)
+        every = self._damp_every or self.solver.damp_every(dt=self.dt)
+        settings = self.solver._new_settings(self.solver.config, 0, 0, self.dt, every)
         if not self.sleep:
             settings.sleep = 0.0
         return settings

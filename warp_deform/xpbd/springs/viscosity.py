@@ -20,18 +20,10 @@ import warp as wp
 from ..lanes.algebra import add, cross, div, dot, less, mul, select, sub  # noqa: F401
 from ..lanes.group_state import group_state
 
-__all__ = ["DAMP_EVERY", "damp_every", "viscosity", "viscosity_adjoint"]
+__all__ = ["DAMP_EVERY", "viscosity", "viscosity_adjoint"]
 
 DAMP_EVERY = 4
-"""Substeps between two visits: what is lost in so many is small, and a visit is dear."""
-
-
-def damp_every(steps: int) -> int:
-    """Substeps between two visits in a launch of so many that others follow, which has its share.
-
-    As many as in a rollout where that divides them.
-    """
-    return next(every for every in range(DAMP_EVERY, 0, -1) if steps % every == 0)
+"""Most substeps between two visits: what is lost in so many is small, and a visit is dear."""
 
 
 @functools.cache
