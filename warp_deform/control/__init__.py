@@ -12,6 +12,7 @@ _HOME = {
     "METHODS": ".plan_search",
     "EpisodeProblem": ".episode_problem",
     "LedProblem": ".led_problem",
+    "Replanner": ".replanner",
     "SwingProblem": ".swing_problem",
     "TensorControlWorlds": ".tensor_worlds",
     "TrajectoryProblem": ".trajectory_problem",

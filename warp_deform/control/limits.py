@@ -38,6 +38,18 @@ def soft_clamp(values: Any, low: Any, high: Any, width: float) -> Any:
     return soft_floor(-soft_floor(-values, -high, width), low, width)
 
 
+def _before_floor(values: Any, floor: Any, width: float) -> Any:
+    """What `soft_floor` gives `values` for, at most `_WIND_UP` widths below the floor."""
+    above = np.maximum((values - floor) / width, math.log1p(math.exp(-_WIND_UP)))
+    # for a value far above, exp would overflow where nothing is to be undone
+    return floor + width * np.where(above > 30.0, above, np.log(np.expm1(np.minimum(above, 30.0))))
+
+
+def _before_clamp(values: Any, low: Any, high: Any, width: float) -> Any:
+    """What `soft_clamp` gives `values` for."""
+    return -_before_floor(-_before_floor(values, low, width), -high, width)
+
+
 @dataclass(frozen=True)
 class TipLimits:
     """Smooth limits of a tip: the table, or what is held on it, below; the arm's reach around.
@@ -73,6 +85,15 @@ class TipLimits:
         radius = soft_clamp(library.hypot(x, y), near, far, self.reach)
         turn = soft_clamp(library.arctan2(y, x), -_TURN, _TURN, self.turn)
         return library.stack([radius * library.cos(turn), radius * library.sin(turn), z, yaw], -1)
+
+    def asked(self, tips: np.ndarray, floors: np.ndarray) -> np.ndarray:
+        """The targets (..., 4) that `project` leads to `tips` (..., 4): its inverse, see `kept`."""
+        x, y, z, yaw = (tips[..., k] for k in range(4))
+        near, far = self._radii(z)
+        radius = _before_clamp(np.hypot(x, y), near, far, self.reach)
+        turn = _before_clamp(np.arctan2(y, x), -_TURN, _TURN, self.turn)
+        z = _before_clamp(z, floors, self.ceiling, self.table)
+        return np.stack([radius * np.cos(turn), radius * np.sin(turn), z, yaw], -1)
 
     def kept(self, targets: Any, floors: Any) -> Any:
         """Targets (..., 4) as they are remembered: at most three widths beyond a limit.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,6 +57,8 @@ class SwingProblem:
             raise InputError(f"{found.name} holds nothing from the start, so it is no swing")
         self.task, self.seeds = found, [int(seed) for seed in seeds]
         self._solver = self._control.worlds.solver
+        self.steps = self._control.horizon
+        """Control steps T of a plan."""
         self._targets = TipTargets(
             "tip_delta_position", self._control.config, self._control.limits, worlds
         )
@@ -63,9 +66,10 @@ class SwingProblem:
         for first in range(0, len(self.seeds), worlds):
             states += self._starts(self.seeds[first : first + worlds])
         positions, velocities, floors, self.layouts = zip(*states, strict=True)
-        self._positions, self._velocities = np.stack(positions), np.stack(velocities)
         self._floors = np.array(floors)
         self._knot_times = self._times()
+        self._positions, self._velocities = np.stack(positions), np.stack(velocities)
+        self._tips = np.pad(self._positions[:, self._held].astype(float), ((0, 0), (0, 1)))
         self._run: DifferentiableRollout | None = None
 
     def _starts(self, seeds: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray, float, object]]:
@@ -87,6 +91,37 @@ class SwingProblem:
         clock = ticks.astype(number) * number(self._solver.config.dt)
         return np.append(clock.astype(float), 1e6)
 
+    @contextlib.contextmanager
+    def begun_at(
+        self, positions: np.ndarray, velocities: np.ndarray, tips: np.ndarray, *, steps: int
+    ) -> Iterator[None]:
+        """Within it plans begin at other states, and are so many steps long.
+
+        Args:
+            positions: of every goal's particles (G, P, 3) [m]
+            velocities: of these (G, P, 3) [m/s]
+            tips: where the tips were led last (G, 4), see `TipTargets.sent`
+            steps: that are left of an episode, 1 or more
+
+        Raises:
+            InputError: another shape, or no such number of steps.
+        """
+        kept = self._positions, self._velocities, self._tips
+        for name, given, own in zip(
+            ("positions", "velocities", "tips"), (positions, velocities, tips), kept, strict=True
+        ):
+            if np.shape(given) != own.shape:
+                raise InputError(f"{name} must have the shape {own.shape}, not {np.shape(given)}")
+        if not 1 <= steps <= self.horizon:
+            raise InputError(f"steps must be 1 to {self.horizon}, not {steps}")
+        self._positions, self._velocities = np.asarray(positions), np.asarray(velocities)
+        self._tips = self._control.limits.asked(np.asarray(tips, dtype=float), self._floors)
+        self.steps = steps
+        try:
+            yield
+        finally:
+            (self._positions, self._velocities, self._tips), self.steps = kept, self.horizon
+
     @property
     def goals(self) -> int:
         """Number of goals G."""
@@ -99,7 +134,7 @@ class SwingProblem:
 
     def actions(self, numbers: np.ndarray) -> np.ndarray:
         """Actions (..., T, 4) of the environment for plans (..., K, 3) of any number K."""
-        moves = actions_of(numbers, self._control.horizon)
+        moves = actions_of(numbers, self.steps)
         return np.concatenate([moves, np.ones((*moves.shape[:-1], 1))], axis=-1)
 
     def evaluate(self, numbers: np.ndarray) -> np.ndarray:
@@ -112,7 +147,7 @@ class SwingProblem:
 
         Particles are not numbers where a guard fires.
         """
-        actions = self.actions(numbers).reshape(-1, self._control.horizon, 4)
+        actions = self.actions(numbers).reshape(-1, self.steps, 4)
         of = np.repeat(np.arange(len(numbers)), numbers.shape[1])
         room = self._control.worlds.count
         parts = [slice(first, first + room) for first in range(0, len(actions), room)]
@@ -122,7 +157,7 @@ class SwingProblem:
         solver, worlds = self._solver, list(range(len(of)))
         steps = self._led(of, actions)
         self._put(of)
-        seconds = self._control.horizon * self._control.control.loop.seconds
+        seconds = self.steps * self._control.control.loop.seconds
         paths = self._paths(of, steps)
         runs = rollout(solver, worlds, paths=paths, least=2 * seconds, most=seconds)
         ends = np.stack([solver.particle_q(w).astype(float) for w in worlds])
@@ -134,16 +169,16 @@ class SwingProblem:
     def _led(self, of: np.ndarray, actions: np.ndarray) -> list[np.ndarray]:
         """Where the tips are told to be (n, 3) [m] at the ends of T steps."""
         worlds = list(range(len(of)))
-        places = self._positions[of, self._held].astype(float)
         self._targets.floors[worlds] = self._floors[of]
-        self._targets.place(worlds, np.pad(places, ((0, 0), (0, 1))))
+        self._targets.place(worlds, self._tips[of])
         return [self._targets.follow(worlds, rows)[:, -1, :3] for rows in actions.swapaxes(0, 1)]
 
     def _paths(self, of: np.ndarray, steps: list[np.ndarray]) -> dict[int, GripPath]:
         """Of worlds whose tips are told to be (n, 3) [m] at the ends of T steps."""
         places = self._positions[of, self._held].astype(float)
         knots = np.stack([places, *steps, steps[-1]], axis=1)
-        return {w: GripPath(self._knot_times, k, particle=self._held) for w, k in enumerate(knots)}
+        times = np.append(self._knot_times[: self.steps + 1], self._knot_times[-1])
+        return {w: GripPath(times, k, particle=self._held) for w, k in enumerate(knots)}
 
     def _put(self, of: np.ndarray) -> None:
         """Put worlds to the starts of goals."""
@@ -157,9 +192,19 @@ class SwingProblem:
         assert self.task.held_particle is not None, "it was looked at before"
         return self.task.held_particle
 
+    @property
+    def horizon(self) -> int:
+        """Control steps of a whole episode."""
+        return self._control.horizon
+
+    @property
+    def particles(self) -> int:
+        """Their number P."""
+        return self._positions.shape[1]
+
     def refined(self, numbers: np.ndarray) -> np.ndarray:
         """Numbers (G, T, 3), three a step, of the plans that have numbers (G, K, 3)."""
-        return numbers_of(numbers, self._control.horizon)
+        return numbers_of(numbers, self.steps)
 
     def gradients(self, numbers: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Losses (n,) of plans (n, K, 3) for these goals (n,), and their gradients (n, K, 3).
@@ -182,16 +227,18 @@ class SwingProblem:
         worlds, steps = list(range(len(of))), self._led(of, self.actions(numbers))
         self._put(of)
         run = self._run = self._run or DifferentiableRollout(self._solver)
-        seconds = self._control.horizon * self._control.control.loop.seconds
+        seconds = self.steps * self._control.control.loop.seconds
         ends = run.forward(worlds, [seconds], paths=self._paths(of, steps))[:, -1]
         places = torch.from_numpy(ends.astype(float)).requires_grad_()
-        losses = self._losses_of(of, places)
-        (by_places,) = torch.autograd.grad(losses.sum(), places)
+        with torch.enable_grad():
+            losses = self._losses_of(of, places)
+            (by_places,) = torch.autograd.grad(losses.sum(), places)
         ways = run.backward(by_places[:, None].numpy(), parts=False).way_points
         by_ways = np.stack([ways[w] for w in worlds], axis=1)
         by_ways[-2] += by_ways[-1]  # the last target stands there twice
         free = torch.tensor(numbers, dtype=torch.float64, requires_grad=True)
-        told = self._tensor_ways(of, tensor_actions_of(free, self._control.horizon))
+        with torch.enable_grad():
+            told = self._tensor_ways(of, tensor_actions_of(free, self.steps))
         (gradients,) = torch.autograd.grad(told, free, torch.from_numpy(by_ways[1:-1]))
         out = losses.detach().numpy().copy()
         limits = self._solver.config.limits
@@ -204,8 +251,7 @@ class SwingProblem:
 
         config, limits = self._control.config, self._control.limits
         floors = torch.from_numpy(self._floors[of])
-        places = torch.from_numpy(self._positions[of, self._held].astype(float))
-        asked = torch.nn.functional.pad(places, (0, 1))
+        asked = torch.from_numpy(self._tips[of])
         steps = torch.nn.functional.pad(moves, (0, 1)) * (config.max_speed * config.seconds)
         ways = []
         for step in steps.unbind(1):
