@@ -34,8 +34,9 @@ class Replanner:
         while worlds.running.any():
             worlds.advance(torch.from_numpy(act(worlds.observe().numpy())))
 
-    The best rest of a plan that a step has tried is kept, the one of the step before among them, so
-    where nothing disturbs a swing its plan gets no worse.
+    The best rest of a plan that a step has tried is kept, the one of the step before among them. So
+    where nothing disturbs a swing, its plan gets no worse, but for a millimetre or two: plans that
+    begin amid a swing list contacts anew.
 
     Args:
         problem: whose goals the rows are, in their order
@@ -43,7 +44,7 @@ class Replanner:
         rounds: gradients of every goal at every step; 0 plays the plans as they are
 
     Raises:
-        InputError: numbers of another shape, or no such number of rounds.
+        InputError: numbers of another shape or not finite, or no such number of rounds.
     """
 
     def __init__(self, problem: SwingProblem, numbers: np.ndarray, *, rounds: int = 8) -> None:
@@ -52,6 +53,8 @@ class Replanner:
             raise InputError(
                 f"numbers must have the shape ({problem.goals}, K, 3), not {given.shape}"
             )
+        if not np.isfinite(given).all():
+            raise InputError("numbers must be finite")
         if type(rounds) is not int or rounds < 0:
             raise InputError(f"rounds is a number of gradients, 0 or more, not {rounds!r}")
         self.problem, self.rounds = problem, rounds
@@ -70,21 +73,25 @@ class Replanner:
                 One that stays behind is over, as after a guard: its action means nothing
 
         Raises:
-            InputError: another number of rows, or episodes that are not at the step that follows.
+            InputError: another shape, or episodes that are not at the step that follows.
         """
         seen = np.asarray(seen, dtype=float)
-        if seen.ndim != 2 or len(seen) != self.problem.goals:
-            raise InputError(f"seen must have {self.problem.goals} rows, not {seen.shape}")
+        goals, count = self.problem.goals, self.problem.particles
+        if seen.ndim != 2 or len(seen) != goals or seen.shape[1] < 6 + 6 * count:
+            raise InputError(
+                f'seen must be what "state" shows of {goals} episodes, not {seen.shape}'
+            )
         steps = np.rint(seen[:, -1] * self._horizon).astype(int)
         if (steps == 0).all():
             self._step, self.rest = 0, self._first
-            self._over = np.zeros(len(seen), bool)
+            self._over = np.zeros(goals, bool)
+        if self._step == self._horizon:
+            raise InputError(f"an episode has {self._horizon} steps: reset all of them")
         self._over = self._over | (steps == self._step - 1)
         if (steps[~self._over] != self._step).any():
             shown = sorted(set(steps[~self._over].tolist()))
             raise InputError(f"step {self._step} of every episode follows, not steps {shown}")
         if self.rounds and self._step and not self._over.all():
-            goals, count = self.problem.goals, self.problem.particles
             tips, beads = seen[:, :4], seen[:, 5:].reshape(goals, -1)
             places = beads[:, : 3 * count].reshape(goals, count, 3) + tips[:, None, :3]
             velocities = beads[:, 3 * count : 6 * count].reshape(goals, count, 3)

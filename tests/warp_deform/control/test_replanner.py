@@ -88,19 +88,22 @@ def test_a_plan_that_begins_amid_an_episode_ends_as_the_whole(
 def test_what_nothing_disturbs_gets_better_and_what_is_disturbed_much(
     problem, plans, worlds
 ) -> None:
-    def left(rounds: int, **disturbed: float) -> float:
+    def left(rounds: int, **disturbed: float) -> np.ndarray:
         play(worlds, Replanner(problem, plans, rounds=rounds), **disturbed)
         assert worlds.trusted.all()
-        return float(worlds.left.mean())
+        return worlds.left.numpy()
 
-    assert left(4) <= left(0) + 1e-4
+    planned, again = left(0), left(4)
+    assert again.mean() < planned.mean() and (again < planned + 2e-3).all()
     for disturbed in ({"noise": 0.1}, {"damping": 1.5}):
-        assert left(6, **disturbed) < 0.6 * left(0, **disturbed)
+        assert left(6, **disturbed).mean() < 0.6 * left(0, **disturbed).mean()
 
 
 def test_it_plays_the_same_twice(problem, plans, worlds) -> None:
     act = Replanner(problem, plans, rounds=2)
     first = play(worlds, act, noise=0.05)
+    with pytest.raises(InputError, match="an episode has 20 steps"):
+        act(first[-1])
     np.testing.assert_array_equal(first, play(worlds, act, noise=0.05))
 
 
@@ -115,14 +118,17 @@ def test_what_does_not_fit_is_refused(problem, plans, worlds) -> None:
     for numbers in (plans[:3], plans[:, :, :2], plans[0]):
         with pytest.raises(InputError, match=r"numbers must have the shape \(8, K, 3\)"):
             Replanner(problem, numbers)
+    with pytest.raises(InputError, match="finite"):
+        Replanner(problem, np.where(plans > 0, plans, np.nan))
     for rounds in (-1, 1.5, True):
         with pytest.raises(InputError, match="rounds is a number of gradients"):
             Replanner(problem, plans, rounds=rounds)
     act = Replanner(problem, plans)
     worlds.reset(dict(enumerate(SEEDS)))
     first = worlds.observe().numpy()
-    with pytest.raises(InputError, match="8 rows"):
-        act(first[:5])
+    for other in (first[:5], first[0], first[:, :60]):
+        with pytest.raises(InputError, match='what "state" shows of 8 episodes'):
+            act(other)
     act(first)
     gone = first.copy()
     gone[:, -1] = 1 / 20
