@@ -106,7 +106,7 @@ class SwingProblem:
         Raises:
             InputError: another shape, or no such number of steps.
         """
-        kept = self._positions, self._velocities, self._tips
+        kept, before = (self._positions, self._velocities, self._tips), self.steps
         for name, given, own in zip(
             ("positions", "velocities", "tips"), (positions, velocities, tips), kept, strict=True
         ):
@@ -120,7 +120,7 @@ class SwingProblem:
         try:
             yield
         finally:
-            (self._positions, self._velocities, self._tips), self.steps = kept, self.horizon
+            (self._positions, self._velocities, self._tips), self.steps = kept, before
 
     @property
     def goals(self) -> int:
