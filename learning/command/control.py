@@ -52,6 +52,8 @@ class ControlEvalOptions(CommandOptions):
     """Folder that `train-control` made."""
     episodes: Annotated[int, arg(metavar="N"), FlagRange(1, 40_000)] = 200
     """Number of test episodes, with seeds 10,000 and up."""
+    video: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Film the first two test episodes into this MP4."""
 
 
 def eval_control(options: ControlEvalOptions) -> Outcome:
@@ -59,7 +61,7 @@ def eval_control(options: ControlEvalOptions) -> Outcome:
     quiet_warp()
     from ..control.evaluate import evaluate_control
 
-    report = evaluate_control(options.run, episodes=options.episodes)
+    report = evaluate_control(options.run, episodes=options.episodes, video=options.video)
     return Outcome(data=report, text=_tested(report))
 
 

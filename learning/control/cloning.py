@@ -28,9 +28,8 @@ import torch
 from torch import Tensor, nn
 
 from warp_deform.collecting.control_replay import led_task_of
-from warp_deform.collecting.control_runs import ControlRun, LedTask, control_worlds, led
-from warp_deform.control.control_worlds import ControlWorlds
-from warp_deform.control.numbers import control_numbers, recorded_numbers
+from warp_deform.collecting.control_runs import ControlRun, LedTask, control_worlds, led, observed
+from warp_deform.control.numbers import recorded_numbers
 from warp_deform.episodes import Episode, EpisodeReader
 from warp_deform.errors import InputError
 from warp_deform.support.checked import POSITIVE, check_fields
@@ -258,7 +257,7 @@ def play_clone(
     control, said = control_worlds(how), dict[int, list[np.ndarray]]()
 
     def act(runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
-        seen = np.stack([_seen(control, slot, run) for slot, run in runs.items()])
+        seen = np.stack([observed(control, slot, run) for slot, run in runs.items()])
         with torch.no_grad():
             chunks = policy(torch.from_numpy(seen)).numpy()
         actions: dict[int, np.ndarray | None] = {}
@@ -277,19 +276,3 @@ def play_clone(
         )
         for _, run in led(control, seeds, start=lambda runs: None, act=act)
     }
-
-
-def _seen(control: ControlWorlds, slot: int, run: ControlRun) -> np.ndarray:
-    """The observation "state" (D,) float32 of a slot, as recordings have it."""
-    episode, tip = control.worlds.episodes[slot], run.rows[-1].control
-    assert tip is not None, "rows of control have a tip"
-    numbers = control_numbers(
-        tip=tip.tip,
-        holding=tip.holding,
-        particle_q=episode.snapshot.particle_q,
-        particle_qd=episode.snapshot.particle_qd,
-        body_q=episode.snapshot.body_q,
-        goal=np.asarray(episode.layout.targets, dtype=float),
-        time=len(run.actions) / control.horizon,
-    )
-    return np.concatenate([np.asarray(array, np.float32).ravel() for array in numbers.values()])

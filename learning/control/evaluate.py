@@ -12,21 +12,31 @@ from warp_deform.support.progress import progress_bar
 from ..evaluation.protocol import FIRST_SEED
 from ..runs.folder import write_json
 from ..training.processes import join_processes
+from .film import film_played
 from .play import play_control
 from .run import ControlRun
 from .saved import load_actor
 
 __all__ = ["evaluate_control"]
 
+_FILMED = 2
+"""Episodes of a video."""
+
 
 def evaluate_control(
-    folder: Path, *, episodes: int = 200, step: int | None = None, progress: bool = True
+    folder: Path,
+    *,
+    episodes: int = 200,
+    step: int | None = None,
+    video: Path | None = None,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Play test seeds with a run's chosen snapshot; what it came to, also kept in the folder.
 
     Args:
         episodes: with seeds 10,000 and up
         step: of another snapshot than the chosen one; the folder then keeps nothing
+        video: an MP4 of the first two episodes; it is written first
 
     Returns:
         task, method, seed, updates, selected, validation: of that snapshot, first_seed, test: see
@@ -34,7 +44,8 @@ def evaluate_control(
         has fired
 
     Raises:
-        InputError: this is no control run's folder, or it has no such snapshot.
+        InputError: this is no control run's folder, it has no such snapshot, or the video's path
+            does not end with .mp4 or cannot be written.
     """
     run = ControlRun(folder)
     settings, chosen = run.read_control(), run.chosen() if step is None else step
@@ -42,6 +53,9 @@ def evaluate_control(
         raise InputError(f"{folder} has no snapshot of step {chosen}; it has {run.steps()}")
     control, first = settings["control"], FIRST_SEED["test"]
     actor, task = load_actor(run.snapshot(chosen))
+    if video is not None:
+        seeds = range(first, first + min(episodes, _FILMED))
+        film_played(video, actor, task, seeds=seeds, horizon=control["horizon"])
     bar = progress_bar(f"test {task}", episodes, shown=progress)
     with join_processes("cpu", threads=1), bar as advance:
         worlds = TensorControlWorlds(

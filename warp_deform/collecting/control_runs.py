@@ -11,6 +11,7 @@ import numpy as np
 from ..control.control_task import ControlTask
 from ..control.control_worlds import ControlWorlds
 from ..control.modes import CONTROL_MODES, ControlConfig
+from ..control.numbers import control_numbers
 from ..episodes import (
     CONTROL,
     CONTROL_FORMAT,
@@ -24,7 +25,15 @@ from ..tasks.task import Task
 from ..worlds.loop import SLOTS, SOLVED
 from .recording import episode_info, origin
 
-__all__ = ["ControlRun", "LedTask", "control_worlds", "led", "record_control", "without_idle_end"]
+__all__ = [
+    "ControlRun",
+    "LedTask",
+    "control_worlds",
+    "led",
+    "observed",
+    "record_control",
+    "without_idle_end",
+]
 
 Act = Callable[[Mapping[int, "ControlRun"]], Mapping[int, np.ndarray | None]]
 """Next action (A,) of every running slot, or None for a slot whose episode is to end."""
@@ -184,6 +193,22 @@ def _row(control: ControlWorlds, slot: int, reward: float, pictures: bool) -> St
             np.array(episode.tip, dtype=float), control.holding(slot), float(reward)
         ),
     )
+
+
+def observed(control: ControlWorlds, slot: int, run: ControlRun) -> np.ndarray:
+    """The observation "state" (D,) float32 of a slot, as environments show it."""
+    episode, tip = control.worlds.episodes[slot], run.rows[-1].control
+    assert tip is not None, "rows of control have a tip"
+    numbers = control_numbers(
+        tip=tip.tip,
+        holding=tip.holding,
+        particle_q=episode.snapshot.particle_q,
+        particle_qd=episode.snapshot.particle_qd,
+        body_q=episode.snapshot.body_q,
+        goal=np.asarray(episode.layout.targets, dtype=float),
+        time=len(run.actions) / control.horizon,
+    )
+    return np.concatenate([np.asarray(array, np.float32).ravel() for array in numbers.values()])
 
 
 def without_idle_end(run: ControlRun) -> ControlRun:

@@ -25,7 +25,7 @@ from .control_runs import control_worlds
 from .video import FPS, LONGEST, STILL_SECONDS
 from .workers import single_threaded
 
-__all__ = ["film_control"]
+__all__ = ["film_control", "film_control_episodes"]
 
 _MARK_RADIUS = 0.006
 """Of the points of a goal [m]."""
@@ -75,6 +75,27 @@ def film_control(
     """
     readers = [EpisodeReader(folder, control=True) for folder in folders]
     shown = [[reader.read(seed) for reader in readers] for seed in seeds]
+    film_control_episodes(shown, path, names=names, size=size)
+
+
+def film_control_episodes(
+    shown: Sequence[Sequence[Episode]],
+    path: Path,
+    *,
+    names: Sequence[str] = ("",),
+    size: tuple[int, int] = (540, 960),
+) -> None:
+    """Write an MP4 of episodes in memory: one after the other, those of one seed beside each other.
+
+    Args:
+        names: of the episodes of a seed, one each
+        size: rows and columns of a frame of one episode
+
+    Raises:
+        InputError: the path does not end with .mp4 or cannot be written, or an episode is none of
+            control at a fixed rate.
+        WarpDeformError: the start of an episode comes out differently here.
+    """
     scenes = [
         [_panel(name, episode) for name, episode in zip(names, episodes, strict=True)]
         for episodes in shown

@@ -7,15 +7,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from learning.control import film
 from learning.control import train as training
 from learning.control.apg import Apg
 from learning.control.evaluate import evaluate_control
 from learning.control.run import ControlRun
 from learning.control.train import ControlTrainConfig, train_control
 from learning.runs.folder import read_snapshot
+from warp_deform.collecting.control_video import film_control_episodes
 from warp_deform.command.main import main
 from warp_deform.errors import InputError, WarpDeformError
 
@@ -98,6 +101,23 @@ def test_the_best_on_validation_seeds_is_tested_on_others(
     assert json.loads((whole / "control_info.json").read_text()) == report
 
 
+def test_a_film_shows_the_episodes_that_are_tested(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    shown = []
+    monkeypatch.setattr(film, "film_control_episodes", lambda rows, path: shown.extend(rows))
+    line = ["eval-control", str(whole), "--episodes", "3", "--json", "--video"]
+    assert main([*line, str(tmp_path / "film.mp4")]) == 0
+    report = json.loads(capfd.readouterr().out)
+    assert [[each.info.seed for each in row] for row in shown] == [[10_000], [10_001]]
+    for (episode,), score, left in zip(shown, report["scores"], report["left"], strict=False):
+        assert len(episode.steps) == 3 and episode.info.task == "whip-target"
+        assert episode.steps[-1].score == pytest.approx(score, abs=1e-6) and left is not None
+    monkeypatch.undo()
+    film_control_episodes([shown[0]], tmp_path / "film.mp4", size=(54, 96))
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] > 30
+
+
 def test_minutes_are_planned_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     minutes = {**FEW, "updates": None, "minutes": 0.01, "snapshots": 1}
     config = ControlTrainConfig(**minutes, out=tmp_path / "run", progress=False)
@@ -137,6 +157,7 @@ def test_tasks_and_folders_that_do_not_fit_are_one_line(
         (["train-control", "whipp", "--out", str(tmp_path / "r")], "whipp"),
         (["train-control", "cable-mask-goal", "--out", str(tmp_path / "r")], "jaw"),
         (["train-control", "whip-target", "--out", str(whole)], "another"),
+        (["eval-control", str(whole), "--video", str(tmp_path / "a.avi")], "must end with .mp4"),
         (["eval-control", str(empty)], "holds no training run; `warp-deform train-control`"),
         (["eval", str(whole)], "use `warp-deform eval-control"),
         (["report", str(whole)], "eval"),

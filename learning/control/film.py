@@ -1,0 +1,55 @@
+"""A video of test episodes that a control run's policy plays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warp_deform.collecting.control_runs import (
+    ControlRun,
+    LedTask,
+    control_worlds,
+    led,
+    observed,
+    record_control,
+)
+from warp_deform.collecting.control_video import film_control_episodes
+from warp_deform.control.registry import control_task
+from warp_deform.episodes import Episode
+
+from .actor import Actor, PlanActor
+
+__all__ = ["film_played"]
+
+
+def film_played(
+    path: Path, actor: Actor | PlanActor, task: str, *, seeds: Sequence[int], horizon: int | None
+) -> None:
+    """Write an MP4 of the episodes of seeds, each to its end, one after the other.
+
+    Args:
+        horizon: control steps of an episode; None: the task's
+
+    Raises:
+        InputError: the path does not end with .mp4 or cannot be written.
+        WarpDeformError: a guard fired before the first step of an episode was over.
+    """
+    how = LedTask(type(control_task(task)), start="held", horizon=horizon)
+    film_control_episodes([[_played(actor, how, seed)] for seed in seeds], path)
+
+
+def _played(actor: Actor | PlanActor, how: LedTask, seed: int) -> Episode:
+    """One episode, as recordings have it."""
+    control = control_worlds(how)
+
+    def act(runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+        ((slot, run),) = runs.items()
+        seen = torch.from_numpy(observed(control, slot, run))
+        with torch.no_grad():
+            return {slot: actor(seen[None])[0].numpy()}
+
+    ((slot, run),) = led(control, [seed], start=lambda runs: None, act=act)
+    return record_control(control, slot, run, demonstrator="policy", pictures=False)
