@@ -32,6 +32,9 @@ def run_bounded(
     this thread as well, and Ctrl-C, until it returns: whoever makes it has to know that it will. It
     then counts as ended, however late.
 
+    The thread is new, for libfranka gives the one that it moves a robot in the highest real-time
+    priority and leaves it so.
+
     Raises:
         TimeoutError: the call did not end in time
         KeyboardInterrupt: on Ctrl-C, after stopping

@@ -38,8 +38,9 @@ def attribute(name: str) -> str:
 
 _FORWARD_ONLY = ("newton._src.utils.mesh", "newton._src.geometry.bvh")
 """Where the kernels stand that `newton.ModelBuilder.finalize` launches: who is whose neighbour, and
-what encloses what. Nobody differentiates by these; with adjoints they compile in three times as
-long, before the first scene of a new machine is there."""
+what encloses what. Nobody differentiates by these, and they run once a model: with adjoints, and
+optimised, they compile in three times as long, before the first scene of a new machine is there."""
+_ONCE = {"enable_backward": False, "optimization_level": 0}
 
 
 @functools.cache
@@ -49,7 +50,7 @@ def _leave_adjoints_out() -> None:
     for name in _FORWARD_ONLY:
         # Newton may put them elsewhere one day: then they compile as it wants them to
         if name in sys.modules:
-            wp.set_module_options({"enable_backward": False}, sys.modules[name])
+            wp.set_module_options(_ONCE, sys.modules[name])
 
 
 def register_attributes(builder: newton.ModelBuilder) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -70,6 +73,20 @@ def test_waypoints_and_home_end_within_half_a_millimetre(
         passed = emulator.call_world("take")["position"]
         for pose in wanted:  # gentle corners are rounded
             assert np.linalg.norm(passed - pose[:3, 3], axis=1).min() < 1e-2
+
+
+def test_who_moves_the_arm_stays_an_ordinary_process(robot: PandaRobot) -> None:
+    """A thread that libfranka moves a robot in keeps the highest real-time priority.
+
+    A policy and its cameras would keep a core from everything else.
+    """
+    robot.move_joints(OFF_HOME, speed=0.5)
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+    seen = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.sched_getscheduler(0))"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert int(seen.stdout) == os.SCHED_OTHER
 
 
 def test_waypoints_at_sharp_corners_are_met(emulator: EmulatorProcess, robot: PandaRobot) -> None:
