@@ -16,6 +16,7 @@ from ..control.control_task import ControlTask
 from ..episodes import Episode, EpisodeReader, Step
 from ..errors import InputError, WarpDeformError
 from ..objects.colors import TARGET
+from ..rendering.camera import Camera, look_at
 from ..rendering.caption import Caption
 from ..rendering.scene_view import ArmMeshes, SceneView
 from ..rendering.video import VideoWriter
@@ -140,16 +141,23 @@ def _begun(episode: Episode) -> Worlds:
     return control.worlds
 
 
+def _swing_camera(size: tuple[int, int]) -> Camera:
+    """As `scene_camera`, with room above for an arm that is stretched upwards."""
+    return look_at((1.5, -0.8, 1.0), (0.4, -0.03, 0.36), size=size, vertical_fov=0.95)
+
+
 class _Stage:
     """Draws states of one scene, with the arm where the tip is."""
 
     def __init__(self, worlds: Worlds, size: tuple[int, int]) -> None:
         self._worlds, self._rows = worlds, size[0]
-        self._view = SceneView(size)
+        task = worlds.task
+        swung = isinstance(task, ControlTask) and task.held_particle is not None
+        self._view = SceneView(size, camera=_swing_camera(size) if swung else None)
         self._meshes = ArmMeshes(worlds.robot.meshes())
         self._q = worlds.robot.home_q
         self._scene = worlds.episodes[0].drawables
-        task, marks = worlds.task, np.zeros((0, 3))
+        marks = np.zeros((0, 3))
         if isinstance(task, ControlTask):
             marks = task.marks(worlds.episodes[0].layout)
         self._marks = marks
