@@ -113,7 +113,7 @@ class ControlTrainReport:
         chosen: the best of them
         loss: mean over the last logged updates; None before there are so many
         seconds: of this call [s]
-        cpu_seconds: of the updates that were logged, in all calls [s]
+        cpu_seconds: of the updates, in all calls [s]
     """
 
     task: str
@@ -170,7 +170,8 @@ def train_control(config: ControlTrainConfig) -> ControlTrainReport:
                 told = learner.update(number)
                 _check(told, number)
                 lr = config.method_config().lr * (1.0 - (number - 1) / updates)
-                log.add(number, {name: torch.tensor(each) for name, each in told.items()}, lr=lr)
+                values = {name: torch.tensor(each) for name, each in told.items()}
+                log.add(number, values, lr=lr, last=number == updates)
 
                 # Snapshots, and what an interrupted run goes on from
                 if number in due:

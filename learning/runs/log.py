@@ -91,8 +91,13 @@ class TrainingLog:
         passed = (now - then for now, then in zip(_clocks(), before, strict=True))
         self._since = tuple(since + each for since, each in zip(self._since, passed, strict=True))
 
-    def add(self, step: int, losses: Mapping[str, Tensor], *, lr: float) -> None:
+    def add(
+        self, step: int, losses: Mapping[str, Tensor], *, lr: float, last: bool = False
+    ) -> None:
         """Count a step's losses in.
+
+        Args:
+            last: of all steps, so that a line is due in any case
 
         Raises:
             WarpDeformError: a line is due, and the mean loss is not finite.
@@ -100,7 +105,7 @@ class TrainingLog:
         for name, value in losses.items():
             self._sums[name] = self._sums.get(name, torch.zeros(())) + value.detach().cpu()
         self._count += 1
-        if step % LINE_STEPS:
+        if step % LINE_STEPS and not last:
             return
         self.check(step)
         means = {name: float(total) / self._count for name, total in self._sums.items()}

@@ -72,6 +72,7 @@ def test_killed_and_called_again_it_ends_with_the_same_weights(
     assert main(["train-control", "whip-target", "--out", str(out), *flags, "--json"]) == 0
     report = json.loads(capfd.readouterr().out)
     assert report["snapshots"] == [2, 4] and report["chosen"] in (2, 4)
+    assert report["cpu_seconds"] > 0.0 and np.isfinite(report["loss"])
     for step in (2, 4):
         one, other = (read_snapshot(ControlRun(each).snapshot(step)) for each in (whole, out))
         assert one[1]["digest"] == other[1]["digest"]
@@ -116,6 +117,12 @@ def test_a_film_shows_the_episodes_that_are_tested(
     monkeypatch.undo()
     film_control_episodes([shown[0]], tmp_path / "film.mp4", size=(54, 96))
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] > 30
+
+
+def test_updates_that_fill_no_line_of_the_log_are_counted(tmp_path: Path) -> None:
+    report = train_control(ControlTrainConfig(**FEW, out=tmp_path / "run", progress=False))
+    assert FEW["updates"] < training.LINE_STEPS
+    assert report.cpu_seconds > 0.0 and report.loss is not None
 
 
 def test_minutes_are_planned_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
