@@ -19,6 +19,7 @@ from warp_deform.collecting.control_runs import (
 from warp_deform.collecting.control_video import film_control_episodes
 from warp_deform.control.registry import control_task
 from warp_deform.episodes import Episode
+from warp_deform.errors import WarpDeformError
 
 from .actor import Actor, PlanActor
 
@@ -35,7 +36,7 @@ def film_played(
 
     Raises:
         InputError: the path does not end with .mp4 or cannot be written.
-        WarpDeformError: a guard fired before the first step of an episode was over.
+        WarpDeformError: a seed has no valid start.
     """
     how = LedTask(type(control_task(task)), start="held", horizon=horizon)
     film_control_episodes([[_played(actor, how, seed)] for seed in seeds], path)
@@ -52,4 +53,6 @@ def _played(actor: Actor | PlanActor, how: LedTask, seed: int) -> Episode:
             return {slot: actor(seen[None])[0].numpy()}
 
     ((slot, run),) = led(control, [seed], start=lambda runs: None, act=act)
+    if not run.rows:
+        raise WarpDeformError(f"the episode of seed {seed} cannot be filmed: {run.ended}")
     return record_control(control, slot, run, demonstrator="policy", pictures=False)
