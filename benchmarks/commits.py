@@ -13,6 +13,7 @@ over older, with its quartiles. Scenes and plays are those of `warp-deform bench
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import subprocess
@@ -102,7 +103,8 @@ def _start(tree: Path, scene: str) -> subprocess.Popen[str]:
 
 def _ask(worker: subprocess.Popen[str], how: str, seed: int) -> list[float]:
     assert worker.stdin is not None and worker.stdout is not None
-    print(how, seed, file=worker.stdin, flush=True)
+    with contextlib.suppress(BrokenPipeError):  # it has ended, and then gives no answer
+        print(how, seed, file=worker.stdin, flush=True)
     answer = worker.stdout.readline()
     if not answer:
         raise SystemExit(f"a worker ended with code {worker.wait()}; its error stands above")
@@ -118,6 +120,9 @@ def _serve(scene: str) -> None:
     from warp_deform.bench import bag, cloth, rigid
     from warp_deform.quiet import quiet_warp
 
+    tree = Path(os.environ["PYTHONPATH"])
+    if not Path(bench.__file__).resolve().is_relative_to(tree):
+        sys.exit(f"{bench.__file__} was imported, not what {tree} has")
     quiet_warp()
     caught: dict[str, Any] = {}
 

@@ -1,5 +1,6 @@
 """The benchmark that plays two source trees in turns, on trees that cost what is said."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -56,6 +57,28 @@ def test_a_tree_that_fails_ends_the_comparison(tmp_path: Path) -> None:
     (newer / "warp_deform" / "quiet.py").write_text("raise ImportError\n")
     with pytest.raises(SystemExit, match="code 1"):
         commits.compare(older, newer, "cloth10", rounds=1)
+
+
+def test_a_worker_that_has_ended_is_told_by_its_code() -> None:
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", "exit(3)"], **pipes) as worker:
+        worker.wait()
+        with pytest.raises(SystemExit, match="code 3"):
+            commits._ask(worker, "alone", 0)
+        worker.stdin = None  # what waits in it can no longer be sent
+
+
+def test_another_package_than_the_tree_s_is_refused(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    older, newer = tree(tmp_path / "a", 0.2, 0.4), tmp_path / "b"
+    (newer / "warp_deform" / "bench").mkdir(parents=True)
+    (newer / "warp_deform" / "__init__.py").write_text(
+        f"__path__ = [{str(older / 'warp_deform')!r}]\n"
+    )
+    with pytest.raises(SystemExit, match="code 1"):
+        commits.compare(older, newer, "cloth10", rounds=1)
+    assert "was imported, not what" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["."], ["nowhere"], ["--rounds", "0"]])

@@ -38,8 +38,8 @@ def attribute(name: str) -> str:
 
 _FORWARD_ONLY = ("newton._src.utils.mesh", "newton._src.geometry.bvh")
 """Where the kernels stand that `newton.ModelBuilder.finalize` launches: who is whose neighbour, and
-what encloses what. Nobody differentiates by these, and they run once a model: with adjoints, and
-optimised, they compile in three times as long, before the first scene of a new machine is there."""
+what encloses what. Nobody differentiates by these, and they run once a model: to compile them with
+adjoints, and optimised, would only delay the first scene of a new machine."""
 _ONCE = {"enable_backward": False, "optimization_level": 0}
 
 
