@@ -110,6 +110,18 @@ def ready_panda(emulator, connection):
     return connection
 
 
+@pytest.fixture(scope="module")
+def narrow_networks():
+    """The preset's networks have so few channels that a step takes no time; they learn little."""
+    from dataclasses import replace
+
+    from learning.models.transporter import PRESETS
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "fast", replace(PRESETS["fast"], width=1 / 16))
+        yield
+
+
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
     """The folder of a run that took seconds, see `short_runs`; nobody changes it."""

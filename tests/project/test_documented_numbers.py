@@ -46,7 +46,7 @@ def test_most_measurements_are_compared_with_a_file() -> None:
 
 
 def test_a_changed_digit_is_found() -> None:
-    """Of a hundred compared numbers, drawn from all, in one digit each."""
+    """Of thirty compared numbers, drawn from all, in one digit each; a page is read for each."""
     rng = random.Random(0)
     pages = examined()
     held = [
@@ -57,13 +57,13 @@ def test_a_changed_digit_is_found() -> None:
         for at, number in figure.numbers
     ]
     noticed = 0
-    for path, at, number in rng.sample(held, 100):
+    for path, at, number in rng.sample(held, 30):
         text = pages[path][0]
         mantissa = number.partition("e")[0]
         digit = at + rng.choice([i for i, each in enumerate(mantissa) if each.isdigit()])
         other = rng.choice([each for each in "0123456789" if each != text[digit]])
         noticed += bool(numbers.examine(path.name, text[:digit] + other + text[digit + 1 :])[1])
-    assert noticed >= 95
+    assert noticed >= 28
 
 
 @pytest.mark.parametrize(

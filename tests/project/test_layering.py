@@ -13,7 +13,6 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import pytest
@@ -133,24 +132,30 @@ def violations(source: str, module: str, *, is_package: bool = False) -> list[st
     return wrong
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_point_one_way(path: Path) -> None:
-    dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-    source = path.read_text()
-    assert violations(source, dotted, is_package=path.name == "__init__.py") == []
-    if str(path.relative_to(ROOT)) not in COMPUTED_IMPORTS:
-        assert not {"import_module", "__import__"} & {
-            getattr(node.func, "attr", getattr(node.func, "id", None))
-            for node in ast.walk(ast.parse(source))
-            if isinstance(node, ast.Call)
-        }, "a module name computed at run time hides from this test"
-    if str(path.relative_to(ROOT)) not in ADDS_TO_PATH:
-        assert "sys.path." not in source
+def test_imports_point_one_way() -> None:
+    wrong = []
+    for path in FILES:
+        dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        wrong += violations(path.read_text(), dotted, is_package=path.name == "__init__.py")
+    assert wrong == []
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_for_annotations_alone_stand_last_in_one_block(path: Path) -> None:
-    body = ast.parse(path.read_text()).body
+def test_no_import_hides() -> None:
+    """A module's name that is computed at run time would hide from the test above."""
+
+    def computes(source: str) -> bool:
+        calls = (node.func for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+        names = {getattr(func, "attr", getattr(func, "id", None)) for func in calls}
+        return bool({"import_module", "__import__"} & names)
+
+    sources = {str(path.relative_to(ROOT)): path.read_text() for path in FILES}
+    assert {name for name, source in sources.items() if computes(source)} == COMPUTED_IMPORTS
+    assert {name for name, source in sources.items() if "sys.path." in source} == ADDS_TO_PATH
+
+
+def block_wrong(source: str) -> bool:
+    """Whether imports for annotations alone stand in several blocks, or before other imports."""
+    body = ast.parse(source).body
     blocks = [
         at
         for at, node in enumerate(body)
@@ -158,10 +163,14 @@ def test_imports_for_annotations_alone_stand_last_in_one_block(path: Path) -> No
         and ast.unparse(node.test) == "TYPE_CHECKING"
         and isinstance(node.body[0], ast.Import | ast.ImportFrom)
     ]
-    assert len(blocks) <= 1
-    assert not any(
+    return len(blocks) > 1 or any(
         isinstance(node, ast.Import | ast.ImportFrom) for at in blocks for node in body[at:]
     )
+
+
+def test_imports_for_annotations_alone_stand_last_in_one_block() -> None:
+    assert [path for path in FILES if block_wrong(path.read_text())] == []
+    assert block_wrong("if TYPE_CHECKING:\n    import a\nimport b\n")
 
 
 @cache

@@ -75,9 +75,9 @@ def _findings(nodes: list[ast.AST], names: dict[str, str]) -> Iterator[tuple[int
             yield node.lineno, f"{full} with trust_remote_code"
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_file_loads_nothing_unsafely(path: Path) -> None:
-    assert unsafe(path.read_text()) == ALLOWED.get(str(path.relative_to(ROOT)), [])
+def test_files_load_nothing_unsafely() -> None:
+    said = {str(path.relative_to(ROOT)): unsafe(path.read_text()) for path in FILES}
+    assert {name: lines for name, lines in said.items() if lines} == ALLOWED
 
 
 def test_the_exception_reads_by_its_own_names_alone() -> None:

@@ -74,9 +74,9 @@ def test_an_action_outside_moves_nothing(
 
 
 def test_touch_off_measures_the_table(ready_panda: PandaRobot) -> None:
-    corners = [(0.40, -0.2), (0.40, 0.2), (0.6, 0.2), (0.6, -0.2)]
+    corners = [(0.48, -0.05), (0.48, 0.05), (0.55, 0.05), (0.55, -0.05)]
     quick = replace(limits(SURFACE - 0.02), max_joint_speed=0.2)
-    points = touch_off(SafeRobot(ready_panda, quick), corners, TouchOffConfig(hover_m=0.045))
+    points = touch_off(SafeRobot(ready_panda, quick), corners, TouchOffConfig(hover_m=0.036))
     plane, residuals = fit_table_plane(points)
     errors = plane.z(np.array(corners)) - SURFACE
     assert np.abs(errors).max() < 1e-3 and np.abs(residuals).max() < 5e-4

@@ -221,8 +221,8 @@ def test_lock_step_gives_the_same_bits_twice() -> None:
             EmulatorProcess(world=RecordingWorld, free_host=True) as emulator,
             PandaRobot(NetworkedConfig(host=emulator.host)) as robot,
         ):
-            robot.move_linear(moved(0.2, 0.1, -0.3, yaw=0.5), speed=0.2)
-            robot.move_linear(moved(0.2, 0.1, -0.45, yaw=0.5), speed=0.05, stop_force_N=8.0)
+            robot.move_linear(moved(0.1, 0.05, -0.35, yaw=0.5), speed=0.25)
+            robot.move_linear(moved(0.1, 0.05, -0.45, yaw=0.5), speed=0.05, stop_force_N=8.0)
             emulator.call_world("place_object", width=0.006)
             robot.grasp(width_m=0.006, force_N=15.0)
             robot.move_joints(HOME, speed=0.3)

@@ -314,16 +314,16 @@ def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
                 chooser,
                 recorder=made,
                 goal=goal,
-                config=EpisodeConfig(max_actions=2),
+                config=EpisodeConfig(max_actions=1),
             )
         beads = look().beads[:, :2]
-    assert result.outcomes == ("placed", "placed") and result.score is not None
+    assert result.outcomes == ("placed",) and result.score is not None
     ways = [np.linalg.norm(beads - targets[::way], axis=1).mean() for way in (1, -1)]
     assert min(ways) < 0.8 * 0.07
     again = score_recording(tmp_path / "a")
     assert (again.iou, again.success) == (result.score.iou, result.score.success)
     found = replay_recording(tmp_path / "a")
-    assert (found.mismatches, found.actions) == (0, 2)
+    assert (found.mismatches, found.actions) == (0, 1)
     readings = Recording.read(tmp_path / "a").robot
     moving = [row for row in readings if row.get("mode") == "moving"]
     assert len(moving) > 5 and len({tuple(row["q"]) for row in moving}) > 3

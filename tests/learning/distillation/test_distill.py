@@ -14,7 +14,6 @@ from learning.distillation import distill as distilling
 from learning.distillation.distill import DistillConfig, distill
 from learning.distillation.plan import Costs, Plan, make_plan, read_plan
 from learning.distillation.stages import Stages
-from learning.models import transporter
 from learning.runs.folder import RunFolder
 from warp_deform.command.main import main
 from warp_deform.episodes import EpisodeReader
@@ -35,17 +34,9 @@ def plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def small() -> Any:
-    """The preset's network with so few channels that a step takes no time."""
-    patch = pytest.MonkeyPatch()
-    narrow = replace(transporter.PRESETS["fast"], width=1 / 16)
-    patch.setitem(transporter.PRESETS, "fast", narrow)
-    yield
-    patch.undo()
-
-
-@pytest.fixture(scope="module")
-def whole(small: Any, plan: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def whole(
+    narrow_networks: None, plan: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Any]:
     """What came of a distillation that nothing interrupted."""
     out = tmp_path_factory.mktemp("whole") / "out"
     return distill(DistillConfig(task=TASK, plan=plan, episodes=1, out=out))

@@ -37,7 +37,7 @@ def _one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+def run(narrow_networks: None, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     root = tmp_path_factory.mktemp("film")
     data = write_demonstrations(root / "demos", 1, task=TASK)
     schedule = Schedule(steps=1, batch=1, lr=1e-3, snapshots=1)

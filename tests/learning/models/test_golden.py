@@ -1,6 +1,7 @@
 """Parity with the original's TensorFlow modules: forward, loss, and one training step.
 
-tests/data/README.md says what the file holds. Errors are relative to the largest logit.
+tests/data/README.md says what the file holds. Errors are relative to the largest logit. Two modules
+hold every layer and make a step here; `python benchmarks/parity.py` steps them all.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ def _parity() -> ModuleType:
 
 
 parity = _parity()
+STEPPED = ("attention", "transport_crop_after")
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +36,7 @@ def golden() -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("name", parity.MODULES)
 def test_parity(name: str, golden: dict[str, np.ndarray]) -> None:
-    errors = parity.measure(name, golden)
+    errors = parity.measure(name, golden, step=name in STEPPED)
     assert errors.logits < 1e-5 and errors.loss < 1e-5
-    assert errors.after_step < 5e-4
+    assert (errors.after_step is not None) == (name in STEPPED)
+    assert errors.after_step is None or errors.after_step < 5e-4

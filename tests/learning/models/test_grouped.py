@@ -106,7 +106,7 @@ def test_bfloat16_learns_as_float32_does() -> None:
         agent = Transporter(replace(SMALL, bfloat16=half), seed=0)
         labelled = batch(agent)
         optimiser, losses = KerasAdam(agent.parameters(), lr=1e-3), []
-        for _ in range(12):
+        for _ in range(6):
             optimiser.zero_grad()
             loss = agent(labelled).attention
             loss.backward()

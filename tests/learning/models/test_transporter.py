@@ -73,7 +73,7 @@ def test_agent_learns_its_labels(agent_class: type[Transporter]) -> None:
     agent = agent_class(config, seed=0)
     labelled = batch(agent)
     optimiser = KerasAdam(agent.parameters(), lr=3e-4)
-    for _ in range(60):
+    for _ in range(50):
         losses = agent(labelled)
         optimiser.zero_grad()
         losses.total().backward()

@@ -27,13 +27,13 @@ from warp_deform.command.main import main
 from warp_deform.errors import InputError, WarpDeformError
 
 HEAD, OTHER = "127.0.0.2", "127.0.0.3"
-RUNS = 4
+RUNS = 3
 GRID = """
 out = "{out}"
 tasks = ["block-notarget"]
 agents = ["gt-mlp"]
-demos = [1, 2]
-seeds = [0, 1]
+demos = [1]
+seeds = [0, 1, 2]
 steps = 150
 batch = 4
 snapshots = 1

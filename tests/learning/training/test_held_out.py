@@ -19,6 +19,7 @@ from learning.training.train import train
 from warp_deform.errors import InputError
 
 TASK = "cable-line-notarget"
+pytestmark = pytest.mark.usefixtures("narrow_networks")
 STATES = Schedule(steps=300, batch=16, lr=3e-3, snapshots=3, ema=0.9)
 
 

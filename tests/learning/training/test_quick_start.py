@@ -21,6 +21,7 @@ from learning.runs.folder import RunFolder
 from warp_deform.command.main import main
 
 TASK = "cable-line-notarget"
+pytestmark = pytest.mark.usefixtures("narrow_networks")
 
 
 class Episodes:

@@ -27,6 +27,7 @@ from warp_deform.errors import InputError
 from warp_deform.tasks.cable_line import CableLineNotarget
 
 TASK = "cable-line-notarget"
+pytestmark = pytest.mark.usefixtures("narrow_networks")
 HALF = ["--precision", "bfloat16"]
 SHORT = Schedule(steps=4, batch=1, lr=1e-3, warmup=2, decay=True, ema=0.9, snapshots=2)
 STATES = replace(SHORT, steps=60, batch=16, lr=3e-3)
@@ -43,7 +44,9 @@ def config(folder: Path, out: Path, **changes: Any) -> TrainConfig:
 
 
 @pytest.fixture(scope="module")
-def straight(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainReport]:
+def straight(
+    narrow_networks: None, folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, TrainReport]:
     out = tmp_path_factory.mktemp("run") / "straight"
     return out, train(config(folder, out))
 

@@ -25,6 +25,7 @@ from learning.training.train import train
 from warp_deform.errors import InputError, WarpDeformError
 
 TASK = "cable-line-notarget"
+pytestmark = pytest.mark.usefixtures("narrow_networks")
 PICTURES = Schedule(steps=4, batch=1, lr=1e-3, warmup=2, decay=True, ema=0.9, snapshots=2)
 STATES = Schedule(steps=260, batch=4, lr=3e-3, warmup=2, decay=True, ema=0.9, snapshots=3)
 

@@ -49,33 +49,32 @@ def test_no_bead_that_is_seen_is_no_carry() -> None:
     assert task.demonstrate_visible(layout, done, np.random.default_rng(0)) is None
 
 
-def about_to_carry(count: int) -> Iterator[tuple[WorldState, np.ndarray]]:
+def about_to_carry() -> Iterator[tuple[WorldState, np.ndarray]]:
     """States of episodes of `visible` before their first carry, and that carry."""
     task, side = BagItems1(), Worlds(BagItems1(), SLOTS, lanes=SLOTS)
-    for first in range(FIRST, FIRST + count, SLOTS):
-        seeds = {slot: first + slot for slot in range(SLOTS)}
-        side.reset(seeds)
-        rngs = {slot: episode_rng(seed, DEMONSTRATOR_STREAM) for slot, seed in seeds.items()}
-        for _ in range(task.max_actions):
-            actions = {}
-            for slot, rng in list(rngs.items()):
-                episode = side.episodes[slot]
-                action = task.demonstrate_visible(episode.layout, episode.snapshot, rng)
-                assert action is not None
-                if task.stage_of(float(action[6])) is CARRY:
-                    yield side.state(slot), action
-                    del rngs[slot]
-                else:
-                    actions[slot] = action
-            if actions:
-                side.step(actions)
+    seeds = {slot: FIRST + slot for slot in range(SLOTS)}
+    side.reset(seeds)
+    rngs = {slot: episode_rng(seed, DEMONSTRATOR_STREAM) for slot, seed in seeds.items()}
+    for _ in range(task.max_actions):
+        actions = {}
+        for slot, rng in list(rngs.items()):
+            episode = side.episodes[slot]
+            action = task.demonstrate_visible(episode.layout, episode.snapshot, rng)
+            assert action is not None
+            if task.stage_of(float(action[6])) is CARRY:
+                yield side.state(slot), action
+                del rngs[slot]
+            else:
+                actions[slot] = action
+        if actions:
+            side.step(actions)
 
 
 def test_bags_carried_across_keep_the_cube_and_others_lose_it() -> None:
     task = BagItems1()
     look = Lookahead(task, robot="ur5", precision="float32", count=SLOTS)
     chosen, others = [], []
-    for state, action in about_to_carry(2 * SLOTS):
+    for state, action in about_to_carry():
         episode = state.episode
         chosen.append((state, action))
         across = task.across(episode.layout, episode.snapshot)
@@ -86,5 +85,5 @@ def test_bags_carried_across_keep_the_cube_and_others_lose_it() -> None:
         return sum(outlook.grade == ENCLOSED for outlook in outlooks)
 
     across_kept, near_kept = kept(look.try_each(chosen)), kept(look.try_each(others))
-    assert len(chosen) > SLOTS
-    assert across_kept >= 0.75 * len(chosen) and near_kept <= across_kept - 3
+    assert len(chosen) >= 0.75 * SLOTS
+    assert across_kept >= 0.75 * len(chosen) and near_kept <= across_kept - 2
