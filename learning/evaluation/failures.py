@@ -31,7 +31,6 @@ from warp_deform.worlds.loop import SOLVED, EpisodeRun
 from warp_deform.worlds.worlds import Worlds
 
 __all__ = [
-    "FAILURES",
     "bag_holds_items",
     "bag_opening",
     "closed",
@@ -40,9 +39,6 @@ __all__ = [
     "took_nothing",
 ]
 
-FAILURES = ("physics", "missed grasp", "destructive bag action", "item not enclosed",
-            "opening covered", "back and forth", "other")  # fmt: skip
-"""In the order in which they are looked for."""
 _CLOSED = 0.25
 _NEAR = 0.03
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,31 +17,9 @@ from warp_deform.worlds.worlds import Worlds
 from ..policy.policy import ImagePolicy, Policy, RetryingPolicy, StatePolicy
 from .failures import bag_opening, failure
 from .protocol import Protocol
+from .summary import PlayedEpisode
 
-__all__ = ["Measures", "PlayedEpisode", "acting", "goal_distance", "play_policy"]
-
-
-@dataclass(frozen=True)
-class PlayedEpisode:
-    """What came of one episode.
-
-    Attributes:
-        score: at its end, 0 if its physics cannot be trusted
-        reason: why it ended
-        failure: which of `failures.FAILURES` it is; None if solved
-        goal_l2: for goal-conditioned tasks, `goal_distance` at the start and after every action
-        enclosed: `Worlds.enclosed` at the end, whether the bag keeps its items; None also if the
-            physics cannot be trusted
-    """
-
-    seed: int
-    success: bool
-    score: float
-    actions: int
-    reason: str
-    failure: str | None = None
-    goal_l2: tuple[float, ...] | None = None
-    enclosed: bool | None = None
+__all__ = ["Measures", "acting", "goal_distance", "play_policy"]
 
 
 class Measures(NamedTuple):

@@ -25,10 +25,9 @@ from ..policy.policy import load_policy
 from ..runs.folder import RunFolder, write_json
 from ..runs.log import cpu_seconds, read_log
 from .paper_results import PARTIAL_SCORE, SUCCESS, partial_credit, read_paper
-from .play import PlayedEpisode
 from .protocol import FIRST_SEED, Protocol, check_goals, check_splits
 from .snapshot import evaluate_snapshot, trained_steps
-from .summary import Evaluation, best
+from .summary import Evaluation, PlayedEpisode, best
 
 __all__ = ["evaluate_run"]
 

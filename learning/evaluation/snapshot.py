@@ -22,9 +22,9 @@ from warp_deform.worlds.loop import SLOTS, worlds_for
 
 from ..policy.policy import ImagePolicy, StatePolicy, load_policy
 from ..runs.folder import Fields, RunFolder, check_fields, read_json, read_record, write_json
-from .play import PlayedEpisode, play_policy
+from .play import play_policy
 from .protocol import Protocol, goals_for, goals_of
-from .summary import Evaluation, summarise
+from .summary import Evaluation, PlayedEpisode, summarise
 
 __all__ = [
     "evaluate_snapshot",

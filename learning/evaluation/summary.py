@@ -14,9 +14,35 @@ from typing import Any
 import numpy as np
 
 from .paper_results import partial_credit
-from .play import PlayedEpisode
 
-__all__ = ["Evaluation", "best", "measure", "summarise", "wilson"]
+__all__ = ["FAILURES", "Evaluation", "PlayedEpisode", "best", "measure", "summarise", "wilson"]
+
+FAILURES = ("physics", "missed grasp", "destructive bag action", "item not enclosed",
+            "opening covered", "back and forth", "other")  # fmt: skip
+"""Kinds of failure, in the order in which `failures.failure` looks for them."""
+
+
+@dataclass(frozen=True)
+class PlayedEpisode:
+    """What came of one episode.
+
+    Attributes:
+        score: at its end, 0 if its physics cannot be trusted
+        reason: why it ended
+        failure: which of `FAILURES` it is; None if solved
+        goal_l2: for goal-conditioned tasks, `goal_distance` at the start and after every action
+        enclosed: `Worlds.enclosed` at the end, whether the bag keeps its items; None also if the
+            physics cannot be trusted
+    """
+
+    seed: int
+    success: bool
+    score: float
+    actions: int
+    reason: str
+    failure: str | None = None
+    goal_l2: tuple[float, ...] | None = None
+    enclosed: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -43,7 +69,7 @@ def summarise(episodes: Sequence[PlayedEpisode], *, task: str) -> dict[str, Any]
     n_episodes, n_success, pc_success [%], pc_success_ci95: Wilson's interval [%], mean_score in
     [0, 1] with its standard_error, mean_actions, mean_actions_solved (of successes, None without),
     paper_value [%]: what the paper's table calls success, see `partial_credit`
-    failures: how often each of `failures.FAILURES` happened
+    failures: how often each of `FAILURES` happened
     goal_l2: mean of the last states' `goal_distance`, None where there is no goal
     n_success_enclosed: successes whose every item the bag enclosed, which scores do not ask for,
     see `Task.enclosed`; None where there is no bag or item

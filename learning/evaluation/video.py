@@ -28,9 +28,9 @@ from warp_deform.worlds.worlds import Worlds
 
 from ..policy.policy import ImagePolicy, load_policy
 from ..runs.folder import RunFolder
-from .play import Measures, PlayedEpisode, play_policy
+from .play import Measures, play_policy
 from .protocol import Protocol, goals_for, goals_of
-from .summary import Evaluation
+from .summary import Evaluation, PlayedEpisode
 
 __all__ = ["HeatMaps", "Sight", "draw", "film_episodes", "heat_maps"]
 

@@ -12,9 +12,10 @@ from warp_deform.errors import InputError
 from warp_deform.page.sources import Entry, Shown
 from warp_deform.worlds.worlds import Worlds
 
-from ..evaluation.play import PlayedEpisode, play_policy
+from ..evaluation.play import play_policy
 from ..evaluation.protocol import Protocol, goals_for, goals_of
 from ..evaluation.snapshot import read_played
+from ..evaluation.summary import PlayedEpisode
 from ..policy.policy import ImagePolicy, StatePolicy, load_policy
 from ..runs.folder import RunFolder, read_json
 

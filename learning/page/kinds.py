@@ -10,7 +10,7 @@ __all__ = ["kind_of"]
 
 
 def kind_of(episode: Episode) -> str:
-    """Which of `evaluation.failures.FAILURES` an episode is; empty if it succeeded.
+    """Which of `evaluation.summary.FAILURES` an episode is; empty if it succeeded.
 
     Those of bags ask the simulator, so here such an episode is "other".
     """

@@ -86,7 +86,7 @@ class Cell:
             played
         paper_protocol_stage_rule: who chose the lift there, "action" or "privileged"
         paper: the paper's number [%]; None where it has none
-        failures: how often each of `failures.FAILURES` happened
+        failures: how often each of `summary.FAILURES` happened
         validation: learning curve on validation episodes
         test: learning curve on test episodes, where the paper's protocol was played
     """

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..evaluation.failures import FAILURES
 from ..evaluation.paper_results import SUCCESS, PaperResults
+from ..evaluation.summary import FAILURES
 from .cells import Cell
 from .origins import origins
 

@@ -10,8 +10,7 @@ import pytest
 from fixtures.short_runs import TASK
 
 from learning.command.outcome_text import evaluated, trained
-from learning.evaluation.play import PlayedEpisode
-from learning.evaluation.summary import summarise
+from learning.evaluation.summary import PlayedEpisode, summarise
 from learning.runs.folder import RunFolder
 from learning.training import train as training
 from warp_deform.command import main as cli

@@ -14,13 +14,11 @@ import torch
 from fixtures.training_samples import write_demonstrations
 
 from learning.evaluation import snapshot as evaluating
-from learning.evaluation.failures import (
-    FAILURES,
-)
 from learning.evaluation.play import goal_distance
 from learning.evaluation.protocol import Protocol
 from learning.evaluation.run import evaluate_run
 from learning.evaluation.snapshot import evaluate_snapshot, is_evaluated
+from learning.evaluation.summary import FAILURES
 from learning.policy.policy import load_policy
 from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig

@@ -17,12 +17,11 @@ from fixtures.training_samples import block_episode
 
 from learning.evaluation import protocol, share
 from learning.evaluation import snapshot as evaluating
-from learning.evaluation.play import PlayedEpisode
 from learning.evaluation.protocol import Protocol, check_splits, goals_for, goals_of
 from learning.evaluation.run import evaluate_run
 from learning.evaluation.share import share_run
 from learning.evaluation.snapshot import evaluate_snapshot, stopped_early, trained_steps
-from learning.evaluation.summary import Evaluation, measure, summarise, wilson
+from learning.evaluation.summary import Evaluation, PlayedEpisode, measure, summarise, wilson
 from learning.policy.policy import AgentDescription, ImagePolicy, RetryingPolicy, make_agent
 from learning.runs.folder import RunFolder, read_json
 from warp_deform.episodes import EpisodeReader

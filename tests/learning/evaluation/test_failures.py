@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from learning.evaluation.failures import (
-    FAILURES,
     bag_holds_items,
     bag_opening,
     closed,
     failure,
     puts_back,
 )
+from learning.evaluation.summary import FAILURES
 from warp_deform.tasks.bag_items import BagItems1
 from warp_deform.tasks.cable_line import CableLineNotarget
 from warp_deform.worlds.loop import EpisodeRun

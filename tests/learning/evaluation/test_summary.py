@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from learning.evaluation.play import PlayedEpisode
-from learning.evaluation.summary import Evaluation, best, summarise
+from learning.evaluation.summary import Evaluation, PlayedEpisode, best, summarise
 
 TASK = "cable-line-notarget"
 

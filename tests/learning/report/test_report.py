@@ -14,8 +14,7 @@ import pytest
 from matplotlib.axes import Axes
 
 from learning.evaluation.paper_results import read_paper
-from learning.evaluation.play import PlayedEpisode
-from learning.evaluation.summary import summarise
+from learning.evaluation.summary import PlayedEpisode, summarise
 from learning.policy.policy import AGENTS
 from learning.report.cells import CurvePoint, pool, version_notes
 from learning.report.curves import draw_curves

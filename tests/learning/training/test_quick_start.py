@@ -16,7 +16,7 @@ from fixtures.places import ROOT
 from fixtures.training_samples import write_demonstrations
 
 from learning.evaluation import snapshot as evaluating
-from learning.evaluation.play import PlayedEpisode
+from learning.evaluation.summary import PlayedEpisode
 from learning.runs.folder import RunFolder
 from warp_deform.command.main import main
 
