@@ -10,14 +10,15 @@ that has a row of its task's present version is left out; delete the row to play
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
+from warp_deform.command.main import main as warp_deform
 from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import task
 
@@ -59,11 +60,10 @@ def played(name: str, episodes: int) -> dict[str, Any]:
         command = ["eval", str(run), "--episodes", str(episodes), "--json"]
         # its one snapshot needs no choice
         command += ["--validation-episodes", "1", "--workers", "1"]
-        done = subprocess.run(
-            [sys.executable, "-m", "warp_deform", *command],
-            stdout=subprocess.PIPE, check=True, text=True,
-        )  # fmt: skip
-    result = json.loads(done.stdout.splitlines()[-1])
+        with contextlib.redirect_stdout(io.StringIO()) as out:
+            if warp_deform(command):
+                raise SystemExit(f"{name} could not be played")
+    result = json.loads(out.getvalue().splitlines()[-1])
     test = result["test"]
     low, high = test["pc_success_ci95"]
     return {

@@ -36,8 +36,8 @@ def pytest_ignore_collect(collection_path, config):
 
 
 def pytest_collection_modifyitems(items):
-    """What shares a long compilation comes first, in a row: two workers would each compile it."""
-    marks = (item.get_closest_marker("compiles") for item in items)
+    """What is to run in a row comes first: two workers would each make what it shares."""
+    marks = (item.get_closest_marker("in_a_row") for item in items)
     names = {item: mark.args[0] for item, mark in zip(items, marks, strict=True) if mark}
     items.sort(key=lambda item: (item not in names, names.get(item)))
 

@@ -231,9 +231,7 @@ def _planned(config: ControlTrainConfig, worlds: TensorControlWorlds) -> int:
     worlds.reset({slot: (config.worlds + slot) % config.drawn for slot in range(config.worlds)})
     starts = (time.process_time() - began) * (config.drawn / config.worlds - 1)
     seconds = 60 * config.minutes - starts
-    count = int(seconds / statistics.median(costs))
-    # whole lines of the log, which says what they cost
-    return max(config.snapshots, count - count % LINE_STEPS if count > LINE_STEPS else count)
+    return max(config.snapshots, int(seconds / statistics.median(costs)))
 
 
 def _check(told: Mapping[str, float], number: int) -> None:

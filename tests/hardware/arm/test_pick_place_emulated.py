@@ -28,6 +28,11 @@ def limits(height: float = SURFACE) -> SafetyLimits:
     return SafetyLimits(table=TablePlane(height))
 
 
+def quick(height: float = SURFACE) -> SafetyLimits:
+    """As fast as is allowed."""
+    return replace(limits(height), max_joint_speed=0.2, max_speed=0.25)
+
+
 def test_a_cable_is_placed(emulator: EmulatorProcess, ready_panda: PandaRobot) -> None:
     emulator.call_world("place_object", width=0.004)
     result = execute(SafeRobot(ready_panda, limits()), ACTION)
@@ -48,7 +53,7 @@ def test_a_cable_is_placed(emulator: EmulatorProcess, ready_panda: PandaRobot) -
 
 
 def test_a_missed_grasp_goes_home(ready_panda: PandaRobot) -> None:
-    result = execute(SafeRobot(ready_panda, limits()), ACTION)
+    result = execute(SafeRobot(ready_panda, quick()), ACTION)
     assert result.outcome == PickPlaceOutcome.MISSED_GRASP
     np.testing.assert_allclose(ready_panda.state().q, HOME, atol=1e-3)
 
@@ -58,7 +63,7 @@ def test_a_table_that_is_higher_than_thought_is_felt(
 ) -> None:
     """By 6 mm: the descent stops on contact and the cable is placed all the same."""
     emulator.call_world("place_object", width=0.004)
-    result = execute(SafeRobot(ready_panda, limits(SURFACE - 0.006)), ACTION)
+    result = execute(SafeRobot(ready_panda, quick(SURFACE - 0.006)), ACTION)
     assert result.outcome == PickPlaceOutcome.PLACED
     assert emulator.call_world("take")["force"].max() < 30.0
     assert ready_panda.state().mode == RobotMode.IDLE
@@ -75,8 +80,8 @@ def test_an_action_outside_moves_nothing(
 
 def test_touch_off_measures_the_table(ready_panda: PandaRobot) -> None:
     corners = [(0.48, -0.05), (0.48, 0.05), (0.55, 0.05), (0.55, -0.05)]
-    quick = replace(limits(SURFACE - 0.02), max_joint_speed=0.2)
-    points = touch_off(SafeRobot(ready_panda, quick), corners, TouchOffConfig(hover_m=0.036))
+    robot = SafeRobot(ready_panda, quick(SURFACE - 0.02))
+    points = touch_off(robot, corners, TouchOffConfig(hover_m=0.036))
     plane, residuals = fit_table_plane(points)
     errors = plane.z(np.array(corners)) - SURFACE
     assert np.abs(errors).max() < 1e-3 and np.abs(residuals).max() < 5e-4

@@ -131,6 +131,7 @@ def test_what_no_agent_can_learn_is_no_label() -> None:
         assert correcting._learnable(bad, task) is None
 
 
+@pytest.mark.in_a_row("workers")
 def test_parts_interruptions_and_workers_change_no_bit(
     trained: Path, corrected: CorrectReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

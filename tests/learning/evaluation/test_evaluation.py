@@ -50,6 +50,7 @@ def test_splits_do_not_overlap_with_training_or_each_other() -> None:
         Protocol(split="test", episodes=0)
 
 
+@pytest.mark.in_a_row("workers")
 def test_neither_workers_nor_parts_change_a_result(run: RunFolder) -> None:
     step = run.steps()[-1]
     whole = Protocol(split="validation", episodes=12)

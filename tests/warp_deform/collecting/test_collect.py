@@ -76,6 +76,7 @@ def test_an_episode_holds_everything(collected: tuple[Path, CollectReport]) -> N
             assert step.particle_q.shape == (24, 3) and step.ground_truth.shape == (144,)
 
 
+@pytest.mark.in_a_row("workers")
 def test_workers_do_not_change_a_byte(
     collected: tuple[Path, CollectReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

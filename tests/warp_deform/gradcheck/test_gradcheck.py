@@ -22,7 +22,7 @@ from warp_deform.tasks.cable_shape import CableShape
 from warp_deform.worlds import Worlds
 from warp_deform.xpbd.lanes.tape import Kind
 
-pytestmark = pytest.mark.compiles("adjoints")
+pytestmark = pytest.mark.in_a_row("adjoints")
 
 LINE = "cable-line-notarget"
 FEW = GradcheckConfig(levels=("substep",), states=4)

@@ -45,7 +45,7 @@ from warp_deform.solver import SolverFusedXPBD
 from warp_deform.support.quaternion import quat_from_yaw
 from warp_deform.tasks.metrics import hull_area
 
-pytestmark = pytest.mark.compiles("bags")
+pytestmark = pytest.mark.in_a_row("bags")
 
 DT = 1 / 1200
 DROPS = 4

@@ -151,7 +151,7 @@ def test_pybullet_lets_the_scene_fall_into_a_heap(name):
     _check_settled(scene, _heap(PyBulletWorld(scene)), contact=True)
 
 
-@pytest.mark.compiles("newton-vbd")
+@pytest.mark.in_a_row("newton-vbd")
 @pytest.mark.parametrize("solver", NEWTON_SOLVERS)
 def test_newton_lets_the_cable_fall_into_a_heap(solver):
     scene, settings = peer_scene("heap"), newton_settings(solver, "heap")
@@ -186,7 +186,7 @@ def test_cubes_fall_into_a_tower_that_stands_in_pybullet_too():
 
 
 @needs_pybullet
-@pytest.mark.compiles("newton-vbd")
+@pytest.mark.in_a_row("newton-vbd")
 def test_the_block_lands_flat_in_every_engine():
     scene = peer_scene("block", seed=1)
     worlds = [PyBulletWorld(scene)]
@@ -198,7 +198,7 @@ def test_the_block_lands_flat_in_every_engine():
 
 
 @needs_pybullet
-@pytest.mark.compiles("newton-vbd")
+@pytest.mark.in_a_row("newton-vbd")
 def test_a_timing_reports_its_settings_and_what_it_leaves_out():
     bullet = time_pybullet("block", seconds=0.1, repeats=1)
     assert (bullet.engine, bullet.hz, bullet.iterations, bullet.bodies) == ("pybullet", 240, 50, 1)

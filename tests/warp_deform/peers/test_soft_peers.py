@@ -71,7 +71,7 @@ def _after_play(world, scene, seconds=None):
 
 _SOFT_WORLDS = [
     pytest.param(PyBulletSoftWorld, 0.0037, marks=needs_pybullet, id="pybullet"),
-    pytest.param(NewtonSoftWorld, 0.004, marks=pytest.mark.compiles("newton-vbd"), id="newton-vbd"),
+    pytest.param(NewtonSoftWorld, 0.004, marks=pytest.mark.in_a_row("newton-vbd"), id="newton-vbd"),
 ]
 
 
@@ -108,7 +108,7 @@ def test_a_corner_is_carried_to_where_it_was_told_and_stays_folded(engine, heigh
         assert piercing(end, scene.triangles) == 0 and scene.stretch(end) < 1.03
 
 
-@pytest.mark.compiles("newton-vbd")
+@pytest.mark.in_a_row("newton-vbd")
 def test_a_recorded_newton_fold_moves_like_an_eager_one(monkeypatch):
     scene = soft_scene("cloth10")
     settings = NewtonSoftSettings(substeps=2, iterations=3)
@@ -125,7 +125,7 @@ def _simulate(world, graph):
     world._simulate()
 
 
-@pytest.mark.compiles("newton-vbd")
+@pytest.mark.in_a_row("newton-vbd")
 def test_newton_s_bag_crumples_around_the_cube():
     _check_bag(NewtonSoftWorld, 0.25)
 

@@ -29,7 +29,7 @@ SAMPLES = [
     RING,
     BLOCK,
     "fabric-flat",
-    pytest.param("bag-items-2", marks=pytest.mark.compiles("bags")),
+    pytest.param("bag-items-2", marks=pytest.mark.in_a_row("bags")),
 ]
 
 

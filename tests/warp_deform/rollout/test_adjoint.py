@@ -17,7 +17,7 @@ from warp_deform.rollout import DifferentiableRollout, GripPath, rollout, subste
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 
-pytestmark = pytest.mark.compiles("adjoints")
+pytestmark = pytest.mark.in_a_row("adjoints")
 
 SHORT = CableConfig(beads=10)
 ROLLING = replace(FABRIC_SOLVER, damping=4.0, limits=LOOSE, sleep_speed=0.0, max_speed=1e3)

@@ -24,7 +24,7 @@ from warp_deform.rollout import DifferentiableRollout, Gradients, GripPath
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 
-pytestmark = pytest.mark.compiles("adjoints")
+pytestmark = pytest.mark.in_a_row("adjoints")
 
 DT = 1 / 1200
 CUBE = BoxConfig(mass=0.05, friction=0.8)

@@ -13,7 +13,7 @@ from warp_deform.rollout import DifferentiableRollout, rollout
 from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 
-pytestmark = pytest.mark.compiles("adjoints")
+pytestmark = pytest.mark.in_a_row("adjoints")
 
 BEADS = 10
 

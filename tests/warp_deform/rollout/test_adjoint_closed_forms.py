@@ -20,7 +20,7 @@ from warp_deform.objects.box import BoxPart
 from warp_deform.rollout import DifferentiableRollout, Gradients, GripPath
 from warp_deform.xpbd.bodies.rigid_body import SLEEP_SPEED
 
-pytestmark = pytest.mark.compiles("adjoints")
+pytestmark = pytest.mark.in_a_row("adjoints")
 
 DT = 1 / 1200
 MU = 0.4

@@ -17,7 +17,7 @@ from warp_deform.solver import SolverConfig, SolverFusedXPBD
 from warp_deform.tasks.cloth_physics import FABRIC_SOLVER
 from warp_deform.xpbd.packing.parts import parts, set_parts
 
-pytestmark = pytest.mark.compiles("adjoints")
+pytestmark = pytest.mark.in_a_row("adjoints")
 
 RUBBER = CableConfig(beads=10, link_stiffness=3e3, bend_stiffness=20.0, solve="gauss-seidel")
 LIMP = replace(SMALL, structural_stiffness=200.0, shear_stiffness=30.0, bend_stiffness=0.5)

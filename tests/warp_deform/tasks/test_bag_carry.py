@@ -16,7 +16,7 @@ from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 from warp_deform.worlds.loop import SLOTS
 from warp_deform.worlds.state import WorldState
 
-pytestmark = pytest.mark.compiles("bags")
+pytestmark = pytest.mark.in_a_row("bags")
 
 FIRST = 30_000  # seed, of none that the rule was found or is reported with
 ENCLOSED = 4

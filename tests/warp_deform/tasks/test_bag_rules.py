@@ -21,7 +21,7 @@ from warp_deform.tasks.task import Layout, Snapshot
 from warp_deform.worlds import Worlds
 from warp_deform.worlds.loop import play
 
-pytestmark = pytest.mark.compiles("bags")
+pytestmark = pytest.mark.in_a_row("bags")
 
 ITEMS = (BagItems1, BagItems2)
 each_items = pytest.mark.parametrize("cls", ITEMS)

@@ -20,7 +20,7 @@ from warp_deform.tasks.task import Layout, Snapshot
 from warp_deform.worlds import Worlds
 from warp_deform.worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 
-pytestmark = pytest.mark.compiles("bags")
+pytestmark = pytest.mark.in_a_row("bags")
 
 BAGS = (BagAloneOpen, BagItems1, BagItems2, BagColorGoal)
 SHELL = bag_shell(BagConfig())

@@ -152,6 +152,7 @@ def test_an_installed_task_goes_the_whole_way(
     assert (cell["task"], cell["paper"]) == ("box-away", None)
 
 
+@pytest.mark.in_a_row("workers")
 def test_a_task_of_a_script_reaches_the_workers(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -126,6 +126,7 @@ def test_environment_follows_gymnasium(name: str) -> None:
 @every_task
 def test_same_seed_and_actions_same_bits_in_any_lane_and_company(name: str) -> None:
     seeds, count = (3, 11) if is_bag(name) else (3, 11, 24), slots(name)
+    seeds = (3,) if name in CROWDED else seeds
     steps = 1 if is_bag(name) and name != "bag-alone-open" else 2  # several objects take long
     plans = {seed: [] for seed in seeds}
 
@@ -155,7 +156,8 @@ def test_same_seed_and_actions_same_bits_in_any_lane_and_company(name: str) -> N
         (range(40, 41), {}) if is_bag(name) else (range(40, 46), {2: 24, count - 1: 50})
     )
     lanes = play(count, dict(enumerate((*seeds, *company))))
-    shuffled = play(count, {count - 3: 11, count // 2 - 1: 3} | others)
+    crowd = {} if name in CROWDED else {count - 3: 11}
+    shuffled = play(count, crowd | {count // 2 - 1: 3} | others)
     assert alone[seeds[0]] == again[seeds[0]]
     assert {seed: lanes[seed] for seed in seeds} == alone
     assert {seed: shuffled[seed] for seed in seeds} == alone

@@ -21,13 +21,8 @@ def compiled(kernel: wp.Kernel, folder: Path, name: str) -> str:
     return Path(ptx).read_text()
 
 
-def test_cables_compile_to_ptx(tmp_path: Path) -> None:
-    kernel = forward_kernel(wp.float32, 1, False)
-    assert ".visible .entry forward" in compiled(kernel, tmp_path, "forward")
-
-
 def test_everything_that_is_recorded_compiles_to_ptx(tmp_path: Path) -> None:
-    """With a tape, which adds to the code of a launch without one and leaves nothing of it out."""
+    """Cables, sheets and bodies with a tape: each adds to the code and leaves nothing of it out."""
     kernel = forward_kernel(wp.float32, 1, True, True, True, taped=True)
     assert ".visible .entry forward" in compiled(kernel, tmp_path, "forward")
 
