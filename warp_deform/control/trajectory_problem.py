@@ -37,8 +37,9 @@ _FASTEST_FREE, _FASTEST_HELD = 3.0, 6.0
 _UNIT = 0.002
 """Displacement [m] that a free number of 1 stands for."""
 _KNOTS_A_HOLD = 2
-"""Displacements of each hold that a search has; a descent has one for every second step."""
-_EVERY = 2
+"""Displacements of each hold that a search has."""
+_EVERY = 4
+"""A descent has one for so many recorded steps: as many at any pace, so that plans can be compared."""
 _WORSE = 4.0
 """What an excess over the recording weighs beside a gain, so that nothing gets worse for long."""
 
@@ -136,16 +137,16 @@ class TrajectoryProblem:
         for k in self._holds:
             stretch = path.stretches[k]
             steps = stretch.last - stretch.first
-            shares = hats(steps, max(1, round(steps / _EVERY)) if fine else _KNOTS_A_HOLD)
+            recorded = self.path.stretches[k].last - self.path.stretches[k].first
+            shares = hats(steps, max(1, round(recorded / _EVERY)) if fine else _KNOTS_A_HOLD)
             part = np.zeros((path.steps + 1, shares.shape[1]))
             part[stretch.first : stretch.last + 1] = shares
             parts.append(part)
         return np.concatenate(parts, axis=1) if parts else np.zeros((path.steps + 1, 0))
 
     def refined(self, numbers: np.ndarray) -> np.ndarray:
-        """Numbers of the same plan (1, K', 3) with displacements of every second held step."""
-        plan = self._plan(numbers[0])
-        count = self._basis(plan.path, fine=True).shape[1]
+        """Numbers of the same plan (1, K', 3) with finer displacements of what is held."""
+        count = self._basis(self._plan(numbers[0]).path, fine=True).shape[1]
         return np.concatenate([numbers, np.zeros((1, count, 3))], axis=1)
 
     # -- playing

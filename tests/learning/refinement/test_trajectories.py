@@ -20,6 +20,7 @@ from warp_deform.collecting.control_replay import led_task_of
 from warp_deform.collecting.control_runs import control_worlds
 from warp_deform.collecting.replay import verify
 from warp_deform.command.main import main
+from warp_deform.control import optimize
 from warp_deform.control.control_worlds import ControlWorlds
 from warp_deform.control.smooth_plans import smooth_plan
 from warp_deform.control.trajectory_problem import TrajectoryProblem
@@ -98,6 +99,15 @@ def test_a_block_that_is_let_go_early_beats_nothing(demos: Path) -> None:
     assert dropped.measures is not None
     assert dropped.measures.steps < problem.recorded.measures.steps and not dropped.rests
     assert not dropped.beats(problem.recorded) and problem.loss(dropped) > 2.0
+
+
+def test_a_descent_begins_again_from_plans_of_another_pace(demos: Path) -> None:
+    episode = EpisodeReader(demos, control=True).read(6)
+    actions = np.array([s.action for s in episode.steps if s.action is not None])
+    problem = TrajectoryProblem(control_worlds(led_task_of(episode.info)), 6, actions)
+    found = optimize(problem, "adam", evaluations=70, population=4)
+    assert found.gradients > 10 and found.losses[0] < 1.0  # all stages of the descent
+    assert np.isfinite(found.losses).all() and found.numbers[0].shape[0] > problem.shape[0]
 
 
 def test_the_gradient_of_a_swing_is_that_of_its_losses() -> None:
