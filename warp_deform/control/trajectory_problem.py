@@ -39,7 +39,7 @@ _UNIT = 0.002
 _KNOTS_A_HOLD = 2
 """Displacements of each hold that a search has."""
 _EVERY = 4
-"""A descent has one for so many recorded steps: as many at any pace, so that plans can be compared."""
+"""A descent has one for so many recorded steps, at any pace, so that plans can be compared."""
 _WORSE = 4.0
 """What an excess over the recording weighs beside a gain, so that nothing gets worse for long."""
 
