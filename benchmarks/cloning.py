@@ -1,13 +1,15 @@
 """What cloned policies come to on tasks of control, on seeds held out.
 
-    python benchmarks/cloning.py [TASK...] [--demos N] [--refined] [--seed S] [--episodes N]
-                                 [--work DIR] [--out FILE]
+    python benchmarks/cloning.py [TASK...] [--demos N] [--refined | --planned] [--seed S]
+                                 [--episodes N] [--work DIR] [--out FILE]
 
 For every task it collects demonstrations at 20 Hz with seeds from 0 (unless the work folder has
 them), clones them in chunks on one thread, and keeps five snapshots, evenly spread. Each plays 32
 validation episodes with seeds from 50,000; the best by its successes, then by its score, plays test
 episodes with seeds from 10,000, which nothing was chosen on. With --refined the demonstrations are
-refined as trajectories first. One row a task and source of data, appended to the results: successes
+refined as trajectories first. With --planned a swing is demonstrated by a network that plans it,
+trained for a minute, in place of a search for one goal after the other; its training counts as
+collecting. One row a task and source of data, appended to the results: successes
 with Wilson's 95 % interval [%], mean score, mean steps of the solved, CPU seconds of the updates,
 and of what collected and refined. cable-line-notarget begins with the first bead held and has 600
 steps.
@@ -32,6 +34,8 @@ from learning.control.cloning import (
     play_clone,
     read_chunks,
 )
+from learning.control.demonstrate import demonstrate
+from learning.control.train import ControlTrainConfig, train_control
 from learning.evaluation.protocol import FIRST_SEED
 from learning.evaluation.summary import wilson
 from learning.refinement.trajectories import TrajectoryConfig, refine_trajectories
@@ -52,7 +56,9 @@ def main() -> None:
     parser.add_argument("tasks", nargs="*", default=list(TASKS), metavar="TASK")
     parser.add_argument("--demos", type=int, default=100)
     parser.add_argument("--updates", type=int, default=CloningConfig.updates)
-    parser.add_argument("--refined", action="store_true")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--refined", action="store_true")
+    source.add_argument("--planned", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--work", type=Path, default=Path("build/cloning"))
@@ -71,11 +77,17 @@ def cloned(task: str, options: argparse.Namespace) -> dict[str, Any]:
     """The row of a task."""
     began = time.process_time()
     folder = options.work / task
-    collect(
-        CollectConfig(
-            task=task, episodes=options.demos, out=folder, workers=1, control=True, **TASKS[task]
-        )
-    )
+    if options.planned:
+        run, folder = options.work / f"{task}-run", options.work / f"{task}-planned"
+        train_control(ControlTrainConfig(task=task, method="plan", minutes=1.0, out=run))
+        demonstrate(run, folder, episodes=options.demos)
+    else:
+        collect(
+            CollectConfig(
+                task=task, episodes=options.demos, out=folder, workers=1, control=True,
+                **TASKS[task],
+            )
+        )  # fmt: skip
     if options.refined:
         refined = options.work / f"{task}-refined"
         refine_trajectories(TrajectoryConfig(source=folder, out=refined, workers=1))
@@ -103,7 +115,7 @@ def cloned(task: str, options: argparse.Namespace) -> dict[str, Any]:
     low, high = wilson(len(solved), len(played))
     return {
         "task": task,
-        "data": "refined" if options.refined else "demonstrated",
+        "data": "planned" if options.planned else "refined" if options.refined else "demonstrated",
         "demos": options.demos,
         "rows": len(chunks.seen),
         "seed": options.seed,

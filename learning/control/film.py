@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-import torch
-
-from warp_deform.collecting.control_runs import (
-    ControlRun,
-    LedTask,
-    control_worlds,
-    led,
-    observed,
-    record_control,
-)
+from warp_deform.collecting.control_runs import LedTask, control_worlds, led, record_control
 from warp_deform.collecting.control_video import film_control_episodes
 from warp_deform.control.registry import control_task
 from warp_deform.episodes import Episode
 from warp_deform.errors import WarpDeformError
 
 from .actor import Actor, PlanActor
+from .demonstrate import POLICY, Acting
 
 __all__ = ["film_played"]
 
@@ -45,14 +36,8 @@ def film_played(
 def _played(actor: Actor | PlanActor, how: LedTask, seed: int) -> Episode:
     """One episode, as recordings have it."""
     control = control_worlds(how)
-
-    def act(runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
-        ((slot, run),) = runs.items()
-        seen = torch.from_numpy(observed(control, slot, run))
-        with torch.no_grad():
-            return {slot: actor(seen[None])[0].numpy()}
-
-    ((slot, run),) = led(control, [seed], start=lambda runs: None, act=act)
+    played = led(control, [seed], start=lambda runs: None, act=Acting(actor, control))
+    ((slot, run),) = played
     if not run.rows:
         raise WarpDeformError(f"the episode of seed {seed} cannot be filmed: {run.ended}")
-    return record_control(control, slot, run, demonstrator="policy", pictures=False)
+    return record_control(control, slot, run, demonstrator=POLICY, pictures=False)
