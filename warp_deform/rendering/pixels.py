@@ -63,6 +63,14 @@ class PixelGrid:
         """
         return np.round(self.fractional(xy)).astype(np.int64)
 
+    def in_view(self, xy: np.ndarray) -> np.ndarray:
+        """The nearest world points (..., 2) [m] that a picture of `SHAPE` shows, to the bit.
+
+        A policy cannot be taught to act where its picture ends.
+        """
+        first, last = self.to_world(np.zeros(2)), self.to_world(np.array(SHAPE) - 1.0)
+        return np.clip(np.asarray(xy, dtype=float), first, last)
+
 
 TABLE_GRID = PixelGrid((BOUNDS[0][0], BOUNDS[1][0]), PIXEL_SIZE)
 """The grid of the benchmark's pictures."""

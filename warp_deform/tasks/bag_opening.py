@@ -17,7 +17,7 @@ from ..objects.bag import Bag, BagConfig, BagShell, bag_shell
 from ..objects.box import Box
 from ..objects.push import Push
 from ..objects.surface import area_share
-from ..rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world
+from ..rendering.pixels import PIXEL_SIZE, SHAPE, TABLE_GRID, pixel_to_world
 from ..robots.primitive import PrimitiveConfig, find_grasp
 from .bag_physics import BAG_PRIMITIVE, BAG_SOLVER, INSERT, OPEN
 from .demonstrators import farthest_bead, pick_place, ring_maps, visible_point
@@ -237,12 +237,12 @@ class BagTask(Task):
         return best[1]
 
     def pull_bead(self, layout: Layout, snapshot: Snapshot, bead: int, overshoot: float) -> Action:
-        """Pull one bead to its target and `overshoot` [m] beyond."""
+        """Pull one bead to its target and `overshoot` [m] beyond, but not out of the picture."""
         positions, targets, target_of = self._mapped(layout, snapshot)
         start, target = positions[bead, :2], targets[target_of[bead], :2]
         way = target - start
         beyond = target + way * (overshoot / max(float(np.hypot(*way)), 1e-9))
-        return pick_place(start, beyond, stage=OPEN)
+        return pick_place(start, TABLE_GRID.in_view(beyond), stage=OPEN)
 
     def map_distance(self, layout: Layout, snapshot: Snapshot) -> float:
         """Mean distance of the beads from their targets, over the opening's radius."""
@@ -270,7 +270,7 @@ class BagTask(Task):
             apart = np.linalg.norm(positions[pulled, :2] - positions[bead, :2], axis=1)
             if len(actions) < count and (apart > 0.03).all():
                 pulled.append(bead)
-                place = centre + out[bead] * (self.bag.opening_radius + 0.03)
+                place = TABLE_GRID.in_view(centre + out[bead] * (self.bag.opening_radius + 0.03))
                 actions.append(pick_place(positions[bead, :2], place, stage=OPEN))
         return actions[:count]
 

@@ -12,7 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from warp_deform.errors import InputError
 from warp_deform.rendering.meshes import box_mesh
-from warp_deform.rendering.pixels import PIXEL_SIZE, SHAPE, pixel_to_world, world_to_pixel
+from warp_deform.rendering.pixels import (
+    PIXEL_SIZE,
+    SHAPE,
+    TABLE_GRID,
+    pixel_to_world,
+    world_to_pixel,
+)
 from warp_deform.rendering.topdown import TopDown
 
 
@@ -82,6 +88,15 @@ def test_pixels_and_points_undo_each_other():
     assert (world_to_pixel(pixel_to_world(pixels)) == pixels).all()
     shifted = pixel_to_world(pixels) + 0.49 * PIXEL_SIZE
     assert (world_to_pixel(shifted) == pixels).all()
+
+
+def test_what_is_out_of_view_comes_to_its_edge() -> None:
+    inside = np.random.default_rng(0).uniform((0.25, -0.5), (0.7468, 0.4968), (100, 2))
+    assert np.array_equal(TABLE_GRID.in_view(inside), inside)
+    far = np.array([[0.1, 0.0], [0.9, 0.9], [0.2477, -0.0161], [0.5, -2.0]])
+    pixels = TABLE_GRID.to_pixel(TABLE_GRID.in_view(far))
+    assert ((pixels >= 0) & (pixels < SHAPE)).all()
+    assert pixels[1].tolist() == [319, 159] and pixels[0, 1] == pixels[2, 1] == 0
 
 
 @pytest.mark.parametrize("pixel", [(0, 0), (319, 159), (160, 80), (37, 101)])

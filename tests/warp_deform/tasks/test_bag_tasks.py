@@ -8,7 +8,7 @@ from fixtures.bag_episodes import REACH, delivered, each_items, snapshot, start
 
 from warp_deform.objects import BagConfig, Box
 from warp_deform.objects.bag import bag_shell
-from warp_deform.rendering.pixels import BOUNDS
+from warp_deform.rendering.pixels import BOUNDS, SHAPE, TABLE_GRID
 from warp_deform.rollout import GripPath, rollout
 from warp_deform.tasks.bag_alone_open import BagAloneOpen
 from warp_deform.tasks.bag_color_goal import COLORS, BagColorGoal
@@ -272,3 +272,14 @@ def test_the_visible_demonstrator_plays_a_seed_alike_in_any_company(cls) -> None
 
     alone = play(1, 0)
     assert alone == play(8, 5) and len(set(alone)) == len(alone) > 2
+
+
+def test_no_pull_ends_out_of_view() -> None:
+    """A place that no picture shows cannot be learnt, and training refuses such demonstrations."""
+    task, layout = start(BagAloneOpen)
+    lying = snapshot(task, layout)
+    for bead in range(0, 32, 4):
+        far = task.pull_bead(layout, lying, bead, overshoot=0.8)
+        pixel = TABLE_GRID.to_pixel(far[3:5])
+        assert ((pixel >= 0) & (pixel < SHAPE)).all()
+        assert (far[3:5] != task.pull_bead(layout, lying, bead, overshoot=0.9)[3:5]).sum() <= 1
