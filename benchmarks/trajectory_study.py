@@ -95,7 +95,7 @@ def measured(folder: Path, method: str, seconds: float) -> dict[str, Any]:
         found = optimize(problem, method, seconds=seconds, population=POPULATION, seed=seed)
         losses.append(min(1.0, float(found.losses[0])))  # else the recording is kept
         walk = problem.walks(found.numbers[0][None])[0]
-        if walk.beats(problem.recorded) and (walk.rests or not problem.recorded.rests):
+        if walk.beats(problem.recorded):
             ratios.append(over(walk, problem.recorded))
         evaluations += found.evaluations
         cpu += found.cpu_seconds
