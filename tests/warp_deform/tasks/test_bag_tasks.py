@@ -209,8 +209,10 @@ def color_goal_with_opening(width: float, actions: int) -> tuple[BagColorGoal, L
     return task, layout, snapshot(task, layout, points, lifts=(OPEN.lift,) * actions)
 
 
-@pytest.mark.parametrize(("name", "patience"), [("demonstrate", 6), ("demonstrate_visible", 3)])
-def test_a_demonstrator_waits_for_room_and_then_takes_what_there_is(name, patience) -> None:
+@pytest.mark.parametrize("name", ["demonstrate", "demonstrate_visible"])
+def test_a_demonstrator_puts_the_block_in_as_soon_as_it_fits(name) -> None:
+    """It goes by what pictures show: the same at every action, or no policy could learn it."""
+
     def insertions(width: float) -> list[bool]:
         stages = []
         for actions in range(BagColorGoal.max_actions):
@@ -220,7 +222,7 @@ def test_a_demonstrator_waits_for_room_and_then_takes_what_there_is(name, patien
         return stages
 
     assert all(insertions(1.0))
-    assert insertions(0.6) == [False] * patience + [True] * (8 - patience)
+    assert all(insertions(0.6))  # no 10 cm, but more than the block's diagonal
     assert not any(insertions(0.2))  # the block does not fit
 
 
