@@ -30,7 +30,7 @@ __all__ = ["BagColorGoal"]
 
 COLORS: tuple[Color, ...] = (PURPLE, BLUE, YELLOW, RED, GREEN, CYAN)
 _ROOM = 0.025
-"""Beyond its size [m], with which the block is put in where the opening is wide enough."""
+"""Most room [m] beyond its size that the block is given where the opening is wide enough."""
 _GOAL_SETTLE_SECONDS = 1.0
 
 
@@ -213,20 +213,16 @@ class BagColorGoal(BagTask):
         number = next(i for i, item in enumerate(snapshot.objects) if isinstance(item, Box))
         return INSERT if segment in snapshot.segments[number] else OPEN
 
-    def _clear(self, layout: Layout, snapshot: Snapshot, room: float = _ROOM) -> np.ndarray:
-        """Where (320, 160) the block fits into the opening with `room` [m] to spare."""
-        return self.clear_opening(layout, snapshot, self.block.parts[0].size[:2], room)
-
     def _widest(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """Where (320, 160) the block fits with the most room, at most `_ROOM`; empty if nowhere.
 
         Even there the opening's hull is as wide as the block's diagonal.
         """
-        clear = self._clear(layout, snapshot)
-        for room in np.linspace(_ROOM, 0.0, 9)[1:]:
+        size = self.block.parts[0].size[:2]
+        for room in np.linspace(_ROOM, 0.0, 9):
+            clear = self.clear_opening(layout, snapshot, size, float(room))
             if clear.any():
                 break
-            clear = self._clear(layout, snapshot, float(room))
         return clear
 
     # -- ground truth
