@@ -145,7 +145,7 @@ def test_every_task_has_a_gymnasium_id() -> None:
     [
         ("cable-ring", "WarpDeform/CableRing-v3"),
         ("cable-ring-notarget", "WarpDeform/CableRingNotarget-v3"),
-        ("bag-items-1", "WarpDeform/BagItems1-v5"),
+        ("bag-items-1", "WarpDeform/BagItems1-v6"),
     ],
 )
 def test_gymnasium_id(name: str, expected: str) -> None:

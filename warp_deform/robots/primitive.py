@@ -208,7 +208,8 @@ def carry(
 
     A bead or a body is lowered until it meets something, a vertex of a fabric or a bag only where
     `sheet_meets` says so, else to a fixed height. The retreat to `hover` follows the release and is
-    in the motion only.
+    in the motion only. A body that is taken above the action's lift, as one that lies on a bag can
+    be, is carried at the height it was taken at: it would be pressed through what lies under it.
 
     Args:
         stage: speeds and pauses
@@ -216,6 +217,8 @@ def carry(
             table
     """
     pick, place, lift = action[:3], action[3:6], float(action[6])
+    if grasp.body is not None:
+        lift = max(lift, grasp.height)
     yaw = pick[2] + _half_turn(place[2] - pick[2])
     bottom = min(floor + (config.sheet_release if grasp.sheet else 0.0), lift)
     points = [

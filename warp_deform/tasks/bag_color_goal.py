@@ -48,7 +48,7 @@ class BagColorGoal(BagTask):
 
     name = "bag-color-goal"
     instruction = "Put the block into the bag that has it in the goal picture."
-    version = 4
+    version = 5
     goal_conditioned = True
     stages = (OPEN, INSERT)
     success_score = 0.95

@@ -57,7 +57,7 @@ class BagItems1(BagTask):
     instruction = "Put the cube into the bag and carry the bag to the zone."
     stages = (OPEN, INSERT, CARRY)
     success_score = 0.5
-    version = 5
+    version = 6
     looks_aloft = True
     ground_truth_rows = ((Row.POSE, 1), *BAG_ROWS, (Row.POSE, 1))
     objects: ClassVar[tuple[str, ...]] = ("bag", "cube")

@@ -139,6 +139,23 @@ def test_what_would_be_pressed_into_the_table_is_lowered_no_further_than_the_lif
     assert path.lower is not None and path.lower[0] == path.lower[1]
 
 
+@given(st.floats(0.0, 0.4), st.floats(0.04, 0.4), st.floats(0.0, 0.3))
+def test_a_box_is_never_carried_below_where_it_was_taken(height, lift, floor) -> None:
+    """A box that lies on a bag would be pressed through it."""
+    box = replace(HELD, height=height, particle=None, body=0)
+    action = np.array([0.5, 0.0, 0.0, 0.5, 0.2, 0.0, lift])
+    motion, path = carry(action, box, STAGE, floor, 0.30, CONFIG)
+    lowered, _ = path.lower
+    carried = path.positions[path.times <= lowered]
+    assert carried[:, 2].min() == pytest.approx(height)
+    assert carried[:, 2].max() == pytest.approx(max(height, lift))
+    assert path.positions[-1, 2] == pytest.approx(min(floor, max(height, lift)))
+    assert motion.seconds >= path.times[-1]
+    bead = replace(HELD, height=height)
+    _, path = carry(action, bead, STAGE, floor, 0.30, CONFIG)
+    assert path.positions[path.times <= path.lower[0]][-1, 2] == pytest.approx(lift)
+
+
 def test_a_vertex_of_a_fabric_ends_its_descent_on_what_it_meets_only_where_it_is_to() -> None:
     action = np.array([0.5, 0.0, 0.0, 0.5, 0.2, 0.0, 0.04])
     grasp = replace(HELD, sheet=True)

@@ -9,6 +9,7 @@ from fixtures.bag_episodes import REACH, delivered, each_items, snapshot, start
 from warp_deform.objects import BagConfig, Box
 from warp_deform.objects.bag import bag_shell
 from warp_deform.rendering.pixels import BOUNDS, SHAPE, TABLE_GRID
+from warp_deform.robots.primitive import Outcome
 from warp_deform.rollout import GripPath, rollout
 from warp_deform.tasks.bag_alone_open import BagAloneOpen
 from warp_deform.tasks.bag_color_goal import COLORS, BagColorGoal
@@ -285,3 +286,23 @@ def test_no_pull_ends_out_of_view() -> None:
         pixel = TABLE_GRID.to_pixel(far[3:5])
         assert ((pixel >= 0) & (pixel < SHAPE)).all()
         assert (far[3:5] != task.pull_bead(layout, lying, bead, overshoot=0.9)[3:5]).sum() <= 1
+
+
+def test_a_block_that_lies_on_a_bag_is_not_pressed_through_it() -> None:
+    """A policy put the block on a bag, and then took it with the lift of an opening, 5 cm."""
+    worlds = Worlds(BagColorGoal(), 1)
+    worlds.reset({0: 50_009})
+    for x, y, to_x, to_y, lift in (
+        (0.3390625, 0.0015625, 0.4078125, -0.0109375, INSERT.lift),
+        (0.3515625, 0.0265625, 0.5765625, 0.2140625, INSERT.lift),
+        (0.6515625, 0.1578125, 0.4953125, 0.2953125, OPEN.lift),
+        (0.4515625, 0.2703125, 0.6203125, 0.2453125, OPEN.lift),
+        (0.3890625, 0.2515625, 0.5703125, 0.2390625, INSERT.lift),
+        (0.5453125, 0.2453125, 0.5703125, 0.2453125, OPEN.lift),
+    ):
+        before = worlds.episodes[0].snapshot.body_q[0, 2]
+        worlds.step({0: np.array([x, y, 0.0, to_x, to_y, 0.0, lift])})
+    episode = worlds.episodes[0]
+    past = episode.history[-1]
+    assert before > OPEN.lift and isinstance(episode.objects[past.held], Box)
+    assert past.outcome is Outcome.PLACED and episode.physics_ok
