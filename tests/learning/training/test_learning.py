@@ -1,4 +1,4 @@
-"""Two minutes from nothing: demonstrations, training, and places that were never shown."""
+"""From nothing in a moment: demonstrations, training, and places that were never shown."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from learning.data.dataset import Demonstrations
@@ -18,8 +17,10 @@ from learning.training.train import train
 from warp_deform.collecting.collect import CollectConfig, collect
 
 TASK = "cable-shape"
-STEPS = 110
-"""Enough: more than a third of the places are close by then."""
+STEPS = 48
+"""Enough: with three seeds, 0.28 to 0.39 of the places are close by then."""
+WARMUP = 10
+"""The preset's 100 steps, a fortieth of its 4000, would be all of these."""
 
 
 def place_errors(snapshot: Path, held_out: Demonstrations) -> np.ndarray:
@@ -41,11 +42,10 @@ def place_errors(snapshot: Path, held_out: Demonstrations) -> np.ndarray:
     return np.array(errors)
 
 
-@pytest.mark.timeout(900)
-def test_held_out_places_are_learnt_in_two_minutes(tmp_path: Path) -> None:
+def test_held_out_places_are_learnt_within_a_minute(tmp_path: Path) -> None:
     collect(CollectConfig(task=TASK, episodes=10, out=tmp_path / "demos"))
     collect(CollectConfig(task=TASK, episodes=10, seed=50_000, out=tmp_path / "held-out"))
-    schedule = replace(SCHEDULES["fast"], steps=STEPS, snapshots=1, validate=0)
+    schedule = replace(SCHEDULES["fast"], steps=STEPS, warmup=WARMUP, snapshots=1, validate=0)
     out = tmp_path / "run"
     train(
         TrainConfig(
@@ -63,5 +63,5 @@ def test_held_out_places_are_learnt_in_two_minutes(tmp_path: Path) -> None:
     assert len(before) > 30
     # a share is steadier than a median: half of the places are a choice among many beads
     close = [float((errors < 0.02).mean()) for errors in (before, after)]
-    assert close[1] > 0.25 and close[1] > 3 * close[0]  # 0.37 and 0.08
-    assert after.mean() < 0.75 * before.mean()  # 0.067 and 0.116 m
+    assert close[1] > 0.25 and close[1] > 3 * close[0]  # 0.31 and 0.08
+    assert after.mean() < 0.75 * before.mean()  # 0.075 and 0.116 m

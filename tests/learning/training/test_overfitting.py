@@ -16,7 +16,7 @@ from learning.training.train import train
 from warp_deform.episodes import Episode
 
 PICTURES = Schedule(steps=30, batch=1, lr=5e-4, warmup=5, decay=True, snapshots=1)
-GOALS = Schedule(steps=25, batch=1, lr=5e-4, warmup=5, snapshots=1)
+GOALS = Schedule(steps=12, batch=1, lr=1e-3, warmup=3, snapshots=1)
 STATES = Schedule(steps=500, batch=1, lr=3e-3, warmup=50, decay=True, snapshots=1)
 AGENTS = {
     "transporter": ("cable-ring", PICTURES),
