@@ -69,7 +69,7 @@ def batch(agent: Transporter) -> Batch:
 
 @pytest.mark.parametrize("agent_class", AGENTS)
 def test_agent_learns_its_labels(agent_class: type[Transporter]) -> None:
-    config = dataclasses.replace(TINY, width=0.25, lifts=(0.05, 0.3))
+    config = dataclasses.replace(TINY, lifts=(0.05, 0.3))
     agent = agent_class(config, seed=0)
     labelled = batch(agent)
     optimiser = KerasAdam(agent.parameters(), lr=3e-4)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from learning.refinement import film
 from learning.refinement.film import check_filmed, film_refined
 from learning.refinement.refine import REFINED, REFINEMENT
 from learning.refinement.trajectories import (
@@ -164,10 +165,14 @@ def test_picks_and_places_are_led_first(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_a_film_shows_what_was_refined_beside_what_it_was(
-    demos: Path, refined: tuple[Path, TrajectoryReport], tmp_path: Path
+    demos: Path,
+    refined: tuple[Path, TrajectoryReport],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     import imageio.v2 as imageio
 
+    monkeypatch.setattr(film, "FILMED", 1)
     path = tmp_path / "new" / "film.mp4"
     check_filmed(demos, path)
     film_refined(demos, refined[0], path)

@@ -161,9 +161,9 @@ def test_errors_come_back_as_they_are_and_lost_work_is_given_up(
     def die(_: int) -> int:
         os._exit(1)
 
-    with pytest.raises(InputError, match=r"workers is 99, more than 8 for each of \d+ cores"):
-        Workers(99, ray=address)
-    with cluster.joined(address):
+    with cluster.joined(address):  # once: whoever joins starts processes
+        with pytest.raises(InputError, match=r"workers is 99, more than 8 for each of \d+ cores"):
+            Workers(99, ray=address)
         assert sorted(cluster.unordered(refuse, [0, 1, 3], 2)) == [0, 1, 3]
         with pytest.raises(InputError, match=r"^two is refused$"):
             list(cluster.unordered(refuse, [2, 1], 1))
