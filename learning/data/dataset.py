@@ -18,10 +18,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from warp_deform.episodes import Episode, EpisodeReader, episode_name, read_index
+from warp_deform.episodes import Episode, EpisodeReader, Step, episode_name, read_index
 from warp_deform.episodes.corrected import is_corrected, labels_of
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
+
+from .goal_name import GoalName
 
 __all__ = ["Demonstrations", "Transition", "choose", "remove_cache"]
 
@@ -37,13 +39,12 @@ _IMPORTED_SOLVED = "bag-items-1", "bag-items-2"
 
 
 class Transition(NamedTuple):
-    """One demonstrated action: what was seen, what was done, and where the demonstration ended.
+    """One demonstrated action: what was seen, what was done, and with which goal.
 
     Attributes:
         color: before the action (H, W, 3) uint8
         height: before the action (H, W) float32 [m]
-        goal_color: at the end of the demonstration, which counts as its goal (H, W, 3) uint8; of a
-            corrected episode its own goal
+        goal_color: of the goal (H, W, 3) uint8, see `Demonstrations`
         goal_height: the same as heights (H, W) float32 [m]
         action: what is to be learnt (7,) float64 pick x, y, yaw, place x, y, yaw, lift [m, rad]
     """
@@ -111,15 +112,25 @@ class Demonstrations:
         count: demonstrations to learn from; None takes all but the spare ones
         seed: which ones, see `choose`
         spare: how many others there have to be, see `spared`
+        goal: of a demonstration; "end" takes how it ended (hindsight, the paper's), "own" the goal
+            that it was recorded with
 
     Raises:
-        InputError: no folder, another task's episodes, failures among them, or too few.
+        InputError: no folder, another task's episodes, failures among them, or too few; a goal of
+            their own is asked for, and they have none.
 
     Source: Seita et al., ICRA 2021, code that records demonstrations.
     """
 
     def __init__(
-        self, folder: Path, *, task: str, count: int | None = None, seed: int = 0, spare: int = 0
+        self,
+        folder: Path,
+        *,
+        task: str,
+        count: int | None = None,
+        seed: int = 0,
+        spare: int = 0,
+        goal: GoalName = "end",
     ) -> None:
         self.task = find_task(task)
         reader = EpisodeReader(Path(folder))
@@ -151,14 +162,17 @@ class Demonstrations:
                 f"hold out {spare}; collect more"
             )
         self._reader, self._index, self._seed, self._rest = reader, index, seed, rest
+        self._goal = goal
         self._take(chosen)
 
     def _take(self, seeds: tuple[int, ...]) -> None:
         self.seeds = seeds
         self.seals = tuple(self._index[episode_name(number)]["seal"] for number in seeds)
-        cache = self._reader.folder / _FOLDER
+        cache, kind = self._reader.folder / _FOLDER, "" if self._goal == "end" else "-own"
         self._episodes = [
-            _open(self._reader, number, cache / f"{number:09d}-{seal}-{_FORMAT}.npy")
+            _open(
+                self._reader, number, cache / f"{number:09d}-{seal}-{_FORMAT}{kind}.npy", self._goal
+            )
             for number, seal in zip(self.seeds, self.seals, strict=True)
         ]
 
@@ -213,7 +227,7 @@ class Demonstrations:
             yield episode, int(rng.integers(len(self._episodes[episode].actions)))
 
     def transition(self, episode: int, t: int) -> Transition:
-        """Transition t of a demonstration; its goal is how the demonstration ended (hindsight)."""
+        """Transition t of a demonstration, with its goal."""
         recorded = self._episodes[episode]
         rows = np.load(recorded.path, mmap_mode="r", allow_pickle=False)
         now, end = rows[t], rows[-1]
@@ -228,8 +242,7 @@ class Demonstrations:
     def state(self, episode: int, t: int) -> tuple[np.ndarray, np.ndarray]:
         """Ground truth (D,) float32 before transition t, and its action (7,).
 
-        Where the task has a goal, the second half is the goal's state: here that of the
-        demonstration's end (hindsight), as in `transition`.
+        Where the task has a goal, the second half is the goal's state, of the goal of `transition`.
         """
         recorded = self._episodes[episode]
         state = recorded.ground_truth[t].copy()
@@ -251,40 +264,49 @@ def _counts(entry: Mapping[str, Any]) -> bool:
     return least is None or entry["score"] > least
 
 
-def _open(reader: EpisodeReader, seed: int, path: Path) -> _Rows:
+def _open(reader: EpisodeReader, seed: int, path: Path, goal: GoalName) -> _Rows:
     """The cached rows of an episode, made first where they are missing or damaged."""
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
         if rows.dtype.names != _COLUMNS or rows.ndim != 1 or len(rows) < 2:
             raise ValueError("something else under this name")
     except (OSError, ValueError, EOFError):  # not made yet, or cut short by a full disk
-        _write(_rows(_learnt(reader.read(seed), what=reader.path(seed))), path)
+        _write(_rows(_learnt(reader.read(seed), goal, what=reader.path(seed))), path)
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     return _Rows(path, np.array(rows["action"][:-1]), np.array(rows["ground_truth"]))
 
 
-def _learnt(episode: Episode, *, what: Path) -> Episode:
-    """An episode as it is learnt from; of a corrected one the states with labels, then its goal.
+def _learnt(episode: Episode, goal: GoalName, *, what: Path) -> Episode:
+    """An episode as it is learnt from: states with what is to be done in them, then its goal.
 
     Raises:
-        InputError: there is no label.
+        InputError: there is no label, or no goal of its own.
     """
-    if not is_corrected(episode.info.demonstrator):
+    if is_corrected(episode.info.demonstrator):
+        labels = labels_of(episode.info, what=what)
+        steps = [
+            replace(step, action=label)
+            for step, label in zip(episode.steps, labels, strict=False)
+            if label is not None
+        ]
+        if not steps:
+            raise InputError(f"{what} holds no label; remove it")
+        end = episode.steps[-1]
+        return replace(episode, steps=(*steps, end if episode.goal is None else _aimed_at(episode)))
+    if goal == "end":
         return episode
-    labels = labels_of(episode.info, what=what)
-    steps = [
-        replace(step, action=label)
-        for step, label in zip(episode.steps, labels, strict=False)
-        if label is not None
-    ]
-    if not steps:
-        raise InputError(f"{what} holds no label; remove it")
+    if episode.goal is None:
+        raise InputError(f"{what} has no goal of its own; leave --goal out")
+    return replace(episode, steps=(*episode.steps[:-1], _aimed_at(episode)))
+
+
+def _aimed_at(episode: Episode) -> Step:
+    """The last state of an episode as if its goal had been reached."""
     end = episode.steps[-1]
-    if episode.goal is not None:
-        half = len(end.ground_truth) // 2  # in the second one stands the goal's state
-        truth = np.concatenate([end.ground_truth[half:], end.ground_truth[half:]])
-        end = replace(end, color=episode.goal.color, height=episode.goal.height, ground_truth=truth)
-    return replace(episode, steps=(*steps, end))
+    assert episode.goal is not None
+    half = len(end.ground_truth) // 2  # in the second one stands the goal's state
+    truth = np.concatenate([end.ground_truth[half:], end.ground_truth[half:]])
+    return replace(end, color=episode.goal.color, height=episode.goal.height, ground_truth=truth)
 
 
 def _rows(episode: Episode) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import Literal
 
 from warp_deform.collecting.collect import most_attempts
 from warp_deform.collecting.folder import check_seeds
-from warp_deform.collecting.goals import load_goal, load_goals
+from warp_deform.collecting.goals import check_goals, load_goal
 from warp_deform.collecting.make_goals import GOAL_SEED, make_goals
 from warp_deform.episodes import EpisodeReader, Goal
 from warp_deform.errors import InputError
@@ -24,7 +24,7 @@ from warp_deform.tasks.registry import task as find_task
 
 from ..runs.folder import RunFolder
 
-__all__ = ["FIRST_SEED", "Protocol", "check_goals", "check_splits", "goals_for", "goals_of"]
+__all__ = ["FIRST_SEED", "Protocol", "check_splits", "goals_for", "goals_of"]
 
 FIRST_SEED = {"validation": 50_000, "test": 10_000}
 """First seed of each split's episodes."""
@@ -130,21 +130,6 @@ def goals_of(folder: Path, protocol: Protocol, seeds: Sequence[int]) -> dict[int
     turns = {seed: (seed - protocol.seeds.start) % number for seed in seeds}
     goals = {k: load_goal(reader.path(reader.seeds[k])) for k in set(turns.values())}
     return {seed: goals[k] for seed, k in turns.items()}
-
-
-def check_goals(folder: Path, task: str) -> Path:
-    """The folder, if it holds goals of the task.
-
-    Raises:
-        InputError: it does not, or the task has no goals.
-    """
-    if not find_task(task).goal_conditioned:
-        raise InputError(f"{task} has no goal image, so no goals can be given")
-    for info in EpisodeReader(folder).infos():
-        if info.task != task:
-            raise InputError(f"{folder} holds goals of {info.task}, not of {task}")
-    load_goals(folder)
-    return folder
 
 
 def check_splits(trained: Iterable[int], protocols: Sequence[Protocol], *, task: str) -> None:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import joblib
 
+from warp_deform.collecting.goals import check_goals
 from warp_deform.collecting.workers import worker_count
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
@@ -25,7 +26,7 @@ from ..policy.policy import load_policy
 from ..runs.folder import RunFolder, write_json
 from ..runs.log import cpu_seconds, read_log
 from .paper_results import PARTIAL_SCORE, SUCCESS, partial_credit, read_paper
-from .protocol import FIRST_SEED, Protocol, check_goals, check_splits
+from .protocol import FIRST_SEED, Protocol, check_splits
 from .snapshot import evaluate_snapshot, trained_steps
 from .summary import Evaluation, PlayedEpisode, best
 

@@ -8,6 +8,7 @@ from typing import Any, get_args
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
 
+from ..data.goal_name import GoalName
 from ..models.transporter import Transporter, TransporterConfig
 from ..policy.policy import AGENTS
 from .processes import DEVICES
@@ -16,7 +17,7 @@ from .settings import PrecisionName, TrainSettings
 
 __all__ = ["TrainConfig"]
 
-PRECISIONS = get_args(PrecisionName)
+GOALS, PRECISIONS = get_args(GoalName), get_args(PrecisionName)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +39,10 @@ class TrainConfig(TrainSettings):
             raise InputError(f"there is no agent {self.agent!r}; there are: {', '.join(AGENTS)}")
         if self.preset not in SCHEDULES:
             raise InputError(f"preset is {self.preset!r}; it must be one of {sorted(SCHEDULES)}")
+        if self.goal not in GOALS:
+            raise InputError(f"goal is {self.goal!r}; it must be one of {list(GOALS)}")
+        if self.goal == "own" and not find_task(self.task).goal_conditioned:
+            raise InputError(f"goal is 'own', and {self.task} has no goals; leave --goal out")
         if self.device not in DEVICES:
             raise InputError(f"device is {self.device!r}; it must be 'cpu' or 'cuda'")
         for name, least in (("seed", 0), ("threads", 1), ("hold_out", 0)):

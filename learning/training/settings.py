@@ -14,6 +14,8 @@ from tyro.conf import Positional, arg
 
 from warp_deform.support.flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
 
+from ..data.goal_name import GoalName
+
 __all__ = ["AgentName", "PrecisionName", "PresetName", "TrainMethod", "TrainSettings"]
 
 AgentName = Literal["transporter", "goal-split", "goal-stack", "gt-mlp", "gt-mlp-2step"]
@@ -46,6 +48,9 @@ class TrainMethod:
 
     preset: PresetName = "paper"
     """The paper's network and schedule, or one for two CPU cores."""
+    goal: GoalName = "end"
+    """What is the goal of a demonstration: its end, as in the paper, or the goal of its own that it
+    was recorded with, which other objects can surround; see `demo --goals`."""
     steps: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Number of training steps. By default, the preset's."""
     batch: Annotated[int | None, arg(metavar="N"), COUNT] = None

@@ -182,7 +182,9 @@ def claim(
         "device": config.device,
         "demonstrations": dict(zip(map(str, data.seeds), data.seals, strict=True)),
         "versions": versions(),
-        **({} if start is None else {"start": start}),  # as runs had it before there was a choice
+        # as runs had it before there were choices
+        **({} if start is None else {"start": start}),
+        **({} if config.goal == "end" else {"goal": config.goal}),
     }
     text = json.dumps(deciding, sort_keys=True)
     key = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -220,7 +222,7 @@ def _compare(run: RunFolder, wanted: Mapping[str, Any], stored: Mapping[str, Any
         raise InputError(
             f"{run.path} is a shared policy, not trained further; choose another --out"
         )
-    for name, value in {"start": None, **wanted}.items():
+    for name, value in {"start": None, "goal": None, **wanted}.items():
         before = stored.get(name)
         if before == value:
             continue

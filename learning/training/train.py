@@ -114,6 +114,7 @@ def train(config: TrainConfig) -> TrainReport:
             count=config.demos,
             seed=config.seed,
             spare=config.hold_out,
+            goal=config.goal,
         )
         check_lifts(data)
         plan = config.plan(len(data))

@@ -23,7 +23,7 @@ from ..worlds.loop import SLOTS, SOLVED, play, worlds_for
 from .control_demos import ControlChunk, attempt_control_chunk, check_control, describe_control
 from .control_video import film_control
 from .folder import Attempt, Collection, append_attempt, check_seeds
-from .goals import load_goals
+from .goals import check_goals, load_goals
 from .recording import observe, record, task_config
 from .settings import CollectSettings
 from .video import check_video, film
@@ -40,19 +40,17 @@ FILMED = 2
 
 @dataclass(frozen=True, kw_only=True)
 class CollectConfig(CollectSettings):
-    """The settings of a collection, checked, and what a program alone can choose."""
-
-    goals: Path | None = None
-    """Folder of goals (see `make_goals`); a seed aims at the one number seed modulo their count, as
-    in the environments. None constructs a goal from every seed."""
+    """The settings of a collection, checked."""
 
     def __post_init__(self) -> None:
         if self.control:
             check_control(self)
             if self.goals is not None:
-                raise InputError("goals from a folder are for picks and places")
+                raise InputError("--goals does not go with --control")
         else:
             find_task(self.task)
+            if self.goals is not None:
+                check_goals(self.goals, self.task)
             self._refuse_control()
         find_robot(self.robot)
         if self.episodes < 1:

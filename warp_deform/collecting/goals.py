@@ -14,10 +14,18 @@ import numpy as np
 from ..episodes import EpisodeReader, Goal
 from ..errors import InputError
 from ..tasks.free_space import FreeSpace
+from ..tasks.registry import task as find_task
 from ..tasks.task import Layout, Snapshot, Task
 from .recording import GOAL_TARGETS, recorded_task
 
-__all__ = ["CONSTRUCTED", "DEMONSTRATED", "at_goal", "load_goal", "load_goals"]
+__all__ = [
+    "CONSTRUCTED",
+    "DEMONSTRATED",
+    "at_goal",
+    "check_goals",
+    "load_goal",
+    "load_goals",
+]
 
 CONSTRUCTED = "constructed"
 """Kind of goal, and the demonstrator that the files of such goals name."""
@@ -34,6 +42,21 @@ def load_goals(folder: Path) -> list[Goal]:
     """
     reader = EpisodeReader(folder)
     return [_goal(reader, seed) for seed in reader.seeds]
+
+
+def check_goals(folder: Path, task: str) -> Path:
+    """The folder, if it holds goals of the task.
+
+    Raises:
+        InputError: it does not, or the task has no goals.
+    """
+    if not find_task(task).goal_conditioned:
+        raise InputError(f"{task} has no goal image, so no goals can be given")
+    for info in EpisodeReader(folder).infos():
+        if info.task != task:
+            raise InputError(f"{folder} holds goals of {info.task}, not of {task}")
+    load_goals(folder)
+    return folder
 
 
 def load_goal(path: Path) -> Goal:

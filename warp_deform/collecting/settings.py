@@ -47,6 +47,9 @@ class CollectSettings:
     """Film the first two kept episodes into this MP4."""
     robot: RobotName = "ur5"
     """Which arm moves."""
+    goals: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder of goals, see `warp-deform goals`. The seed decides which one an episode goes for, and
+    its start is drawn for it, as a test's is. By default every seed makes a goal of its own."""
     control: bool = False
     """Demonstrate control at 20 Hz: the tip is led step by step, in the environment
     `WarpDeform/<Task>-Control-v1`. Swings (whip, whip-target) are searched for."""

@@ -53,6 +53,52 @@ def test_the_goal_in_a_state_is_the_end_too(folder: Path) -> None:
     assert (state[72:] == recorded[-1].ground_truth[:72]).all()
 
 
+def test_the_goal_is_the_demonstration_s_own_where_that_is_asked_for(folder: Path) -> None:
+    """Of pictures and states, of what is spared too; the end stays the goal of who asks for it."""
+    own = Demonstrations(folder, task=TASK, count=2, spare=2, goal="own")
+    end = Demonstrations(folder, task=TASK, count=2, spare=2)
+    for mine, theirs in ((own, end), (own.spared(2), end.spared(2))):
+        assert mine.seeds == theirs.seeds
+        for episode, seed in enumerate(mine.seeds):
+            recorded = EpisodeReader(folder).read(seed)
+            one, other = mine.transition(episode, 1), theirs.transition(episode, 1)
+            assert (one.goal_color == recorded.goal.color).all()
+            assert (one.goal_height == recorded.goal.height).all()
+            assert (other.goal_color == recorded.steps[-1].color).all()
+            assert not (one.goal_color == other.goal_color).all()
+            assert (one.color == other.color).all() and (one.action == other.action).all()
+            state, _ = mine.state(episode, 1)
+            assert (state[:72] == recorded.steps[1].ground_truth[:72]).all()
+            # what went for a goal has the goal's state in the second half of its own
+            assert (state[72:] == recorded.steps[-1].ground_truth[72:]).all()
+
+
+def test_a_recording_without_a_goal_has_none_of_its_own(tmp_path: Path) -> None:
+    EpisodeWriter(tmp_path).write(dataclasses.replace(block_episode(0), goal=None))
+    with pytest.raises(InputError, match="no goal of its own; leave --goal out"):
+        Demonstrations(tmp_path, task=TASK, goal="own")
+    assert len(Demonstrations(tmp_path, task=TASK)) == 1
+
+
+def test_goals_of_their_own_are_another_run_and_need_a_task_with_goals(
+    folder: Path, tmp_path: Path
+) -> None:
+    def begin(**changes) -> str:
+        schedule = Schedule(steps=2, batch=1, lr=1e-3, snapshots=1)
+        values = {"task": TASK, "agent": "gt-mlp", "preset": "fast", "schedule": schedule}
+        config = TrainConfig(data=folder, out=tmp_path / "run", **values | changes)
+        return train(config).weights_hash
+
+    weights = begin(goal="own")
+    assert begin(goal="own") == weights
+    with pytest.raises(InputError, match="holds a run with another goal"):
+        begin()
+    with pytest.raises(InputError, match="cable-ring has no goals; leave --goal out"):
+        begin(task="cable-ring", goal="own")
+    with pytest.raises(InputError, match="goal is 'start'; it must be one of"):
+        begin(goal="start")
+
+
 def test_a_task_without_goal_keeps_its_state(tmp_path: Path) -> None:
     write_demonstrations(tmp_path, 1, task="cable-ring")
     data = Demonstrations(tmp_path, task="cable-ring")
