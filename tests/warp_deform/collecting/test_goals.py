@@ -94,6 +94,12 @@ def test_demonstrations_aim_at_given_goals(constructed: Path, tmp_path: Path) ->
 def test_wrong_requests_are_refused(constructed: Path, demonstrated: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no goal image"):
         make_goals("cable-ring", tmp_path, count=1)
+    with pytest.raises(InputError, match="has no goal image, so no goals can be given"):
+        CollectConfig(task="cable-ring", out=tmp_path, goals=constructed)
+    with pytest.raises(InputError, match=f"holds goals of {TASK}, not of block-notarget"):
+        CollectConfig(task="block-notarget", out=tmp_path, goals=constructed)
+    with pytest.raises(InputError, match="--goals does not go with --control"):
+        CollectConfig(task=TASK, out=tmp_path, goals=constructed, control=True)
     with pytest.raises(InputError, match="kind is 'drawn'"):
         make_goals(TASK, tmp_path, count=1, kind="drawn")
     for seed in (-1, 999_999_999):

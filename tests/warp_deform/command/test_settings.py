@@ -53,6 +53,7 @@ CHANGED: dict[str, tuple[list[str], Any]] = {
     "validate": (["7"], 7),
     "confirm": (["9"], 9),
     "patience": (["6"], 6),
+    "goal": (["own"], "own"),
     "precision": (["float32"], "float32"),
     "device": (["cuda"], "cuda"),
     "untrained": ([], True),
