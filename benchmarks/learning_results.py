@@ -53,6 +53,8 @@ def check_in(paths: Sequence[Path], out: Path) -> list[str]:
         )
         if steps != usual.steps:
             name += f"-{steps}-steps"
+        if run.settings.get("goal") == "own":
+            name += "-own-goals"
         target = RunFolder(out / "runs" / name)
         target.path.mkdir(parents=True, exist_ok=True)
         settings = {key: value for key, value in run.settings.items() if key != "data"}

@@ -100,6 +100,8 @@ def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     if settings.get("corrected"):
         by = [name for name in settings["demonstrators"] if is_corrected(name)]
         parts.append(f"{settings['corrected']} episodes {' and '.join(by)}")
+    if settings.get("goal") == "own":
+        parts.append("goals of their own")
     if settings.get("start"):
         parts.append("begun with trained weights")
     return ", ".join(parts)

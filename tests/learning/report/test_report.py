@@ -192,6 +192,7 @@ def test_who_demonstrated_and_how_long_is_a_variant(tmp_path: Path) -> None:
     write_run(tmp_path / "b", seed=1)
     write_run(tmp_path / "c", trained={"demonstrators": ["refined"]})
     write_run(tmp_path / "d", trained={"demonstrators": ["original", "scripted"]})
+    write_run(tmp_path / "i", trained={"goal": "own"})
     patient = {"patience": 2, "validate": 20}
     write_run(tmp_path / "e", trained=patient, trained_steps=2000)
     write_run(tmp_path / "f", seed=1, trained=patient, trained_steps=3000)
@@ -206,6 +207,7 @@ def test_who_demonstrated_and_how_long_is_a_variant(tmp_path: Path) -> None:
         "fast": (0, 1, 2),
         "fast, refined demonstrations": (0,),
         "fast, original and scripted demonstrations": (0,),
+        "fast, goals of their own": (0,),
         "fast, up to 4000 steps, patience 2": (0, 1),
         "fast, 4000 of 8000 steps": (0,),
     }
