@@ -50,6 +50,29 @@ def flange_T_tcp() -> np.ndarray:
     return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, HAND_LENGTH], [0, 0, 0, 1.0]])
 
 
+def _links() -> np.ndarray:
+    """Return what a joint's angle does not change of the links' transforms, (7, 4, 4) [m]."""
+    links = np.zeros((7, 4, 4))
+    for link, a, d, alpha in zip(links, DH_A, DH_D, DH_ALPHA, strict=True):
+        ca, sa = np.cos(alpha), np.sin(alpha)
+        link[:, 2:] = [[0.0, a], [-sa, -d * sa], [ca, d * ca], [0.0, 1.0]]
+    return links
+
+
+def _joint_7_T_flange() -> np.ndarray:
+    """Return the pose of the flange in joint 7's frame, (4, 4) [m]."""
+    flange = np.eye(4)
+    flange[2, 3] = FLANGE
+    return flange
+
+
+# Motions are planned and checked in thousands of poses; what is the same for all is made once.
+_LINKS = _links()
+_ALPHA_COSINES, _ALPHA_SINES = np.cos(DH_ALPHA), np.sin(DH_ALPHA)
+_BASE, _JOINT_7_T_FLANGE, _FLANGE_T_TCP = np.eye(4), _joint_7_T_flange(), flange_T_tcp()
+_JOINT_7_T_TCP = _JOINT_7_T_FLANGE @ _FLANGE_T_TCP
+
+
 class PandaKinematics:
     """Forward kinematics and Jacobian of the nominal arm; a real one differs by some 0.1 mm."""
 
@@ -59,45 +82,36 @@ class PandaKinematics:
 
     def poses(self, q: np.ndarray) -> np.ndarray:
         """Return base_T_tcp (N, 4, 4) [m] of many joint positions [rad] (N, 7) at once."""
-        q = np.asarray(q, dtype=np.float64)
-        cosines, sines = np.cos(q), np.sin(q)
-        T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-        for i, (a, d, alpha) in enumerate(zip(DH_A, DH_D, DH_ALPHA, strict=True)):
-            ca, sa, ct, st = np.cos(alpha), np.sin(alpha), cosines[:, i], sines[:, i]
-            link = np.zeros((len(q), 4, 4))
-            for row, (cosine, sine, shift) in enumerate(
-                [(1.0, 0.0, a), (ca, -sa, -d * sa), (sa, ca, d * ca)]
-            ):
-                link[:, row, 0] = (ct if row == 0 else st) * cosine
-                link[:, row, 1] = (-st if row == 0 else ct) * cosine
-                link[:, row, 2] = sine
-                link[:, row, 3] = shift
-            link[:, 3, 3] = 1.0
+        T = np.broadcast_to(_BASE, (len(q), 4, 4))
+        for link in self._link_transforms(np.asarray(q).T):
             T = T @ link
-        flange = np.eye(4)
-        flange[2, 3] = FLANGE
-        return T @ (flange @ flange_T_tcp())
+        return T @ _JOINT_7_T_TCP
 
     def jacobian(self, q: np.ndarray) -> np.ndarray:
         """Return the TCP's Jacobian in the base frame, shape (6, 7) [m, rad]."""
         base_T_tcp, axes, origins = self._chain(q)
-        return np.vstack([np.cross(axes, base_T_tcp[:3, 3] - origins).T, axes.T])
+        (x, y, z), (a, b, c) = axes.T, (base_T_tcp[:3, 3] - origins).T
+        columns = np.stack([y * c - z * b, z * a - x * c, x * b - y * a, x, y, z], axis=1)
+        return columns.T
+
+    @classmethod
+    def _chain(cls, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return base_T_tcp, and the joints' axes and origins, each (7, 3)."""
+        T, frames = _BASE, np.empty((7, 4, 4))
+        for link, frame in zip(cls._link_transforms(q), frames, strict=True):
+            T = np.matmul(T, link, out=frame)
+        return T @ _JOINT_7_T_FLANGE @ _FLANGE_T_TCP, frames[:, :3, 2], frames[:, :3, 3]
 
     @staticmethod
-    def _chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return base_T_tcp, and the joints' axes and origins, each (7, 3)."""
-        T, axes, origins = np.eye(4), np.empty((7, 3)), np.empty((7, 3))
-        for i, (a, d, alpha) in enumerate(zip(DH_A, DH_D, DH_ALPHA, strict=True)):
-            ca, sa, ct, st = np.cos(alpha), np.sin(alpha), np.cos(q[i]), np.sin(q[i])
-            T = T @ np.array(
-                [
-                    [ct, -st, 0.0, a],
-                    [st * ca, ct * ca, -sa, -d * sa],
-                    [st * sa, ct * sa, ca, d * ca],
-                    [0.0, 0.0, 0.0, 1.0],
-                ]
-            )
-            axes[i], origins[i] = T[:3, 2], T[:3, 3]
-        flange = np.eye(4)
-        flange[2, 3] = FLANGE
-        return T @ flange @ flange_T_tcp(), axes, origins
+    def _link_transforms(q: np.ndarray) -> np.ndarray:
+        """Return each link's transform (7, ..., 4, 4) [m] at its joint's angles (7, ...) [rad]."""
+        q = np.asarray(q, dtype=np.float64)
+        across = (slice(None), *(None,) * (q.ndim - 1))
+        ca, sa = _ALPHA_COSINES[across], _ALPHA_SINES[across]
+        ct, st = np.cos(q), np.sin(q)
+        links = np.empty((*q.shape, 4, 4))
+        links[...] = _LINKS[across]
+        links[..., 0, 0], links[..., 0, 1] = ct, -st
+        links[..., 1, 0], links[..., 1, 1] = st * ca, ct * ca
+        links[..., 2, 0], links[..., 2, 1] = st * sa, ct * sa
+        return links
