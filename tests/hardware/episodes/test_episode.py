@@ -49,8 +49,10 @@ from hardware.recordings.scoring import StartAtGoal, score_recording
 from hardware.rig.config import RigConfig
 from hardware.twin.camera import SimCamera, sim_calibration
 from hardware.twin.twin import CableTwin, TwinConfig
+from hardware.vision.segmentation import segment_cable
 from warp_deform.command.main import main as command
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.tasks.metrics import mask_iou
 from warp_deform.xpbd.guards import PhysicsError, Problem, ProblemKind
 
 POLICY = ROOT / "benchmarks/results/learning/policies/cable-mask-goal-goal-split-500"
@@ -295,7 +297,7 @@ def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
     config = TwinConfig(seed=7)
     world = functools.partial(CableTwin, config)
     targets = chain(0.52)[:, :2]
-    goal = TASK.mask(targets)
+    start, goal = chain(0.45)[:, :2], TASK.mask(targets)
     with EmulatorProcess(world=world, free_host=True) as emulator:
         look = functools.partial(emulator.call_world, "look")
         emulator.call_world("lay", beads=chain(0.45))
@@ -316,7 +318,9 @@ def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
                 goal=goal,
                 config=EpisodeConfig(max_actions=1),
             )
-        beads = look().beads[:, :2]
+        after = look()
+        seen = segment_cable(config.view.rectify(SimCamera(look).read().rgb, sim_calibration()))
+    beads = after.beads[:, :2]
     assert result.outcomes == ("placed",) and result.score is not None
     ways = [np.linalg.norm(beads - targets[::way], axis=1).mean() for way in (1, -1)]
     assert min(ways) < 0.8 * 0.07
@@ -324,6 +328,13 @@ def test_a_whole_episode_through_the_vendors_client(tmp_path: Path) -> None:
     assert (again.iou, again.success) == (result.score.iou, result.score.success)
     found = replay_recording(tmp_path / "a")
     assert (found.mismatches, found.actions) == (0, 1)
-    readings = Recording.read(tmp_path / "a").robot
-    moving = [row for row in readings if row.get("mode") == "moving"]
+    recording = Recording.read(tmp_path / "a")
+    (row,) = recording.actions
+    assert row["gripper_width_after_lift_m"] == pytest.approx(2 * config.chain.radius, abs=2e-4)
+    picked = np.linalg.norm(start - row["action"][:2], axis=1)
+    placed = np.linalg.norm(beads - row["action"][3:5], axis=1)
+    assert placed.min() < 8e-3 and abs(placed.argmin() - picked.argmin()) < 10
+    assert mask_iou(seen, TASK.mask(beads)) > 0.9
+    assert mask_iou(seen, TASK.mask(start)) < 0.6
+    moving = [row for row in recording.robot if row.get("mode") == "moving"]
     assert len(moving) > 5 and len({tuple(row["q"]) for row in moving}) > 3

@@ -1,9 +1,11 @@
-"""The twin of the physical workspace: chain, foam, simulated robot and camera, and the emulator."""
+"""The twin of the physical workspace: chain, foam, simulated robot and camera.
+
+Under the vendor's client it is in `episodes/test_episode.py`.
+"""
 
 from __future__ import annotations
 
-import functools
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig, PickPlaceO
 from hardware.arm.safe_robot import SafeRobot
 from hardware.arm.straight_line import distance
 from hardware.cameras.camera import CameraError
-from hardware.emulator import Contact, EmulatorProcess, Hand, TableWorld
+from hardware.emulator import Contact, Hand, TableWorld
 from hardware.twin.camera import SimCamera, SimCameraConfig, sim_calibration
 from hardware.twin.robot import SimRobot, SimRobotConfig
 from hardware.twin.twin import CableTwin, TwinConfig
@@ -271,32 +273,3 @@ def test_a_camera_at_the_foam_sees_nothing(twin: CableTwin) -> None:
     with pytest.raises(CameraError, match="home pose"):
         SimCamera(twin.look).read()
     twin.step(Hand(ARM.pose(HOME), np.zeros(3), 0.08, False, 1e-3))
-
-
-# The emulator.
-
-
-@pytest.mark.emulator
-@pytest.mark.timeout(480)
-def test_the_vendors_client_moves_the_chain_and_the_camera_sees_it() -> None:
-    from fixtures import emulator_client  # noqa: F401  skips where the vendor has no wheels
-
-    from hardware.backends.franka_config import NetworkedConfig
-    from hardware.backends.panda import PandaRobot
-
-    world = functools.partial(CableTwin, TwinConfig(seed=7))
-    with EmulatorProcess(world=world, free_host=True) as emulator:
-        look = functools.partial(emulator.call_world, "look")
-        emulator.call_world("lay", beads=ALONG_Y)
-        camera, calibration, task = SimCamera(look), sim_calibration(), CableMaskGoal()
-        with PandaRobot(NetworkedConfig(host=emulator.host)) as panda:
-            limits = replace(LIMITS, max_joint_speed=0.2)
-            result = execute(SafeRobot(panda, limits), MIDDLE)
-        assert result.outcome == PickPlaceOutcome.PLACED
-        assert result.width_after_lift_m == pytest.approx(2 * CONFIG.chain.radius, abs=2e-4)
-        after = look()
-        placed = np.linalg.norm(after.beads[:, :2] - MIDDLE.place_xy, axis=1)
-        assert placed.min() < 8e-3 and 35 < placed.argmin() < 55
-        mask = segment_cable(CONFIG.view.rectify(camera.read().rgb, calibration))
-        assert mask_iou(mask, task.mask(after.beads)) > 0.9
-        assert mask_iou(mask, task.mask(ALONG_Y)) < 0.6
