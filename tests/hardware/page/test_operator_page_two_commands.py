@@ -53,7 +53,7 @@ def test_a_stop_at_the_page_ends_the_command_that_moves_an_arm_of_another(tmp_pa
         assert f"serves {HOST}" in first_line(emulator)
         with command(
             "run", "--robot", "panda", "--host", HOST, "--camera", "sim", "--execute", "--page",
-            "--max-actions", 1, "--out", out,
+            "--agent", "random", "--max-actions", 1, "--out", out,
         ) as run:  # fmt: skip
             address = first_line(run).split()[1]
             with connect(
