@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,14 @@ def run(capfd: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[s
     return code, json.loads(lines[-1]) if lines else {}, said.err
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an episode of one action; nobody changes it."""
+    folder = tmp_path_factory.mktemp("recorded") / "a"
+    episode(folder, Arm(), [ACTION], max_actions=1)
+    return folder
+
+
 def test_a_dry_run_needs_nothing_and_moves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -52,43 +61,12 @@ def test_a_dry_run_needs_nothing_and_moves_nothing(
     assert code == 0 and data["n_episodes"] == 1
 
 
-def test_a_simulated_episode_is_run_scored_replayed_and_packed(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "demos"
-    code, data, _ = run(
-        capfd,
-        "collect",
-        "-n",
-        "1",
-        "--robot",
-        "sim",
-        "--agent",
-        "scripted",
-        "--seed",
-        "2",
-        "--max-actions",
-        "2",
-        "--out",
-        str(out),
-    )
-    assert code == 0 and data["episodes"] == 1 and data["actions"] == 2
-    assert data["demonstrations"] == 0 and not list(out.glob("*.parquet"))  # the goal is too far
-    folder = str(out / "live" / "0000")
-    code, scored, _ = run(capfd, "score", folder)
-    assert code == 0 and len(scored["episodes"][0]["iou"]) == 3
-    film = tmp_path / "plans.mp4"
-    code, replayed, _ = run(capfd, "replay", folder, "--video", str(film))
-    assert code == 0 and replayed["mismatches"] == 0 and film.stat().st_size > 1000
-    assert [row["iou"] for row in replayed["rows"]] == scored["episodes"][0]["iou"]
-
-
 def test_a_folder_without_a_picture_does_not_hide_the_other_scores(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, recorded: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     folders = [tmp_path / name for name in "abc"]
     for folder in (folders[0], folders[2]):
-        episode(folder, Arm(), [ACTION], max_actions=1)
+        shutil.copytree(recorded, folder)
     recorder(folders[1]).finish("stopped")
     code, data, said = run(capfd, "score", *map(str, folders))
     assert code == 2 and "1 of 3 folders cannot be scored" in said
@@ -100,27 +78,35 @@ def test_a_folder_without_a_picture_does_not_hide_the_other_scores(
     assert "before its first picture" in lines[1]
 
 
-def test_an_episode_of_collect_is_that_of_run_with_its_seed(
+def test_collected_episodes_are_scored_and_replayed_and_those_of_run_with_their_seeds(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Toss, noise and draws: the second episode sees the pictures of `run --seed` bit by bit,
     before and after an action.
     """
+    out, alone = tmp_path / "c", tmp_path / "r"
     options = ("--robot", "sim", "--agent", "random", "--max-actions", "1")
-    assert (
-        run(capfd, "collect", "-n", "2", "--seed", "7", *options, "--out", f"{tmp_path}/c")[0] == 0
-    )
-    assert run(capfd, "run", "--seed", "8", *options, "--out", f"{tmp_path}/r")[0] == 0
-    collected, alone = tmp_path / "c" / "live" / "0001" / "frames", tmp_path / "r" / "frames"
-    for name in ("000_rgb.png", "001_rgb.png"):
-        assert (collected / name).read_bytes() == (alone / name).read_bytes()
-    first = tmp_path / "c" / "live" / "0000" / "frames" / "000_rgb.png"
-    assert first.read_bytes() != (alone / "000_rgb.png").read_bytes()
+    code, data, _ = run(capfd, "collect", "-n", "2", "--seed", "7", *options, "--out", str(out))
+    assert code == 0 and data["episodes"] == 2 and data["actions"] == 2
+    assert data["demonstrations"] == 0 and not list(out.glob("*.parquet"))  # the goals are too far
+    first, second = out / "live" / "0000", out / "live" / "0001"
+    code, scored, _ = run(capfd, "score", str(first))
+    assert code == 0 and len(scored["episodes"][0]["iou"]) == 2
+    film = tmp_path / "plans.mp4"
+    code, replayed, _ = run(capfd, "replay", str(first), "--video", str(film))
+    assert code == 0 and replayed["mismatches"] == 0 and film.stat().st_size > 1000
+    assert [row["iou"] for row in replayed["rows"]] == scored["episodes"][0]["iou"]
+    assert run(capfd, "run", "--seed", "8", *options, "--out", str(alone))[0] == 0
+    for name in ("frames/000_rgb.png", "frames/001_rgb.png"):
+        assert (second / name).read_bytes() == (alone / name).read_bytes()
+    start = "frames/000_rgb.png"
+    assert (first / start).read_bytes() != (alone / start).read_bytes()
 
 
-def test_a_replay_finds_a_changed_mask(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "a"
-    episode(folder, Arm(), [ACTION], max_actions=1)
+def test_a_replay_finds_a_changed_mask(
+    tmp_path: Path, recorded: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(recorded, tmp_path / "a")
     write_goal(
         folder / "frames" / "000_mask.png", np.zeros_like(GOAL), np.zeros((2, 2, 3), np.uint8)
     )
@@ -159,24 +145,29 @@ def tampered(folder: Path, name: str, change: Callable[[dict[str, Any]], None]) 
 )
 def test_what_is_recorded_and_computed_otherwise_is_exit_code_1(
     tmp_path: Path,
+    recorded: Path,
     capfd: pytest.CaptureFixture[str],
     name: str,
     change: Callable[[dict[str, Any]], None],
     message: str,
     verbs: str,
 ) -> None:
-    folder, untouched = tmp_path / "a", tmp_path / "b"
-    for each in (folder, untouched):
-        episode(each, Arm(), [ACTION], max_actions=1)
+    folder = shutil.copytree(recorded, tmp_path / "a")
     tampered(folder, name, change)
     for verb in ("score", "replay") if verbs == "both" else ("replay",):
         code, data, said = run(capfd, verb, str(folder))
         found = data["episodes"][0] if verb == "score" else data
         assert code == 1 and re.search(message, said) and "differ" in said
         assert found["differences"] and found["warnings"] == []
-        assert run(capfd, verb, str(untouched))[0] == 0
-    code, data, said = run(capfd, "score", str(untouched), str(folder), str(tmp_path / "none"))
+    code, data, said = run(capfd, "score", str(recorded), str(folder), str(tmp_path / "none"))
     assert code == 2 and len(data["episodes"]) == 2, "a folder that is none is bad input"
+
+
+def test_what_is_computed_as_it_is_recorded_is_exit_code_0(
+    recorded: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for verb in ("score", "replay"):
+        assert run(capfd, verb, str(recorded))[0] == 0
 
 
 def test_an_episode_that_began_at_its_goal_is_counted_by_itself(
