@@ -19,6 +19,7 @@ from fixtures.emulator_client import (
     wait_for_motion,
 )
 from fixtures.emulator_worlds import TABLE_Z, RecordingWorld
+from fixtures.safety_spy import joints_at
 
 from hardware import (
     GraspError,
@@ -34,6 +35,7 @@ from hardware.emulator import EmulatorProcess
 from warp_deform.errors import InputError
 
 pytestmark = [pytest.mark.emulator, pytest.mark.timeout(180)]
+LOW = joints_at(moved(0.08, 0.03, -0.33))  # some centimetres over the table
 
 
 @pytest.fixture
@@ -135,7 +137,9 @@ def test_a_descent_stops_at_the_table(emulator: EmulatorProcess, robot: PandaRob
     assert TABLE_Z - 5e-3 < result.base_T_tcp[2, 3] < TABLE_Z
     assert 8.0 < emulator.call_world("take")["force"].max() < 9.0
     assert robot.state().mode == RobotMode.IDLE
-    free = robot.move_linear(moved(0.2, 0, -0.2), speed=0.1, stop_force_N=9.0)
+    free = robot.move_linear(
+        moved(0.2, 0, TABLE_Z + 0.03 - ABOVE_TABLE[2, 3]), speed=0.1, stop_force_N=9.0
+    )
     assert not free.contact
     # The ordinary threshold is back: the same descent goes on until that.
     with pytest.raises(ReflexError) as caught:
@@ -148,7 +152,7 @@ def test_a_descent_stops_at_the_table(emulator: EmulatorProcess, robot: PandaRob
 def test_state_can_be_read_while_the_arm_moves(
     emulator: EmulatorProcess, robot: PandaRobot
 ) -> None:
-    motion = Background(lambda: robot.move_joints(OFF_HOME, speed=0.02))
+    motion = Background(lambda: robot.move_joints(OFF_HOME, speed=0.05))
     wait_for_motion(emulator)
     readings = []
     while motion.running():
@@ -221,13 +225,15 @@ def test_lock_step_gives_the_same_bits_twice() -> None:
             EmulatorProcess(world=RecordingWorld, free_host=True) as emulator,
             PandaRobot(NetworkedConfig(host=emulator.host)) as robot,
         ):
-            robot.move_linear(moved(0.1, 0.05, -0.35, yaw=0.5), speed=0.25)
-            robot.move_linear(moved(0.1, 0.05, -0.45, yaw=0.5), speed=0.05, stop_force_N=8.0)
+            emulator.place(LOW)
+            robot.move_linear(moved(0.1, 0.05, -0.37, yaw=0.3), speed=0.25)
+            robot.move_linear(moved(0.1, 0.05, -0.45, yaw=0.3), speed=0.05, stop_force_N=8.0)
             emulator.call_world("place_object", width=0.006)
             robot.grasp(width_m=0.006, force_N=15.0)
-            robot.move_joints(HOME, speed=0.3)
+            robot.move_joints(LOW, speed=0.3)
             robot.open_gripper()
             state, record = robot.state(), emulator.call_world("take")
+            assert record["force"].max() > 8.0
             return [state.q.tobytes(), *(record[key].tobytes() for key in sorted(record))]
 
     assert run() == run()

@@ -215,7 +215,7 @@ def test_an_arm_under_torque_control_gives_way_to_the_table(
         tau -= stiff * np.array([1, 0, 1, 0, 1, 0, 1]) * (np.array(state.q) - q)
         return libfranka.Torques(list(tau))
 
-    panda.robot.control(timed(make, seconds=8.0))
+    panda.robot.control(timed(make, seconds=4.0))
     record = emulator.call_world("take")
     assert record["force"][-1] == pytest.approx(8.0, rel=0.15)
     assert record["speed"][-1] < 5e-3
