@@ -28,9 +28,10 @@ MARGIN = 0.03
 MAX_JUMP = 0.5  # [rad] between waypoints; more means that the arm folds over
 POSITION_TOLERANCE, TURN_TOLERANCE = 1e-5, 1e-4  # [m], [rad]
 ITERATIONS = 30
-DAMPING = 1e-8
+_DAMPING = 1e-8 * np.eye(6)
 # Greatest motion towards the rest posture in one waypoint [rad].
 REST_STEP = 0.02
+_REST = np.array(HOME_Q)
 
 
 class Kinematics(Protocol):
@@ -70,17 +71,19 @@ def straight_line(
     length, turn = distance(start, base_T_tcp)
     count = max(int(np.ceil(length / SPACING)), int(np.ceil(turn / TURN_SPACING)), 1)
     axis = _rotation_vector(base_T_tcp[:3, :3] @ start[:3, :3].T)
-    points = [np.asarray(q, dtype=np.float64)]
+    points, poses = [np.asarray(q, dtype=np.float64)], [start]
     for i in range(1, count + 1):
         target = base_T_tcp.copy()
         if i < count:
             share = i / count
             target[:3, 3] = (1 - share) * start[:3, 3] + share * base_T_tcp[:3, 3]
             target[:3, :3] = _rotation(share * axis) @ start[:3, :3]
-        points.append(_solve(kinematics, points[-1], target))
+        point, pose = _solve(kinematics, points[-1], target)
+        points.append(point)
+        poses.append(pose)
     path = np.array(points)
-    poses = np.array([start, *(kinematics.pose(point) for point in points[1:])])
-    return StraightLine(path[1:], min(fitting_share(path, poses, max_speed=speed), 1.0 / OVERSHOOT))
+    share = fitting_share(path, np.array(poses), max_speed=speed)
+    return StraightLine(path[1:], min(share, 1.0 / OVERSHOOT))
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
@@ -89,8 +92,10 @@ def distance(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), float(np.linalg.norm(turn))
 
 
-def _solve(kinematics: Kinematics, start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return joint positions (7,) near `start` that put the TCP at `target`."""
+def _solve(
+    kinematics: Kinematics, start: np.ndarray, target: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return joint positions (7,) near `start` that put the TCP at `target`, and where exactly."""
     q = start.copy()
     where = f"({', '.join(f'{x:.3f}' for x in target[:3, 3])}) m"
     for iteration in range(ITERATIONS):
@@ -102,10 +107,10 @@ def _solve(kinematics: Kinematics, start: np.ndarray, target: np.ndarray) -> np.
         if small and np.linalg.norm(error[3:]) < TURN_TOLERANCE and iteration:
             break
         J = kinematics.jacobian(q)
-        pseudo_inverse = J.T @ np.linalg.inv(J @ J.T + DAMPING * np.eye(6))
+        pseudo_inverse = J.T @ np.linalg.inv(J @ J.T + _DAMPING)
         step = pseudo_inverse @ error
         if not iteration:
-            rest = np.array(HOME_Q) - q
+            rest = _REST - q
             rest -= pseudo_inverse @ (J @ rest)
             step += rest * min(1.0, REST_STEP / max(float(np.linalg.norm(rest)), 1e-12))
         q = q + step
@@ -118,7 +123,7 @@ def _solve(kinematics: Kinematics, start: np.ndarray, target: np.ndarray) -> np.
     if beyond.any():
         joint = int(np.argmax(beyond)) + 1
         raise UnreachablePose(f"joint {joint} would come too near its limit for the TCP at {where}")
-    return q
+    return q, pose
 
 
 def _rotation_vector(R: np.ndarray) -> np.ndarray:
