@@ -257,24 +257,19 @@ def test_only_this_machine_is_served(host: str) -> None:
         EmulatorConfig(host=host)
 
 
-def test_a_killed_emulator_says_so() -> None:
+def test_an_emulator_that_is_too_slow_or_killed_says_so() -> None:
+    with pytest.raises(EmulatorFailed, match=r"did not start in 0\.01 s; give it longer"):
+        EmulatorProcess(free_host=True, start_timeout_s=0.01)
     process = EmulatorProcess(free_host=True)
-    process.kill()
+    os.kill(process._process.pid, signal.SIGSTOP)
+    try:
+        with pytest.raises(EmulatorFailed, match=r"did not answer 'world' in 0\.1 s; give it"):
+            process.call_world("place_object", timeout_s=0.1, width=0.0)
+    finally:
+        process.kill()
     with pytest.raises(EmulatorFailed, match=r"has ended; .*start another"):
         process.snapshot()
     process.close()
-
-
-def test_an_emulator_that_is_too_slow_says_so() -> None:
-    with pytest.raises(EmulatorFailed, match=r"did not start in 0\.01 s; give it longer"):
-        EmulatorProcess(free_host=True, start_timeout_s=0.01)
-    slow = EmulatorProcess(free_host=True)
-    os.kill(slow._process.pid, signal.SIGSTOP)
-    try:
-        with pytest.raises(EmulatorFailed, match=r"did not answer 'world' in 0\.1 s; give it"):
-            slow.call_world("place_object", timeout_s=0.1, width=0.0)
-    finally:
-        slow.kill()
 
 
 def test_command_line() -> None:
