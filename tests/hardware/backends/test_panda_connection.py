@@ -37,28 +37,36 @@ from hardware.emulator.server import EmulatorConfig
 pytestmark = [pytest.mark.emulator, pytest.mark.timeout(180)]
 
 
-def test_a_robot_in_reflex_can_be_connected_to() -> None:
-    with EmulatorProcess(free_host=True) as emulator:
-        with PandaRobot(NetworkedConfig(host=emulator.host)) as robot:
-            emulator.inject_reflex("joint_reflex", after_ticks=50)
-            with pytest.raises(ReflexError):
-                robot.move_joints(OFF_HOME, speed=0.2)
-        with PandaRobot(NetworkedConfig(host=emulator.host)) as robot:
-            assert robot.state().mode == RobotMode.REFLEX
-            robot.recover()
-            robot.move_joints(HOME, speed=0.3)
-        with pytest.raises(ConnectionLost, match="closed"):
-            robot.state()
-        robot.close()
+@pytest.fixture
+def standing(emulator: EmulatorProcess) -> EmulatorProcess:
+    """An emulated Panda at home that nobody is connected to."""
+    emulator.user_stop(False)
+    emulator.place(HOME)
+    return emulator
 
 
-def test_taking_hold_of_a_robot_recovers_it_from_a_user_stop_that_no_state_shows() -> None:
-    with EmulatorProcess(free_host=True) as emulator:
-        emulator.user_stop()
-        emulator.user_stop(False)
-        with PandaRobot(NetworkedConfig(host=emulator.host)) as robot:
-            SafeRobot(robot, SafetyLimits(table=TablePlane(0.0)))
-            robot.move_joints(OFF_HOME, speed=0.5)
+def test_a_robot_in_reflex_can_be_connected_to(standing: EmulatorProcess) -> None:
+    with PandaRobot(NetworkedConfig(host=standing.host)) as robot:
+        standing.inject_reflex("joint_reflex", after_ticks=50)
+        with pytest.raises(ReflexError):
+            robot.move_joints(OFF_HOME, speed=0.2)
+    with PandaRobot(NetworkedConfig(host=standing.host)) as robot:
+        assert robot.state().mode == RobotMode.REFLEX
+        robot.recover()
+        robot.move_joints(HOME, speed=0.3)
+    with pytest.raises(ConnectionLost, match="closed"):
+        robot.state()
+    robot.close()
+
+
+def test_taking_hold_of_a_robot_recovers_it_from_a_user_stop_that_no_state_shows(
+    standing: EmulatorProcess,
+) -> None:
+    standing.user_stop()
+    standing.user_stop(False)
+    with PandaRobot(NetworkedConfig(host=standing.host)) as robot:
+        SafeRobot(robot, SafetyLimits(table=TablePlane(0.0)))
+        robot.move_joints(OFF_HOME, speed=0.5)
 
 
 def test_nothing_listens() -> None:
@@ -111,19 +119,16 @@ BOUND = 16.0
 """What a silent robot may cost [s]: it is heard for 1 s, a motion for 5 s; the machine is busy."""
 
 
-def test_a_silent_robot_freezes_nothing() -> None:
+def test_a_silent_robot_freezes_nothing(standing: EmulatorProcess) -> None:
     """The vendor waits for a command's answer with Python's lock held, up to a minute."""
-    with (
-        EmulatorProcess(free_host=True) as emulator,
-        PandaRobot(NetworkedConfig(host=emulator.host)) as robot,
-    ):
+    with PandaRobot(NetworkedConfig(host=standing.host)) as robot:
         robot.move_joints(HOME, speed=0.2)
         for call in (
             robot.stop,
             robot.recover,
             lambda: robot.grasp(width_m=0.01, force_N=10.0),
         ):
-            with silent(emulator):
+            with silent(standing):
                 clock = time.monotonic()
                 with pytest.raises(ConnectionLost) as caught:
                     call()
