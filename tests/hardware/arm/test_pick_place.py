@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fixtures.board_photographs import INTRINSICS, camera_above
-from fixtures.safety_spy import ARM, HOME, SpyRobot, assert_within
+from fixtures.safety_spy import ARM, HOME, SpyRobot, assert_within, solved_line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -229,7 +229,7 @@ def test_no_action_and_no_calibration_gets_past_the_limits(
         )
         xy = calibration.pixel_to_base(np.array([pick, place]))[:, :2].tolist()
         action = PickPlaceAction(tuple(xy[0]), pick_yaw, tuple(xy[1]), place_yaw)
-        execute(SafeRobot(spy, limits), action)
+        execute(SafeRobot(spy, limits, line_solver=solved_line), action)
     except (RobotError, InputError) as refused:
         assert "\n" not in str(refused)
     assert_within(limits, spy)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from fixtures.safety_spy import ARM, HOME, SpyRobot, assert_within, joints_at, pose
+from fixtures.safety_spy import ARM, HOME, SpyRobot, assert_within, joints_at, pose, solved_line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -11,7 +11,7 @@ from hardware import RobotError
 from hardware.arm.limits import SafetyLimits
 from hardware.arm.panda import Q_MAX, Q_MIN
 from hardware.arm.safe_robot import SafeRobot
-from hardware.arm.straight_line import StraightLine, straight_line
+from hardware.arm.straight_line import StraightLine
 from hardware.arm.table_plane import TablePlane
 from warp_deform.errors import InputError
 
@@ -49,7 +49,7 @@ class LyingSolver:
     def __call__(self, arm: object, q: np.ndarray, T: np.ndarray, *, speed: float) -> StraightLine:
         rng = self.rng
         if self.kind == "honest":
-            return straight_line(ARM, q, T, speed=speed)
+            return solved_line(ARM, q, T, speed=speed)
         points = {
             "chord": lambda: np.linspace(q, q + rng.uniform(-0.4, 0.4, 7), 4)[1:],
             "far": lambda: rng.uniform(Q_MIN, Q_MAX, (2, 7)),
@@ -134,7 +134,11 @@ def near_the_table(
     limits = SafetyLimits(table=TablePlane(tcp[2] - height - float(slopes @ tcp[:2]), *slopes))
     spy = SpyRobot(q=q.copy())
     # The home pose may be too high above such a table, or too low: it is not used here.
-    return limits, spy, SafeRobot(spy, limits, home_q=q if height >= 0.009 else HOME)
+    return (
+        limits,
+        spy,
+        SafeRobot(spy, limits, home_q=q if height >= 0.009 else HOME, line_solver=solved_line),
+    )
 
 
 def short_line(case: dict) -> tuple[SafetyLimits, SpyRobot]:
