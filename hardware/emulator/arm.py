@@ -30,6 +30,8 @@ __all__ = ["ELBOW_SIGN", "Arm"]
 # What rounding may add to a measured velocity before it counts as too much.
 SLACK = 1.001
 FRICTION = 0.5  # [N m s/rad]
+# As arrays that are not made anew every millisecond.
+_INERTIA, _DQ_GREATEST = np.array(INERTIA), DQ_MAX * SLACK
 # A generator's first command may differ from where the arm stands by this [rad, m].
 START_TOLERANCE = 1e-3
 # Joint 4 bends one way only.
@@ -183,10 +185,10 @@ class Arm:
         if names:
             return names
         self.tau_d = tau.copy()
-        self.dq = self.dq + DT * (tau + self.tau_ext - FRICTION * self.dq) / INERTIA
+        self.dq = self.dq + DT * (tau + self.tau_ext - FRICTION * self.dq) / _INERTIA
         self.q = self.q + DT * self.dq
         self.q_d = self.q.copy()
-        if (np.abs(self.dq) > DQ_MAX * SLACK).any():
+        if (np.abs(self.dq) > _DQ_GREATEST).any():
             return ("joint_velocity_violation",)
         return ("joint_position_limits_violation",) if _outward(self.q, self.dq) else ()
 
@@ -240,4 +242,7 @@ class Arm:
 
 def _outward(q: np.ndarray, dq: np.ndarray) -> bool:
     """Return whether a joint is beyond its range and moves farther out."""
-    return bool((((q < Q_MIN) & (dq < 0)) | ((q > Q_MAX) & (dq > 0))).any())
+    below, above = q < Q_MIN, q > Q_MAX
+    if not (below | above).any():  # as in all but a few milliseconds
+        return False
+    return bool(((below & (dq < 0)) | (above & (dq > 0))).any())

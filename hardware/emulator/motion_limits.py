@@ -37,6 +37,7 @@ TAU_RATE_MAX = 1000.0  # [N m/s]
 # Doubles of some radians, subtracted and divided by DT three times, are off by so much; libfranka
 # stays farther away from its limits.
 ROUNDING = 1e-5
+_TAU_GREATEST = TAU_MAX + ROUNDING
 _NAMES = ("velocity_limits_violation", "velocity_discontinuity", "acceleration_discontinuity")
 
 # Says by which names a velocity, its acceleration and its jerk are too much.
@@ -87,7 +88,7 @@ def elbow_excess(velocity: np.ndarray, rate: np.ndarray, jerk: np.ndarray) -> tu
 
 def torque_excess(tau: np.ndarray, before: np.ndarray) -> tuple[str, ...]:
     """Return the names by which commanded torques [N m] (7,) are too much, or change too fast."""
-    if not (np.abs(tau) <= TAU_MAX + ROUNDING).all():
+    if not (np.abs(tau) <= _TAU_GREATEST).all():
         return ("tau_J_range_violation",)
     if not (np.abs(tau - before) <= (TAU_RATE_MAX + ROUNDING) * DT).all():
         return ("controller_torque_discontinuity",)
