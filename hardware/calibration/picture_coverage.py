@@ -9,6 +9,7 @@ calibration", 2000, section 3.1.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -102,14 +103,15 @@ def _cures(
     most = math.floor(math.degrees(limits.max_tilt_rad)) - 1
     degrees = [(a, b) for a in range(-most, most + 1) for b in range(-most, most + 1)]
     tilts = sorted((t for t in degrees if 0 < math.hypot(*t) <= most), key=lambda t: math.hypot(*t))
-    tilted = [
+    tilted = (
         (f"tilt the hand there by {math.hypot(*t):.0f} degrees", _tilted(home, *t)) for t in tilts
-    ]
+    )
     rises = np.arange(_RISE, limits.max_z_m - home[2, 3], _RISE)
-    raised = [(f"raise it by {100 * rise:.0f} cm", _raised(home, rise)) for rise in rises]
+    raised = ((f"raise it by {100 * rise:.0f} cm", _raised(home, rise)) for rise in rises)
     for ways in (tilted, raised):
-        showing = [way for way in ways if _shows(calibration, way[1] @ tcp_T_camera)]
-        for words, pose in showing[:_MOST_TRIED]:
+        # The least come first: what is greater than one that the arm can take is not looked at.
+        showing = (way for way in ways if _shows(calibration, way[1] @ tcp_T_camera))
+        for words, pose in itertools.islice(showing, _MOST_TRIED):
             home_q = _joints(calibration.workplace, pose, limits)
             if home_q is not None:
                 yield words, home_q
