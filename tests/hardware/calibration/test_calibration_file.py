@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from fixtures.board_photographs import INTRINSICS, SIZE, TABLE, camera_above
-from fixtures.safety_spy import ARM
+from fixtures.safety_spy import ARM, solved_line
 from fixtures.touched_table import TouchedTable
 
 from hardware import GraspError, MotionError, SafetyViolation
@@ -26,13 +26,17 @@ from warp_deform.errors import InputError
 # The table.
 
 
+def held(spy: TouchedTable, limits: SafetyLimits) -> SafeRobot:
+    return SafeRobot(spy, limits, line_solver=solved_line)
+
+
 CORNERS = [(0.38, -0.27), (0.38, 0.27), (0.62, 0.27), (0.62, -0.27), (0.5, 0.0)]
 
 
 def test_touch_off_finds_the_table() -> None:
     provisional = SafetyLimits(table=TablePlane(-0.015))
     spy = TouchedTable(object_width=0.0)
-    points = touch_off(SafeRobot(spy, provisional), CORNERS)
+    points = touch_off(held(spy, provisional), CORNERS)
     plane, residuals = fit_table_plane(points)
     assert np.abs(plane.z(np.array(CORNERS)) - spy.true.z(np.array(CORNERS))).max() < 1e-4
     assert np.abs(residuals).max() < 1e-4
@@ -41,13 +45,13 @@ def test_touch_off_finds_the_table() -> None:
 def test_touch_off_that_touches_nothing_or_holds_something() -> None:
     limits = SafetyLimits(table=TablePlane(0.03))  # guessed too high
     with pytest.raises(InputError, match=r"point 1: nothing met down to 0.040 m; lower"):
-        touch_off(SafeRobot(TouchedTable(object_width=0.0), limits), CORNERS)
+        touch_off(held(TouchedTable(object_width=0.0), limits), CORNERS)
     limits = SafetyLimits(table=TablePlane(-0.015))
     with pytest.raises(GraspError, match="not closed"):
-        touch_off(SafeRobot(TouchedTable(object_width=0.01), limits), CORNERS)
+        touch_off(held(TouchedTable(object_width=0.01), limits), CORNERS)
     spy = TouchedTable()
     with pytest.raises(SafetyViolation, match="workspace x"):
-        touch_off(SafeRobot(spy, limits), [*CORNERS, (0.9, 0.0)])
+        touch_off(held(spy, limits), [*CORNERS, (0.9, 0.0)])
     assert not spy.lines
 
 
@@ -59,7 +63,7 @@ def test_a_touch_in_mid_air_is_no_table() -> None:
 
     spy = Jerky(object_width=0.0)
     with pytest.raises(MotionError, match=r"4\.0 mm below where its descent to point 1 began"):
-        touch_off(SafeRobot(spy, limits), CORNERS)
+        touch_off(held(spy, limits), CORNERS)
     assert ARM.pose(spy.q)[2, 3] == pytest.approx(0.045, abs=1e-4)  # up again
 
 
@@ -69,7 +73,7 @@ def test_a_hand_that_feels_something_in_the_air_does_not_go_down(
 ) -> None:
     """The threshold is one of forces, not of changes: what is felt already is missing from it."""
     spy = TouchedTable(object_width=0.0, force=np.array([0.0, felt, 0.0, 0.0, 0.0, 0.0]))
-    robot = SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015)))
+    robot = held(spy, SafetyLimits(table=TablePlane(-0.015)))
     if refused:
         with pytest.raises(MotionError, match=r"feels 1\.6 N in the air, 1\.5 N are allowed; set"):
             touch_off(robot, CORNERS)

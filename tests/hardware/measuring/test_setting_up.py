@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fixtures.board_photographs import BOARD, INTRINSICS, TABLE, photograph
 from fixtures.guided_robot import BASE_T_BOARD, TCP_T_CAMERA, GuidedRobot, Homing, setup
-from fixtures.safety_spy import ARM, HOME, SpyRobot, joints_at, pose
+from fixtures.safety_spy import ARM, HOME, SpyRobot, joints_at, pose, solved_line
 from fixtures.touched_table import TouchedTable
 
 from hardware import GraspError, RobotMode
@@ -167,7 +167,7 @@ def test_the_table_is_asked_for_then_touched_with_homed_fingers(
     found = measure_table(
         RigConfig(setup=tmp_path, robot="fr3"),
         provisional_z=-0.015,
-        robot=SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015))),
+        robot=SafeRobot(spy, SafetyLimits(table=TablePlane(-0.015)), line_solver=solved_line),
         operator=TerminalOperator(answer),
     )
     table = read_table(tmp_path / "table.json")
