@@ -1,4 +1,4 @@
-"""The verbs `train-control` and `eval-control` of the `warp-deform` command."""
+"""The verbs `train-control`, `eval-control` and `demo-control` of the `warp-deform` command."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ from warp_deform.support.progress import duration
 from ..control.settings import ControlTrainSettings
 from .outcome_text import interrupted, table
 
-__all__ = ["ControlEvalOptions", "ControlTrainOptions", "eval_control", "train_control"]
+__all__ = [
+    "ControlDemoOptions",
+    "ControlEvalOptions",
+    "ControlTrainOptions",
+    "demo_control",
+    "eval_control",
+    "train_control",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +70,36 @@ def eval_control(options: ControlEvalOptions) -> Outcome:
 
     report = evaluate_control(options.run, episodes=options.episodes, video=options.video)
     return Outcome(data=report, text=_tested(report))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlDemoOptions(CommandOptions):
+    """Have the policy of a control run demonstrate: what it solves becomes a dataset at 20 Hz.
+
+    It plays the seeds 0, 1, ... with the snapshot that was best on validation seeds. Each episode
+    that is solved is written, without pictures. After an interruption the same command continues.
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder that `train-control` made."""
+    episodes: Annotated[int, arg(aliases=["-n"], metavar="N"), FlagRange(1, 10_000)] = 100
+    """Number of episodes to play."""
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder for the dataset. Complete episodes in it are kept."""
+
+
+def demo_control(options: ControlDemoOptions) -> Outcome:
+    """Record what a control run's policy solves."""
+    quiet_warp()
+    from ..control.demonstrate import demonstrate
+
+    report = asdict(demonstrate(options.run, options.out, episodes=options.episodes))
+    text = (
+        f"{report['out']}: {report['solved']} of {report['episodes']} episodes of "
+        f"{report['task']} solved and recorded, mean score {report['mean_score']:.3f}, in "
+        f"{report['seconds']:.1f} s"
+    )
+    return Outcome(data=report, text=text)
 
 
 def _trained(report: Mapping[str, Any], out: Path) -> str:

@@ -7,7 +7,9 @@ that have nothing in common. A policy is one function of all goals, so what it s
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,7 @@ from warp_deform.collecting.control_runs import (
 from warp_deform.collecting.folder import Attempt, Collection, append_attempt
 from warp_deform.control.control_worlds import ControlWorlds
 from warp_deform.control.registry import control_task
-from warp_deform.episodes import EpisodeWriter, rebuild_index
+from warp_deform.episodes import EpisodeReader, EpisodeWriter, combine_hashes, rebuild_index
 from warp_deform.errors import InputError
 from warp_deform.support.progress import progress_bar
 from warp_deform.worlds.loop import SOLVED
@@ -36,10 +38,37 @@ from .actor import Actor, PlanActor
 from .run import ControlRun as RunFolder
 from .saved import load_actor
 
-__all__ = ["POLICY", "Acting", "demonstrate"]
+__all__ = ["POLICY", "Acting", "Demonstrations", "demonstrate"]
 
 POLICY = "policy"
 """Demonstrator of the episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demonstrations:
+    """What a policy has demonstrated.
+
+    Attributes:
+        task: its name
+        run: folder of the policy's run
+        selected: the snapshot that played, the best on validation seeds
+        out: folder of the dataset
+        episodes: seeds that were played, all in all
+        solved: episodes that the dataset holds
+        mean_score: at the end, of all that were played
+        state_hash: of the kept episodes' hashes in the order of their seeds
+        seconds: of this call
+    """
+
+    task: str
+    run: str
+    selected: int
+    out: str
+    episodes: int
+    solved: int
+    mean_score: float
+    state_hash: str
+    seconds: float
 
 
 class Acting:
@@ -60,8 +89,8 @@ class Acting:
         return action
 
 
-def demonstrate(folder: Path, out: Path, *, episodes: int, progress: bool = True) -> int:
-    """Record what a run's chosen snapshot solves of the seeds 0, 1, ...; how many that is.
+def demonstrate(folder: Path, out: Path, *, episodes: int, progress: bool = True) -> Demonstrations:
+    """Record what a run's chosen snapshot solves of the seeds 0, 1, ...
 
     An episode depends on the weights and its seed alone. The same call goes on where an earlier one
     was interrupted.
@@ -75,6 +104,7 @@ def demonstrate(folder: Path, out: Path, *, episodes: int, progress: bool = True
         InputError: `folder` is no control run's, has no snapshot yet, `episodes` is below 1 or
             would reach the seeds of tests, `out` holds something else, or nothing is solved.
     """
+    clock = time.perf_counter()
     if not 1 <= episodes <= FIRST_SEED["test"]:
         raise InputError(f"episodes is {episodes}; it must be 1 to {FIRST_SEED['test']}")
     run = RunFolder(folder)
@@ -103,8 +133,19 @@ def demonstrate(folder: Path, out: Path, *, episodes: int, progress: bool = True
                 append_attempt(collection.folder, attempt)
                 done[one.seed] = attempt
                 advance()
-        solved = sum(done[seed].success for seed in range(episodes))
-        if not solved:
+        attempts = [done[seed] for seed in range(episodes)]
+        if not any(attempt.success for attempt in attempts):
             raise InputError(f"{folder} solves none of {episodes} episodes; train it for longer")
     rebuild_index(Path(out))
-    return solved
+    infos = EpisodeReader(out, control=True).infos()
+    return Demonstrations(
+        task=task,
+        run=str(folder),
+        selected=chosen,
+        out=str(out),
+        episodes=episodes,
+        solved=sum(attempt.success for attempt in attempts),
+        mean_score=sum(attempt.score for attempt in attempts) / episodes,
+        state_hash=combine_hashes(info.state_hash for info in infos),
+        seconds=time.perf_counter() - clock,
+    )

@@ -96,6 +96,11 @@ VERBS: dict[str, Verb] = {
         kept=f"all but the last updates is kept, {_GOES_ON} and ends with the same bits",
     ),
     "eval-control": Verb("learning.command.control:eval_control", "test a run of train-control"),
+    "demo-control": Verb(
+        "learning.command.control:demo_control",
+        "record what a run of train-control solves",
+        kept=f"episodes already written are complete, {_GOES_ON}",
+    ),
     "report": Verb(
         "learning.command.verbs:report",
         "write tables and learning curves beside the paper's",

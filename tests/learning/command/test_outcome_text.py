@@ -159,9 +159,10 @@ def test_an_interruption_says_what_is_kept(
             "correct",
             "distill",
             "train-control",
+            "demo-control",
         }
     )
-    assert ("episode" in said) is (verb in {"demo", "refine", "correct", "franka"})
+    assert ("episode" in said) is (verb in {"demo", "demo-control", "refine", "correct", "franka"})
 
 
 def test_labels_are_counted_beside_demonstrations() -> None:

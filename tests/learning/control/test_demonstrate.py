@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from learning.control.cloning import read_chunks
 from learning.control.demonstrate import POLICY, demonstrate
 from learning.control.train import ControlTrainConfig, train_control
 from warp_deform.collecting.replay import verify
+from warp_deform.command.main import main
 from warp_deform.control.registry import control_task
-from warp_deform.episodes import EpisodeReader, EpisodeWriter
+from warp_deform.episodes import EpisodeReader, EpisodeWriter, combine_hashes
 from warp_deform.errors import InputError
 
 TASK, EPISODES = "whip-target", 10
@@ -32,16 +35,30 @@ def all_solved(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(control_task(TASK)), "success_score", 0.0)
 
 
+def last_score(reader: EpisodeReader, seed: int) -> float:
+    return reader.read(seed).steps[-1].score
+
+
 def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.glob("*.parquet")}
 
 
 def test_what_is_solved_replays_and_can_be_cloned(
-    run: Path, tmp_path: Path, all_solved: None, monkeypatch: pytest.MonkeyPatch
+    run: Path,
+    tmp_path: Path,
+    all_solved: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "demos"
-    assert demonstrate(run, out, episodes=EPISODES, progress=False) == EPISODES
+    assert main(["demo-control", str(run), "-n", str(EPISODES), "--out", str(out), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["task"], report["episodes"], report["solved"]) == (TASK, EPISODES, EPISODES)
     reader = EpisodeReader(out, control=True)
+    assert report["state_hash"] == combine_hashes(info.state_hash for info in reader.infos())
+    assert report["mean_score"] == pytest.approx(
+        np.mean([last_score(reader, k) for k in reader.seeds])
+    )
     assert reader.seeds == tuple(range(EPISODES))
     assert {info.demonstrator for info in reader.infos()} == {POLICY}
     replayed = verify(out, workers=1)
@@ -66,10 +83,12 @@ def test_what_is_solved_replays_and_can_be_cloned(
     assert files(tmp_path / "again") == files(out)
 
 
-def test_what_cannot_be_is_refused_and_leaves_nothing(run: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_is_refused_and_leaves_nothing(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "demos"
-    with pytest.raises(InputError, match=r"solves none of 2 episodes; train it for longer"):
-        demonstrate(run, out, episodes=2, progress=False)
+    assert main(["demo-control", str(run), "-n", "2", "--out", str(out)]) == 2
+    assert "solves none of 2 episodes; train it for longer" in capsys.readouterr().err
     for wrong in (0, 10_001):
         with pytest.raises(InputError, match="it must be 1 to 10000"):
             demonstrate(run, tmp_path / "other", episodes=wrong, progress=False)

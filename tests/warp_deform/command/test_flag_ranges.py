@@ -52,6 +52,7 @@ NEEDED = {
     "sweep": ["grid.toml"], "refine": ["d", "--out", "o"], "play": [LINE], "view": ["d"],
     "correct": ["r", "--out", "o", "--teacher", "mpc"], "distill": [LINE, "--out", "o"],
     "train-control": ["whip", "--out", "r"], "eval-control": ["r"],
+    "demo-control": ["r", "--out", "d"],
 }  # fmt: skip
 
 

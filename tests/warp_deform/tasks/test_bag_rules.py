@@ -104,9 +104,9 @@ def test_ids_say_that_the_rule_of_bag_items_changed() -> None:
     versions = {name: env_id(name).rpartition("-v")[2] for name in TASKS}
     # all rose once, when nothing was slowed against the world any more. Those with a box among what
     # is soft did twice more: when the table began to feel its weight through that, and when it came
-    # to rest between fabric and table. Bags with a box did once more, when a box that is taken above
-    # its action's lift came to be carried there. Rings and flattened fabrics did once more, when
-    # they were tuned towards the original's number of actions
+    # to rest between fabric and table. Bags with a box did once more, when a box that is taken
+    # above its action's lift came to be carried there. Rings and flattened fabrics did once more,
+    # when they were tuned towards the original's number of actions
     assert {name for name, version in versions.items() if version == "6"} == {
         "bag-items-1",
         "bag-items-2",
