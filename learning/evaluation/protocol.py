@@ -38,9 +38,11 @@ class Protocol:
         split: "validation" or "test", whose seeds are played
         episodes: their number, from the split's first seed on
         first_seed: of test episodes, in place of the split's
-        goals: "constructed": for validation from the episode's own seed, for test from goal seeds;
-            "demonstrated": ends of demonstrations on goal seeds, the paper's
-        n_goals: goals that the test episodes share in turn
+        goals: "constructed": for test from goal seeds; for validation from the episode's own seed,
+            or from goal seeds where such a goal would show more of the start than a test's does,
+            see `Task.goal_shows_its_start`; "demonstrated": ends of demonstrations on goal seeds,
+            the paper's
+        n_goals: goals that the episodes share in turn
         goal_folder: a folder of goals that the test episodes share in turn instead
         stage_rule: who chooses the lift, "action" (the policy) or "privileged" (the paper's hidden
             rule, which reads the simulator)
@@ -82,8 +84,11 @@ class Protocol:
 
     def makes_goals(self, task: str) -> bool:
         """Whether the episodes share goals that are made for them."""
+        known = find_task(task)
         own = self.split == "validation" and self.goals == "constructed"
-        return find_task(task).goal_conditioned and self.given is None and not own
+        if not known.goal_conditioned or self.given is not None:
+            return False
+        return not own or known.goal_shows_its_start()
 
 
 def goals_for(run: RunFolder, task: str, protocol: Protocol) -> Path | None:
@@ -150,7 +155,7 @@ def check_splits(trained: Iterable[int], protocols: Sequence[Protocol], *, task:
             first, count = _goal_seed(protocol), min(protocol.n_goals, protocol.episodes)
             most = most_attempts(count) if protocol.goals == "demonstrated" else count
             if first != protocol.seeds.start:
-                parts["goal"] = range(first, first + most)
+                parts[f"{protocol.split} goal"] = range(first, first + most)
         for name, seeds in parts.items():
             before = splits.get(name, seeds)
             splits[name] = range(seeds.start, max(seeds.stop, before.stop))
@@ -176,7 +181,7 @@ def check_splits(trained: Iterable[int], protocols: Sequence[Protocol], *, task:
 
 
 def _goal_seed(protocol: Protocol) -> int:
-    """First seed of goals that are made; other test seeds have goals of their own."""
-    if protocol.split == "validation":
+    """First seed of goals that are made; validation and other test seeds have their own."""
+    if protocol.split == "validation" and protocol.goals == "demonstrated":
         return FIRST_SEED["validation"]
     return GOAL_SEED + protocol.seeds.start - FIRST_SEED["test"]

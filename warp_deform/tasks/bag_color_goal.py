@@ -131,6 +131,10 @@ class BagColorGoal(BagTask):
             settle_seconds=_GOAL_SETTLE_SECONDS,
         )
 
+    def goal_shows_its_start(self) -> bool:
+        """True: the block in its colour, and the other bag."""
+        return True
+
     def goal_targets(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(70, 3): where the target bag was dropped, its colour's number, and the rows of truth."""
         return np.concatenate([layout.targets[:1], self._rows(layout, snapshot)])

@@ -343,6 +343,13 @@ class Task(abc.ABC):
         """Layout with the objects placed at the targets; only for goal-conditioned tasks."""
         raise TypeError(f"{self.name} has no goal")
 
+    def goal_shows_its_start(self) -> bool:
+        """Whether a goal picture also shows things as they lay in the start that it is made of.
+
+        In a start that is drawn for the goal they lie elsewhere.
+        """
+        return False
+
     def goal_targets(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """Targets that a state stands for as a goal; only for goal-conditioned tasks."""
         raise TypeError(f"{self.name} has no goal")

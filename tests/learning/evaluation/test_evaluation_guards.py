@@ -196,13 +196,33 @@ def test_what_was_trained_on_is_not_played(
     assert not run.evaluations.exists() and not (run.path / "goals").exists()
 
 
+def test_validation_is_as_hard_as_the_test_where_a_goal_shows_its_start(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def make(task: str, out: Path, *, count: int, seed: int, **options: Any) -> dict[str, Any]:
+        asked.append(seed)
+        return {"goals": count}
+
+    monkeypatch.setattr(protocol, "make_goals", make)
+    validation, test = (Protocol(split=s, episodes=3) for s in ("validation", "test"))
+    assert goals_for(run, TASK, validation) is None  # a goal shows nothing but where the cable lies
+    folders = {goals_for(run, "bag-color-goal", each) for each in (validation, test)}
+    assert len(folders) == 2 and None not in folders and asked == [140_000, 100_000]
+
+
 def test_splits_are_apart() -> None:
     test, validation = (Protocol(split=s, episodes=20) for s in ("test", "validation"))
     check_splits([0, 9_999, 10_020, 50_020, 100_020], [validation, test], task=TASK)
     check_splits([100_000], [validation, test], task="cable-ring")  # it has no goals
-    with pytest.raises(InputError, match="100030 is one of training and of the goal"):
+    with pytest.raises(InputError, match="100030 is one of training and of the test goal"):
         demonstrated = replace(test, goals="demonstrated")  # some attempts fail
         check_splits([100_030], [test, demonstrated], task=TASK)
+    check_splits([140_000], [validation, test], task=TASK)  # validation has its starts' own goals
+    check_splits([120_000, 140_020], [validation, test], task="bag-color-goal")
+    with pytest.raises(InputError, match="140000 is one of training and of the validation goal"):
+        check_splits([140_000], [validation, test], task="bag-color-goal")
     with pytest.raises(InputError, match="seed 50000 is one of validation and of test"):
         check_splits([], [validation, replace(test, episodes=50_000)], task=TASK)
     huge = Protocol(split="test", episodes=10**12)

@@ -112,7 +112,7 @@ def test_seeds_that_overlap_are_refused(
 def test_goals_of_other_seeds_are_not_trained_on() -> None:
     other = Protocol(split="test", episodes=5, first_seed=30_000)
     check_splits([110_000], [other], task=TASK)
-    with pytest.raises(InputError, match="120004 is one of training and of the goal seeds"):
+    with pytest.raises(InputError, match="120004 is one of training and of the test goal seeds"):
         check_splits([120_004], [other], task=TASK)
 
 
