@@ -7,6 +7,7 @@ and nowhere steep. They take arrays of NumPy and tensors of torch alike.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -66,7 +67,7 @@ class TipLimits:
     reach: float = 0.01
     turn: float = 0.02
 
-    @property
+    @functools.cached_property
     def ceiling(self) -> float:
         """Greatest height [m]: 1 cm under the last at which the arm reaches over 20 cm."""
         heights, smallest, largest = self._table()
@@ -118,8 +119,31 @@ class TipLimits:
             y = library.where(same, y, radius * library.sin(turn))
         return library.stack([x, y, z, yaw], -1)
 
+    def remembered(self, start: Any, steps: Any, floors: Any) -> Any:
+        """Targets (T, n, 4) after each of `steps` (T, n, 4) from `start` (n, 4), each `kept`.
+
+        Where no limit is met they are sums, and are added up at once, to the same bits.
+        """
+        library = _library(steps)
+        asked = library.concatenate([start[None], steps])
+        free = library.cumsum(asked, 0)[1:]
+        plain, lowest = (x if library is np else x.detach().numpy() for x in (free, floors))
+        if np.array_equal(self.kept(plain, lowest), plain):
+            return free
+        targets, last = [], start
+        for step in steps:
+            last = self.kept(last + step, floors)
+            targets.append(last)
+        return library.stack(targets)
+
     def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.robot.reach_by_height
+
+    @functools.cached_property
+    def _tensor_table(self) -> tuple[Any, ...]:
+        import torch
+
+        return tuple(torch.from_numpy(np.ascontiguousarray(column)) for column in self._table())
 
     def _radii(self, z: Any) -> tuple[Any, Any]:
         """Least and greatest distance from the base [m] at heights z, linear in between."""
@@ -128,8 +152,7 @@ class TipLimits:
             return np.interp(z, heights, smallest), np.interp(z, heights, largest)
         import torch
 
-        columns = (heights, smallest, largest)
-        grid, near, far = (torch.from_numpy(np.ascontiguousarray(c)).to(z) for c in columns)
+        grid, near, far = (column.to(z) for column in self._tensor_table)
         k = torch.searchsorted(grid, z.detach().contiguous()).clamp(1, len(heights) - 1)
         u = (z - grid[k - 1]) / (grid[k] - grid[k - 1])
         return near[k - 1] + u * (near[k] - near[k - 1]), far[k - 1] + u * (far[k] - far[k - 1])

@@ -112,6 +112,19 @@ class TipTargets:
         self.asked[at] = self.limits.kept(self.asked[at] + step, floors)
         return np.asarray(self.limits.project(self.asked[at], floors))[:, None]
 
+    def follow_steps(self, rows: Sequence[int], actions: np.ndarray) -> np.ndarray:
+        """Targets (T, n, 4) of `follow` in T control steps, for actions (T, n, width), at once.
+
+        Only for modes that add to the last target.
+        """
+        assert self.mode.startswith("tip_delta"), self.mode
+        at, moves = list(rows), np.asarray(actions, dtype=float)[..., :-1]
+        steps = self._velocity(moves.reshape(-1, moves.shape[-1])) * self.config.seconds
+        floors = self.floors[at]
+        asked = self.limits.remembered(self.asked[at], steps.reshape(*moves.shape[:2], 4), floors)
+        self.asked[at] = asked[-1]
+        return np.asarray(self.limits.project(asked, floors))
+
     def _velocity(self, moves: np.ndarray) -> np.ndarray:
         """Speeds (n, 4) [m/s, rad/s] of actions (n, 3 or 4)."""
         length = np.linalg.norm(moves[:, :3], axis=1, keepdims=True)

@@ -166,15 +166,15 @@ class SwingProblem:
         ends[wrong] = np.nan
         return ends
 
-    def _led(self, of: np.ndarray, actions: np.ndarray) -> list[np.ndarray]:
-        """Where the tips are told to be (n, 3) [m] at the ends of T steps."""
+    def _led(self, of: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Where the tips are told to be (T, n, 3) [m] at the ends of T steps."""
         worlds = list(range(len(of)))
         self._targets.floors[worlds] = self._floors[of]
         self._targets.place(worlds, self._tips[of])
-        return [self._targets.follow(worlds, rows)[:, -1, :3] for rows in actions.swapaxes(0, 1)]
+        return self._targets.follow_steps(worlds, actions.swapaxes(0, 1))[..., :3]
 
-    def _paths(self, of: np.ndarray, steps: list[np.ndarray]) -> dict[int, GripPath]:
-        """Of worlds whose tips are told to be (n, 3) [m] at the ends of T steps."""
+    def _paths(self, of: np.ndarray, steps: np.ndarray) -> dict[int, GripPath]:
+        """Of worlds whose tips are told to be (T, n, 3) [m] at the ends of T steps."""
         places = self._positions[of, self._held].astype(float)
         knots = np.stack([places, *steps, steps[-1]], axis=1)
         times = np.append(self._knot_times[: self.steps + 1], self._knot_times[-1])
@@ -251,13 +251,10 @@ class SwingProblem:
 
         config, limits = self._control.config, self._control.limits
         floors = torch.from_numpy(self._floors[of])
-        asked = torch.from_numpy(self._tips[of])
         steps = torch.nn.functional.pad(moves, (0, 1)) * (config.max_speed * config.seconds)
-        ways = []
-        for step in steps.unbind(1):
-            asked = limits.kept(asked + step, floors)
-            ways.append(asked)
-        return limits.project(torch.stack(ways), floors)[..., :3]
+        tips = torch.from_numpy(self._tips[of])
+        asked = limits.remembered(tips, steps.swapaxes(0, 1), floors)
+        return limits.project(asked, floors)[..., :3]
 
     def _losses(self, of: np.ndarray, ends: np.ndarray) -> np.ndarray:
         import torch

@@ -123,6 +123,39 @@ def test_positions_span_the_workspace_and_are_approached_at_the_speed_limit() ->
     assert before[0] == pytest.approx([0.75, 0.25, 0.1, 0.0], abs=1e-5)
 
 
+@pytest.mark.parametrize("far", [False, True], ids=["within the limits", "beyond them"])
+@pytest.mark.parametrize("mode", ["tip_delta_position", "tip_delta_pose"])
+def test_many_steps_at_once_have_the_bits_and_the_slopes_of_one_after_the_other(
+    mode: str, far: bool
+) -> None:
+    rng = np.random.default_rng(2)
+    for count, steps in [(1, 20), (3, 7), (8, 25)]:
+        tips = START + rng.uniform(-0.05, 0.05, (count, 4))
+        one, all_at_once = targets(mode, tips), targets(mode, tips)
+        rows = list(range(count))
+        actions = (1.0 if far else 0.02) * rng.normal(size=(steps, count, one.width))
+        led = np.stack([one.follow(rows, row)[:, -1] for row in actions])
+        assert np.array_equal(all_at_once.follow_steps(rows, actions), led)
+        assert np.array_equal(all_at_once.asked, one.asked)
+
+        moves = torch.tensor((0.1 if far else 0.001) * actions[..., :3], requires_grad=True)
+        moved = torch.nn.functional.pad(moves, (0, 1))
+        last, floors = torch.from_numpy(tips), torch.zeros(count, dtype=torch.float64)
+        ways = []
+        for move in moved:
+            last = LIMITS.kept(last + move, floors)
+            ways.append(last)
+        together = LIMITS.remembered(torch.from_numpy(tips), moved, floors)
+        assert torch.equal(together, torch.stack(ways))
+        free = torch.from_numpy(tips) + moved.detach().cumsum(0)
+        assert torch.allclose(together, free) is not far, "limits are met where they should be"
+        back = torch.from_numpy(rng.normal(size=together.shape))
+        slopes = [
+            torch.autograd.grad(each, moves, back)[0] for each in (together, torch.stack(ways))
+        ]
+        assert torch.equal(*slopes)
+
+
 def test_what_is_no_mode_is_named() -> None:
     with pytest.raises(InputError, match="tip_delta_position"):
         targets("pd_joint_pos")
