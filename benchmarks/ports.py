@@ -4,9 +4,10 @@
 
 Goals are those of test seeds from 10,000; scores, totals and losses are means over them. "idle"
 does nothing, "chance" draws actions evenly, one plan a goal, "script" is `FoldPlayer` or
-`SpreadPlayer` with fixed picks, where a task has one. "random", "cem" and "cmaes" are `optimize`
-over the plans of `EpisodeProblem`, with S CPU seconds a goal; "adam", from the best of 50 draws,
-and "cem+adam" descend by the gradients of `LedProblem`, where a task holds one thing. A total is
+`SpreadPlayer` with fixed picks or `PathPlayer` with a fixed path, where a task has one. "random",
+"cem" and "cmaes" are `optimize` over the plans of `EpisodeProblem`, with S CPU seconds a goal;
+"adam", from the best of 50 draws, and "cem+adam" descend by the gradients of `LedProblem`, where a
+task holds one thing. A total is
 the sum of the scores of all steps, DLO-Lab's return; a score is that of the end; away is the task's
 loss at the end. `solved` and `guards` count goals. What has a row of as many goals and seconds is
 left out, so the command goes on after an interruption.
@@ -28,11 +29,13 @@ from warp_deform.control.plan_players import FoldPlayer, Player, SpreadPlayer
 from warp_deform.support.revision import running_revision
 
 TASKS = (
-    "push-cable", "fold-fabric-1", "fold-fabric-3", "unfold-fabric-1", "unfold-fabric-3", "gather"
+    "push-cable", "fold-fabric-1", "fold-fabric-3", "unfold-fabric-1", "unfold-fabric-3",
+    "gather", "wire",
 )  # fmt: skip
 DESCENTS = ("adam", "cem+adam")
-HELD = ("push-cable", "gather")
+HELD = ("push-cable", "gather", "wire")
 """Where they are possible."""
+SCRIPTED = tuple(task for task in TASKS if "fabric" in task or task == "wire")
 SEARCHES = ("random", "cem", "cmaes", *DESCENTS)
 METHODS = ("idle", "chance", "script", *SEARCHES)
 CORNERS = {
@@ -40,6 +43,8 @@ CORNERS = {
     "fold-fabric-3": np.array([[-1, -1, -0.1, -0.1], [1, -1, 0.1, -0.1], [-1, 1, -0.1, 0.1]]),
 }
 """Picks and places that fold, see `FoldPlayer`."""
+THROUGH = np.array([[-1.2, -2.0], [-2.5, -4.2], [0.0, -0.4], [-0.3, 0.3], [1.4, 1.0]])
+"""A path far to one side, which lays the cable straight, and back through between the posts."""
 
 
 class Chance:
@@ -90,7 +95,9 @@ def played_by(
         return problem.play(goals, found.numbers), took
     numbers = np.arange(problem.goals, dtype=float)[:, None, None]
     player: Player = Idle() if method == "idle" else Chance()
-    if method == "script":
+    if method == "script" and task == "wire":
+        numbers, player = np.tile(THROUGH, (problem.goals, 1, 1)), usual
+    elif method == "script":
         assert isinstance(usual, FoldPlayer), "others have no script"
         numbers, player = np.zeros((problem.goals, *usual.shape)), usual
         if task in CORNERS:
@@ -122,7 +129,7 @@ def main() -> None:
                 "task": task, "method": method, "goals": options.goals,
                 "seconds": options.seconds if method in SEARCHES else 0.0,
             }  # fmt: skip
-            suits = task in HELD if method in DESCENTS else method != "script" or "fabric" in task
+            suits = task in HELD if method in DESCENTS else method != "script" or task in SCRIPTED
             if key(row) in rows or not suits:
                 continue
             seeds = range(10_000, 10_000 + options.goals)

@@ -14,9 +14,10 @@ from .control_task import ControlTask
 from .control_worlds import ControlWorlds
 from .fold_fabric import FoldFabric1
 from .led_cable import LedCable
-from .plan_players import FoldPlayer, Player, PushPlayer, SmoothPlayer
+from .plan_players import FoldPlayer, PathPlayer, Player, PushPlayer, SmoothPlayer
 from .push_cable import PushCable
 from .unfold_fabric import UnfoldFabric1
+from .wire import Wire
 
 __all__ = ["PlayedPlans"]  # `warp_deform.control` has `EpisodeProblem`
 
@@ -106,6 +107,10 @@ class EpisodeProblem:
         )
 
     @property
+    def _pays(self) -> bool:
+        return isinstance(self.task, LedCable) and self.task.pays_on_the_way
+
+    @property
     def goals(self) -> int:
         """Number of goals G."""
         return len(self.seeds)
@@ -127,7 +132,7 @@ class EpisodeProblem:
         of = np.repeat(np.arange(count), each)
         played = self.play(of, numbers.reshape(-1, *numbers.shape[2:]))
         losses = played.losses
-        if isinstance(self.task, LedCable):
+        if self._pays:
             lacks = 1.0 - played.returns / self.control.horizon
             losses = np.where(np.isfinite(losses), lacks, np.inf)
         return np.where(np.isfinite(losses), losses, np.inf).reshape(count, each)
@@ -153,7 +158,7 @@ class EpisodeProblem:
         player = self.player_of(numbers)
         player.begin(numbers, layouts)
         rows, returns = [], np.zeros(len(of))
-        pays = isinstance(self.task, LedCable)
+        pays = isinstance(self.task, LedCable)  # a return is told in any case
         for step in range(control.horizon):
             particle_q = np.stack([solver.particle_q(slot) for slot in slots])
             row = np.clip(player.rows(step, control.targets.asked[slots, :3], particle_q), -1, 1)
@@ -193,6 +198,8 @@ def _player(task: ControlTask) -> Player:
     """What suits a task."""
     if isinstance(task, PushCable):
         return PushPlayer(task.control, task.pushes)
+    if isinstance(task, Wire):
+        return PathPlayer(task.control, task.held_particle, task.horizon)
     if isinstance(task, FoldFabric1):
         flat = "targets" if isinstance(task, UnfoldFabric1) else "particle_q"
         return FoldPlayer(task.control, flat, task.fabric.columns, task.horizon // 60)

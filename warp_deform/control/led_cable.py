@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from ..objects.box import Box
 from ..objects.cable import Cable, CableConfig
 from ..tasks.task import Action, Layout, Snapshot, Stage
 from ..xpbd.config import SolverConfig
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     import newton
     from torch import Tensor
 
-__all__ = ["CABLE", "LedCable", "pin"]
+__all__ = ["CABLE", "LedCable", "fix", "pin"]
 
 _SPACING = 0.02
 """Between two vertices of the source's ropes [m]."""
@@ -40,8 +41,16 @@ def pin(builder: newton.ModelBuilder, cable: Cable, bead: int) -> None:
     builder.particle_mass[cable.particles[bead]] = 0.0
 
 
+def fix(builder: newton.ModelBuilder, box: Box) -> None:
+    """Fix a box where it stands: it has neither mass nor inertia, so nothing moves or turns it."""
+    import warp as wp
+
+    builder.body_mass[box.body] = builder.body_inv_mass[box.body] = 0.0
+    builder.body_inertia[box.body] = builder.body_inv_inertia[box.body] = wp.mat33(0.0)
+
+
 class LedCable(ControlTask):
-    """A cable whose last bead the tip holds, and never lets go."""
+    """A cable of which the tip holds a bead, and never lets go."""
 
     stages = (Stage(lift=0.04, speed=0.15),)
     solver = CABLE
@@ -51,6 +60,11 @@ class LedCable(ControlTask):
     keeps_hold = True
 
     cable: ClassVar[CableConfig]
+
+    @property
+    def pays_on_the_way(self) -> bool:
+        """Whether plans are searched for the source's return, or else for their last state."""
+        return True
 
     def in_source(self, points: Tensor) -> Tensor:
         """Points, or lengths, in the source's metres."""

@@ -10,7 +10,6 @@ import numpy as np
 from ..errors import InputError
 from .control_task import ControlTask
 from .episode_problem import EpisodeProblem
-from .led_cable import LedCable
 from .plan_players import OpenPlayer, Player
 from .smooth_plans import tensor_actions_of
 
@@ -100,7 +99,7 @@ class LedProblem(EpisodeProblem):
         paid: list[Tensor] = []
         for row in actions.unbind(1):
             worlds.advance(row)
-            if isinstance(self.task, LedCable):
+            if self._pays:
                 paid.append(torch.exp(-(worlds.left + self.task.least_loss)))
         losses = worlds.left + self.task.least_loss
         if paid:

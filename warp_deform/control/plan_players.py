@@ -13,7 +13,15 @@ from .modes import ControlConfig
 from .push_cable import push_actions
 from .smooth_plans import actions_of
 
-__all__ = ["FoldPlayer", "OpenPlayer", "Player", "PushPlayer", "SmoothPlayer", "SpreadPlayer"]
+__all__ = [
+    "FoldPlayer",
+    "OpenPlayer",
+    "PathPlayer",
+    "Player",
+    "PushPlayer",
+    "SmoothPlayer",
+    "SpreadPlayer",
+]
 
 _FOLD_STEPS = 60
 _OVER, _DOWN, _CARRY, _WAIT, _GO = 12, 16, 48, 53, 60
@@ -94,6 +102,33 @@ class PushPlayer(OpenPlayer):
         begins = layout.particle_q[:, :2].mean(axis=0) + 0.1 * plan[:, :2]
         ends = np.stack([begins, begins + 0.1 * plan[:, 2:]], axis=1)
         return push_actions(layout.body_q[0, :2], ends, self.control)
+
+
+class PathPlayer(OpenPlayer):
+    """A tip that is led straight from point to point, all of them at one height.
+
+    Numbers are x and y of each point, from the middle between the boxes [10 cm]. Each stretch takes
+    as many steps as the others.
+
+    Args:
+        held: the bead at which the tip begins
+        steps: of an episode
+        points: of a path
+    """
+
+    def __init__(self, control: ControlConfig, held: int, steps: int, points: int = 5) -> None:
+        self.control, self.held, self.steps = control, held, steps
+        self.shape = (points, 2)
+
+    def moves(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> np.ndarray:
+        """See `OpenPlayer`."""
+        begins = np.stack([each.particle_q[self.held, :2] for each in layouts])
+        middles = np.stack([each.body_q[:, :2].mean(axis=0) for each in layouts])
+        points = np.concatenate([begins[:, None], middles[:, None] + 0.1 * numbers], axis=1)
+        each = self.steps // self.shape[0]
+        ways = np.diff(points, axis=1) / (each * self.control.max_speed * self.control.seconds)
+        ways = np.repeat(np.pad(ways, ((0, 0), (0, 0), (0, 1))), each, axis=1)
+        return np.pad(ways, ((0, 0), (0, self.steps - ways.shape[1]), (0, 0)))
 
 
 class FoldPlayer:

@@ -12,13 +12,15 @@ from .gather import Gather
 from .push_cable import PushCable
 from .unfold_fabric import UnfoldFabric1, UnfoldFabric3
 from .whip import Whip, WhipTarget
+from .wire import Wire
 
 __all__ = ["control_task"]  # `warp_deform.control` has `CONTROL_TASKS`
 
 CONTROL_TASKS: dict[str, type[ControlTask]] = {
     cls.name: cls
     for cls in (
-        Whip, WhipTarget, PushCable, FoldFabric1, FoldFabric3, UnfoldFabric1, UnfoldFabric3, Gather
+        Whip, WhipTarget, PushCable, FoldFabric1, FoldFabric3, UnfoldFabric1, UnfoldFabric3,
+        Gather, Wire,
     )
 }  # fmt: skip
 

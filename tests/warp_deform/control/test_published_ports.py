@@ -55,7 +55,83 @@ def test_the_cost_of_gather_is_its_sources() -> None:
     assert task.score(layout, state) < 0.02 < 0.3 < task.score(layout, start("gather")[2])
 
 
-@pytest.mark.parametrize("name", ["push-cable", "gather"])
+def test_the_cost_of_wire_is_its_sources_and_falls_to_nothing_at_the_target() -> None:
+    task, layout, state = start("wire")
+    unit = 0.02 / task.cable.spacing
+    rope, target = unit * layout.particle_q, unit * layout.targets
+    away = np.linalg.norm(rope[:, None] - target, axis=2)
+    off = np.linalg.norm(rope[15, :2] - target[15, :2]) - 0.02
+    told = away.min(axis=1).mean() + away.min(axis=0).mean() + 5 * off
+    assert task.cost(layout, state) == pytest.approx(told, abs=1e-5)
+    assert task.cost(layout, State(layout.targets, layout.body_q)) < 3e-4
+    raised = layout.targets + np.array([0.0, 0.0, 0.1 / unit])
+    high = unit * layout.targets[0, 2] + 0.1 - 0.04
+    assert task.cost(layout, State(raised, layout.body_q)) == pytest.approx(0.2 + high, abs=1e-3)
+
+
+def test_only_a_cable_that_lies_through_the_gap_with_its_middle_is_wired() -> None:
+    task, layout, _ = start("wire")
+    posts, beads = layout.body_q[:, :2], layout.targets
+    gap = posts[1] - posts[0]
+    through = (beads[0] - beads[-1])[:2] / np.linalg.norm((beads[0] - beads[-1])[:2])
+
+    def solved(q: np.ndarray) -> bool:
+        return task.solved(layout, State(q, layout.body_q))
+
+    def moved(xy: np.ndarray, z: float = 0.0) -> np.ndarray:
+        return beads + np.append(xy, z)
+
+    spacing = task.cable.spacing
+    assert solved(beads) and not solved(layout.particle_q)
+    assert solved(moved(0.3 * gap)) and not solved(moved(0.6 * gap)) and not solved(moved(-gap))
+    assert solved(moved(3 * spacing * through)) and not solved(moved(6 * spacing * through))
+    assert not solved(moved(np.zeros(2), 0.05)), "over the posts"
+    folded = beads.copy()  # into the gap and out again
+    folded[16:, :2] = folded[15:1:-1, :2] + 0.01 * gap / np.linalg.norm(gap)
+    assert not solved(folded)
+    aside = folded.copy()
+    aside[:, :2] += 2 * spacing * through
+    assert not solved(aside)
+
+
+def test_a_path_far_to_one_side_wires_the_cable_at_every_goal() -> None:
+    """A tip that goes straight through pulls the cable around a post."""
+    problem = LedProblem("wire", seeds=range(4), worlds=8)
+    aside = np.array([[-1.2, -2.0], [-2.5, -4.2], [0.0, -0.4], [-0.3, 0.3], [1.4, 1.0]])
+    straight = np.linspace([-0.5, -0.5], [1.4, 1.0], 5)
+    played = problem.play(range(4), np.stack([aside] * 4))
+    assert played.solved.all() and played.scores.min() > 0.9
+    assert not problem.play(range(4), np.stack([straight] * 4)).solved.any()
+    # what is searched for is the end, and slopes are those of the same loss
+    assert problem.evaluate(aside[None, None])[0, 0] == played.losses[0]
+    numbers = problem.refined(np.stack([aside] * 4))
+    losses, slopes = problem.gradients(numbers[:1], np.arange(1))
+    assert losses[0] == pytest.approx(played.losses[0], abs=5e-3) and np.isfinite(slopes).all()
+
+
+def test_posts_stand_fast_whatever_is_pulled_around_them() -> None:
+    control = ControlWorlds("wire", 1, action_penalty=0.0)
+    control.reset({0: 0})
+    solver, layout = control.worlds.solver, control.worlds.episodes[0].layout
+    centre = layout.body_q[:, :2].mean(axis=0)
+    around = [centre - [0.12, 0.09], centre, layout.targets[3, :2], [0.62, 0.05]]
+    for goal in around:
+        for _ in range(40):
+            way = goal - control.worlds.episodes[0].tip[:2]
+            if np.linalg.norm(way) < 0.01:
+                break
+            pace = min(0.8, np.linalg.norm(way) / 0.05) / np.linalg.norm(way)
+            control.step({0: np.array([*(pace * way), 0.0, 1.0])})
+    assert control.worlds.episodes[0].physics_ok
+    assert np.abs(solver.body_q(0)[:, :3] - layout.body_q[:, :3]).max() < 1e-6
+    # the cable was pulled against a post, and no bead is in one
+    beads = solver.particle_q(0)[:, None, :2] - layout.body_q[:, :2]
+    outside = np.maximum(np.abs(beads) - 0.0283 / 2, 0.0)
+    radius = control_task("wire").cable.radius
+    assert 0.5 * radius < np.linalg.norm(outside, axis=2).min() < 2 * radius
+
+
+@pytest.mark.parametrize("name", ["push-cable", "gather", "wire"])
 def test_losses_are_batched_and_have_slopes(name: str) -> None:
     task, layout, _ = start(name)
     other = task.sample(np.random.default_rng(1), None)
