@@ -60,7 +60,8 @@ class Check:
             self.g["positions"] = self.rng.normal(size=shape)
             self.g["velocities"] = self.rng.normal(size=shape) * 1e-2
 
-    def run(self, moved: Mapping[str, np.ndarray] | None = None) -> Gradients:
+    def run(self, moved: Mapping[str, np.ndarray] | None = None) -> DifferentiableRollout:
+        """Roll out from a moved start; `loss` is that of it."""
         at = self.start | dict(moved or {})
         data = self.solver.data
         for name in ("w0", "w"):
@@ -98,7 +99,7 @@ class Check:
                 ("velocities", self.solver.particle_qd(0)),
             ):
                 self.loss += float((self.g[name] * (now - self.start[name])).sum())
-        return run.backward(**{k: v[None, None] for k, v in self.g.items()})
+        return run
 
     def along(self, name: str) -> np.ndarray:
         base = self.start[name] if name in self.start else self.knots[name]
@@ -117,7 +118,7 @@ class Check:
             "damping": 1e-3, "table_friction": 1e-6, "contact_friction": 1e-6,
             "way_points": 1e-9, "knot_rotations": 1e-9,
         }  # fmt: skip
-        ours = self.run()
+        ours = self.run().backward(**{k: v[None, None] for k, v in self.g.items()})
         self.counts = ours.counts()
         self.knots = {}
         values = {k: getattr(ours, k)[0] for k in steps if k in self.start}
