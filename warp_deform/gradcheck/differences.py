@@ -143,7 +143,7 @@ def fired(run: DifferentiableRollout, worlds: Worlds, draw: Draw) -> np.ndarray:
     touching_of(worlds, 0)[:] = draw.touching
     paths = {} if draw.path is None else {0: draw.path}
     run.forward([0], [worlds.solver.config.dt], paths=paths)
-    return run.backward().fired[0]
+    return run.backward(parts=False).fired[0]
 
 
 def _compare_some(

@@ -50,9 +50,9 @@ class Loss:
         """Between worlds: the difference of the ends first, as less is lost to rounding."""
         return sum(float((vars(self)[n] * (ends[n][i] - ends[n][j])).sum()) for n in ends)
 
-    def backward(self, run: DifferentiableRollout, count: int) -> Gradients:
+    def backward(self, run: DifferentiableRollout, count: int, *, parts: bool) -> Gradients:
         each = np.ones((count, 1, 1, 1))
-        return run.backward(**{name: each * by for name, by in vars(self).items()})
+        return run.backward(**{name: each * by for name, by in vars(self).items()}, parts=parts)
 
 
 def roll(
@@ -82,7 +82,8 @@ def roll(
     for some in (others, *([k] for k in own)):
         part = {name: [values[k] for k in some] for name, values in moved.items()}
         found = _together(run, worlds, draw, substeps, part)
-        gradients = loss.backward(run, len(some))
+        # of all others only how often constraints acted is asked for
+        gradients = loss.backward(run, len(some), parts=first is None)
         first = first or gradients
         acted = counted(gradients.fired)
         if not ends:

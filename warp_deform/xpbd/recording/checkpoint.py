@@ -93,7 +93,9 @@ class Checkpoints:
         )
         first = (start + np.arange(self.data.lanes) * capacity).ravel()
         counts = counts[: len(first)]
-        return np.concatenate([np.arange(a, a + c) for a, c in zip(first, counts, strict=True)])
+        behind = np.cumsum(counts)
+        rows: np.ndarray = np.repeat(first - (behind - counts), counts) + np.arange(behind[-1])
+        return rows
 
     def restore(self, saved: Mapping[str, np.ndarray]) -> None:
         for name in self._held:
