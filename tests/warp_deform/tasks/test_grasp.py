@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from hardware.vision.segmentation import SegmentationConfig, SegmentationError, segment_cable
 from warp_deform.errors import InputError
+from warp_deform.tasks import strand_grasp
 from warp_deform.tasks.metrics import mask_iou
 from warp_deform.tasks.strand_grasp import find_grasp, map_direction, wrap_half_turn
 
@@ -29,6 +30,21 @@ def crossing(rng: np.random.Generator, low: float, high: float) -> tuple[np.ndar
     return draw(strands, rng.uniform(2.2, 4.5)), centre
 
 
+@pytest.fixture
+def widths_measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mask's typical width is the same at all picks of it, and most of what a grasp costs."""
+    measure, known = strand_grasp._typical_width, {}
+
+    def typical(mask: np.ndarray, pixels: np.ndarray, radius: float) -> float:
+        key = mask.tobytes(), radius
+        if key not in known:
+            known[key] = measure(mask, pixels, radius)
+        return known[key]
+
+    monkeypatch.setattr(strand_grasp, "_typical_width", typical)
+
+
+@pytest.mark.usefixtures("widths_measured_once")
 def test_tangent_on_curved_cables(record_property: Callable[[str, object], None]) -> None:
     rng = np.random.default_rng(0)
     errors, feet, flagged = [], [], 0
