@@ -339,14 +339,17 @@ def test_a_lowered_box_stops_at_the_bottom_of_a_bag():
 
 
 def test_bags_beside_and_on_each_other_come_to_rest_apart():
-    edges = []
-    for shift in (0.012, 0.02, 0.028, 0.032):  # one heap's edges are within a tenth by chance
-        beside, above = np.eye(4), np.eye(4)
-        beside[0, 3], above[:3, 3] = 0.19, (shift, 0.0, 0.3)
-        solver, bags = bag_solver(1, bags=(np.eye(4), beside, above))
-        result = rollout(solver, [0], least=0.5, most=4.0)[0]
-        x = solver.particle_q(0)
-        assert result.at_rest and not result.watch.problems(0, BAG_SOLVER.limits)
+    edges, shifts = [], (0.012, 0.02, 0.028, 0.032)  # one heap's are within a tenth by chance
+    beside, above = np.eye(4), np.eye(4)
+    beside[0, 3], above[2, 3] = 0.19, 0.3
+    solver, bags = bag_solver(len(shifts), bags=(np.eye(4), beside, above), lanes=8)
+    upper = slice(bags[2].particles.start, bags[2].particles.stop)
+    for w, shift in enumerate(shifts):
+        solver.data.lane("particles.x", w)[upper, 0] += shift
+    results = rollout(solver, range(len(shifts)), least=0.5, most=4.0)
+    for w, result in results.items():
+        x = solver.particle_q(w)
+        assert result.at_rest and not result.watch.problems(w, BAG_SOLVER.limits)
         edges.append(pierced(x, np.concatenate([bag.faces for bag in bags])))
         assert x[:, 2].min() >= BAG.shell_radius - 5e-4
         middles = np.array([x[bag.particles.start : bag.particles.stop].mean(0) for bag in bags])
