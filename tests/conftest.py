@@ -1,5 +1,6 @@
 """What holds for every test, and fixtures that several files use."""
 
+import gc
 import os
 import shutil
 import signal
@@ -11,6 +12,9 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import pytest
 import warp
 from fixtures.places import ROOT, TESTS
+
+# What is imported stays: looking through it for garbage again and again takes seconds.
+gc.set_threshold(*gc.get_threshold()[:2], 100)
 
 # Newton's kernels only run forward here; without their adjoints they compile in a third of the time
 warp.config.enable_backward = False
@@ -40,6 +44,11 @@ def pytest_collection_modifyitems(items):
     marks = (item.get_closest_marker("in_a_row") for item in items)
     names = {item: mark.args[0] for item, mark in zip(items, marks, strict=True) if mark}
     items.sort(key=lambda item: (item not in names, names.get(item)))
+
+
+def pytest_collection_finish():
+    """What was imported until now is left out when somebody looks for garbage, as pytest does."""
+    gc.freeze()
 
 
 def pytest_runtest_setup(item):

@@ -18,6 +18,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError, _Execu
 
 from ..errors import InputError, WarpDeformError
 from ..quiet import quiet_warp
+from ..support.garbage import collect_rarely
 from ..tasks.registration import register_task
 from ..tasks.registry import registered
 from ..tasks.task import Task
@@ -192,6 +193,7 @@ def _close(results: Generator[Any, None, None]) -> None:
 
 def _serve(owner: int) -> None:
     """Work in this process as long as the one that started it lives, even if that is killed."""
+    collect_rarely()
     threading.Thread(target=_leave_with, args=(owner,), daemon=True).start()
 
 

@@ -29,6 +29,7 @@ from tyro.conf import arg
 
 from ..errors import InputError, Interrupted, WarpDeformError
 from ..support.flag_range import check_flags
+from ..support.garbage import collect_rarely
 from ..support.version import __version__
 
 __all__ = ["VERBS", "CommandOptions", "Outcome", "Verb", "main"]
@@ -177,6 +178,8 @@ class Outcome:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command with the arguments `argv` (default: the process's); returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if argv is None:  # the process is the command's own
+        collect_rarely()
     _open_closed_streams()
     try:
         return _dispatch(arguments)
