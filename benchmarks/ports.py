@@ -26,6 +26,7 @@ import numpy as np
 from warp_deform.control import EpisodeProblem, LedProblem, optimize
 from warp_deform.control.episode_problem import PlayedPlans
 from warp_deform.control.plan_players import FoldPlayer, Player, SpreadPlayer
+from warp_deform.control.wire import THROUGH
 from warp_deform.support.revision import running_revision
 
 TASKS = (
@@ -35,16 +36,15 @@ TASKS = (
 DESCENTS = ("adam", "cem+adam")
 HELD = ("push-cable", "gather", "wire")
 """Where they are possible."""
-SCRIPTED = tuple(task for task in TASKS if "fabric" in task or task == "wire")
 SEARCHES = ("random", "cem", "cmaes", *DESCENTS)
 METHODS = ("idle", "chance", "script", *SEARCHES)
-CORNERS = {
+SCRIPTS = {
     "fold-fabric-1": np.array([[-1, -1, 1, 1]]),
     "fold-fabric-3": np.array([[-1, -1, -0.1, -0.1], [1, -1, 0.1, -0.1], [-1, 1, -0.1, 0.1]]),
+    "wire": THROUGH,
 }
-"""Picks and places that fold, see `FoldPlayer`."""
-THROUGH = np.array([[-1.2, -2.0], [-2.5, -4.2], [0.0, -0.4], [-0.3, 0.3], [1.4, 1.0]])
-"""A path far to one side, which lays the cable straight, and back through between the posts."""
+"""Picks and places that fold, see `FoldPlayer`, and a path, see `PathPlayer`."""
+SCRIPTED = (*SCRIPTS, "unfold-fabric-1", "unfold-fabric-3")
 
 
 class Chance:
@@ -95,14 +95,12 @@ def played_by(
         return problem.play(goals, found.numbers), took
     numbers = np.arange(problem.goals, dtype=float)[:, None, None]
     player: Player = Idle() if method == "idle" else Chance()
-    if method == "script" and task == "wire":
-        numbers, player = np.tile(THROUGH, (problem.goals, 1, 1)), usual
-    elif method == "script":
-        assert isinstance(usual, FoldPlayer), "others have no script"
+    if method == "script":
         numbers, player = np.zeros((problem.goals, *usual.shape)), usual
-        if task in CORNERS:
-            numbers += CORNERS[task]
+        if task in SCRIPTS:
+            numbers += SCRIPTS[task]
         else:
+            assert isinstance(usual, FoldPlayer), "others have no script"
             player = SpreadPlayer(usual.control, usual.flat, usual.columns, usual.shape[0])
     problem.player = player
     played = problem.play(goals, numbers)

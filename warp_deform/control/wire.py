@@ -38,8 +38,10 @@ if TYPE_CHECKING:
     import newton
     from torch import Tensor
 
-__all__ = ["Wire"]
+__all__ = ["THROUGH", "Wire"]
 
+THROUGH = np.array([[-1.2, -2.0], [-2.5, -4.2], [0.0, -0.4], [-0.3, 0.3], [1.4, 1.0]])
+"""A plan of `PathPlayer` that wires: far to one side, so that the cable lies straight, and back."""
 _EDGE = 0.0283
 _FIRST = (0.44, -0.13)
 """Where the first bead lies on average [m]."""

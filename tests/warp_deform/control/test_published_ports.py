@@ -18,6 +18,7 @@ from warp_deform.control import (
 from warp_deform.control.plan_players import FoldPlayer, carry_rows
 from warp_deform.control.push_cable import push_actions
 from warp_deform.control.registry import control_task
+from warp_deform.control.wire import THROUGH
 from warp_deform.errors import InputError
 from warp_deform.tasks.fabric_shape import fold_over
 from warp_deform.tasks.registration import CONTROL_ALONE
@@ -97,14 +98,13 @@ def test_only_a_cable_that_lies_through_the_gap_with_its_middle_is_wired() -> No
 def test_a_path_far_to_one_side_wires_the_cable_at_every_goal() -> None:
     """A tip that goes straight through pulls the cable around a post."""
     problem = LedProblem("wire", seeds=range(4), worlds=8)
-    aside = np.array([[-1.2, -2.0], [-2.5, -4.2], [0.0, -0.4], [-0.3, 0.3], [1.4, 1.0]])
     straight = np.linspace([-0.5, -0.5], [1.4, 1.0], 5)
-    played = problem.play(range(4), np.stack([aside] * 4))
+    played = problem.play(range(4), np.stack([THROUGH] * 4))
     assert played.solved.all() and played.scores.min() > 0.9
     assert not problem.play(range(4), np.stack([straight] * 4)).solved.any()
     # what is searched for is the end, and slopes are those of the same loss
-    assert problem.evaluate(aside[None, None])[0, 0] == played.losses[0]
-    numbers = problem.refined(np.stack([aside] * 4))
+    assert problem.evaluate(THROUGH[None, None])[0, 0] == played.losses[0]
+    numbers = problem.refined(np.stack([THROUGH] * 4))
     losses, slopes = problem.gradients(numbers[:1], np.arange(1))
     assert losses[0] == pytest.approx(played.losses[0], abs=5e-3) and np.isfinite(slopes).all()
 
