@@ -4,7 +4,8 @@
 
 Goals are those of test seeds from 10,000; scores, totals and losses are means over them. "idle"
 does nothing, "chance" draws actions evenly, one plan a goal, "script" is `FoldPlayer` or
-`SpreadPlayer` with fixed picks or `PathPlayer` with a fixed path, where a task has one. "random",
+`SpreadPlayer` with fixed picks, `PathPlayer` with a fixed path, or a fixed motion, where a task has
+one. "random",
 "cem" and "cmaes" are `optimize` over the plans of `EpisodeProblem`, with S CPU seconds a goal;
 "adam", from the best of 50 draws, and "cem+adam" descend by the gradients of `LedProblem`, where a
 task holds one thing. A total is
@@ -26,15 +27,16 @@ import numpy as np
 from warp_deform.control import EpisodeProblem, LedProblem, optimize
 from warp_deform.control.episode_problem import PlayedPlans
 from warp_deform.control.plan_players import FoldPlayer, Player, SpreadPlayer
+from warp_deform.control.unknot import UNTIE
 from warp_deform.control.wire import THROUGH
 from warp_deform.support.revision import running_revision
 
 TASKS = (
     "push-cable", "fold-fabric-1", "fold-fabric-3", "unfold-fabric-1", "unfold-fabric-3",
-    "gather", "wire",
+    "gather", "wire", "unknot",
 )  # fmt: skip
 DESCENTS = ("adam", "cem+adam")
-HELD = ("push-cable", "gather", "wire")
+HELD = ("push-cable", "gather", "wire", "unknot")
 """Where they are possible."""
 SEARCHES = ("random", "cem", "cmaes", *DESCENTS)
 METHODS = ("idle", "chance", "script", *SEARCHES)
@@ -42,8 +44,10 @@ SCRIPTS = {
     "fold-fabric-1": np.array([[-1, -1, 1, 1]]),
     "fold-fabric-3": np.array([[-1, -1, -0.1, -0.1], [1, -1, 0.1, -0.1], [-1, 1, -0.1, 0.1]]),
     "wire": THROUGH,
+    "unknot": UNTIE,
 }
-"""Picks and places that fold, see `FoldPlayer`, and a path, see `PathPlayer`."""
+"""Picks and places that fold, see `FoldPlayer`, a path, see `PathPlayer`, and a motion, see
+`SmoothPlayer`."""
 SCRIPTED = (*SCRIPTS, "unfold-fabric-1", "unfold-fabric-3")
 
 

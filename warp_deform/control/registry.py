@@ -11,6 +11,7 @@ from .fold_fabric_3 import FoldFabric3
 from .gather import Gather
 from .push_cable import PushCable
 from .unfold_fabric import UnfoldFabric1, UnfoldFabric3
+from .unknot import Unknot
 from .whip import Whip, WhipTarget
 from .wire import Wire
 
@@ -20,7 +21,7 @@ CONTROL_TASKS: dict[str, type[ControlTask]] = {
     cls.name: cls
     for cls in (
         Whip, WhipTarget, PushCable, FoldFabric1, FoldFabric3, UnfoldFabric1, UnfoldFabric3,
-        Gather, Wire,
+        Gather, Wire, Unknot,
     )
 }  # fmt: skip
 

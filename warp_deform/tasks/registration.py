@@ -16,7 +16,7 @@ CONTROL_VERSION = 1
 """Of the ids of control: rises with any change of its physics, observation or reward."""
 CONTROL_ALONE = (
     "whip", "whip-target", "push-cable", "fold-fabric-1", "fold-fabric-3", "unfold-fabric-1",
-    "unfold-fabric-3", "gather", "wire",
+    "unfold-fabric-3", "gather", "wire", "unknot",
 )  # fmt: skip
 """Tasks that are only for control; they stand in `warp_deform.control.registry`."""
 

@@ -131,7 +131,7 @@ def test_posts_stand_fast_whatever_is_pulled_around_them() -> None:
     assert 0.5 * radius < np.linalg.norm(outside, axis=2).min() < 2 * radius
 
 
-@pytest.mark.parametrize("name", ["push-cable", "gather", "wire"])
+@pytest.mark.parametrize("name", ["push-cable", "gather", "wire", "unknot"])
 def test_losses_are_batched_and_have_slopes(name: str) -> None:
     task, layout, _ = start(name)
     other = task.sample(np.random.default_rng(1), None)

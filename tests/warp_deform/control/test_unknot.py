@@ -1,0 +1,157 @@
+"""The knot: what is one, how it comes untied, and that no strand goes through another."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from warp_deform.control import ControlConfig, ControlWorlds, EpisodeProblem
+from warp_deform.control.knots import overhand_knot, untied
+from warp_deform.control.led_cable import CABLE
+from warp_deform.control.unknot import UNTIE, Unknot
+from warp_deform.xpbd.guards import ProblemKind
+
+FINE = 12
+"""Looks a control step of 50 ms: what goes at 2 m/s has come 8 mm, a bead is 14 mm wide."""
+
+
+class Watched(Unknot):
+    """The same in steps of a twelfth."""
+
+    control = ControlConfig(rate=20.0 * FINE, max_speed=1.0)
+    horizon = 100 * FINE
+
+
+def apart(beads: np.ndarray, near: int = 6) -> float:
+    """Least distance between two links that are `near` or more apart along the chain."""
+    at = np.array([0.0, 1 / 3, 2 / 3])[None, :, None]
+    points = (beads[:-1, None] + at * np.diff(beads, axis=0)[:, None]).reshape(-1, 3)
+    i, j = np.triu_indices(len(points), 3 * near)
+    return float(np.sqrt(((points[i] - points[j]) ** 2).sum(axis=1).min()))
+
+
+def watched(task: Unknot, actions: np.ndarray, seed: int) -> tuple[ControlWorlds, float]:
+    """Worlds after actions (T, 4) of 50 ms, and how near strands came on the way, in spacings."""
+    control = ControlWorlds(task, 1, action_penalty=0.0)
+    control.reset({0: seed})
+    least = np.inf
+    for action in np.repeat(actions, FINE, axis=0):
+        control.lead([0], action[None])
+        if not control.worlds.episodes[0].physics_ok:
+            break
+        least = min(least, apart(control.worlds.solver.particle_q(0)))
+    control.worlds.look(0)
+    return control, least / control.task.cable.spacing
+
+
+# -- what a knot is
+
+
+@settings(derandomize=True, deadline=None, max_examples=20)
+@given(st.integers(0, 10_000), st.floats(1.2, 2.5), st.booleans())
+def test_an_overhand_knot_is_one_from_every_side(seed: int, loops: float, mirrored: bool) -> None:
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    beads = overhand_knot(80, 0.01, loops) * ([1, 1, -1] if mirrored else [1, 1, 1])
+    assert not untied(beads @ turn + rng.normal(0.0, 1e-4, beads.shape))
+    assert not untied(beads[::-1])
+
+
+def test_chains_without_a_knot_are_untied_however_they_lie() -> None:
+    knot = overhand_knot(50, 0.01, 1.5)
+    # strands lie on each other in one order: neither above nor below in turn
+    spiral = knot.copy()
+    spiral[:, 2] = 0.01 * np.arange(50)
+    angle = np.linspace(0, 6 * np.pi, 60)
+    coil = np.column_stack([np.cos(angle), np.sin(angle), 0.1 * angle])
+    flat = np.column_stack([knot[:, :2], np.zeros(50)])
+    for chain in (spiral, coil, flat, knot[[0, -1]], knot[:3], knot[14:]):
+        assert untied(chain)
+    assert not untied(np.concatenate([np.add(knot, [0.3, 0.0, 0.0]), knot])), "one beside the other"
+
+
+def test_beads_start_a_diameter_apart_on_the_table_and_touch_where_they_cross() -> None:
+    task = Unknot()
+    for seed in range(20):
+        layout = task.sample(np.random.default_rng(seed), None)
+        links = np.linalg.norm(np.diff(layout.particle_q, axis=0), axis=1) / task.cable.spacing
+        assert 0.95 < links.min() and links.max() < 1.0 + 1e-9
+        assert layout.particle_q[:, 2].min() == pytest.approx(task.cable.radius)
+        assert 0.6 < apart(layout.particle_q) / task.cable.spacing < 1.2
+        assert not task.solved(layout, type("", (), {"particle_q": layout.particle_q}))
+
+
+def test_the_cost_is_its_sources() -> None:
+    """Summed link by link as the source does, with its masks."""
+    task = Unknot()
+    layout = task.sample(np.random.default_rng(0), None)
+    rope = layout.particle_q * (0.02 / task.cable.spacing)
+    links, middles = np.diff(rope, axis=0), (rope[1:] + rope[:-1]) / 2
+    crossings = near = 0.0
+    for i in range(len(links)):
+        for j in range(len(links)):
+            if abs(i - j) > 1:
+                away = middles[i] - middles[j]
+                volume = abs(away @ np.cross(links[i], links[j]))
+                crossings += volume / (away @ away + 0.02**2) ** 1.5 / (4 * np.pi)
+                near += max(0.0, 0.04 - np.linalg.norm(away)) ** 2
+    state = type("", (), {"particle_q": layout.particle_q, "body_q": layout.body_q})
+    assert task.cost(layout, state) == pytest.approx(crossings + 100 * near, abs=1e-4)
+    assert 1.9 < crossings < 2.3
+    straight = layout.particle_q[:1] + np.arange(50)[:, None] * [0.0, task.cable.spacing, 0.0]
+    state.particle_q = straight
+    assert task.cost(layout, state) < 1e-6
+
+
+# -- how it comes untied
+
+
+def test_the_plan_unties_every_goal_and_strands_go_round_each_other() -> None:
+    problem = EpisodeProblem("unknot", seeds=range(4), worlds=8)
+    played = problem.play(range(4), np.stack([UNTIE] * 4))
+    assert played.solved.all() and played.returns.min() > 25
+    idle = problem.play(range(4), np.zeros((4, 10, 3)))
+    assert not idle.solved.any() and idle.returns.max() < 5
+    for seed in range(2):
+        control, least = watched(Watched(), played.actions[seed], seed)
+        assert control.worlds.episodes[0].physics_ok and control.worlds.solved(0)
+        assert least > 0.6  # crossing links touch at 0.71
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.4, 1.0])
+@pytest.mark.parametrize("way", [(0.0, 1.0), (1.0, 1.0), (-1.0, 1.0)])
+def test_drawn_tight_it_tears_before_strands_go_through(
+    way: tuple[float, float], speed: float
+) -> None:
+    move = np.append(speed * np.array(way) / np.linalg.norm(way), [0.0, 1.0])
+    control, least = watched(Watched(), np.tile(move, (100, 1)), seed=0)
+    (problem,) = control.worlds.episodes[0].problems
+    assert problem.kind is ProblemKind.STRETCH and 1.15 < problem.value < 1.5
+    assert not control.worlds.solved(0) and least > 0.4
+
+
+def test_by_the_physics_of_other_cables_it_would_come_untied_so() -> None:
+    """An overlap is undone slowly there, and links may be half as long again."""
+
+    class Soft(Watched):
+        solver = CABLE
+
+    control, least = watched(Soft(), np.tile([0.0, 0.4, 0.0, 1.0], (17, 1)), seed=0)
+    assert control.worlds.episodes[0].physics_ok and control.worlds.solved(0) and least < 0.4
+
+
+def test_whatever_is_searched_for_no_strand_goes_through_another() -> None:
+    """Wild and low plans: most tear the cable, and what comes untied did so round the strands."""
+    rng = np.random.default_rng(0)
+    numbers = rng.normal(0.0, 0.5, (32, 10, 3)) - [0.0, 0.0, 0.4]
+    problem = EpisodeProblem("unknot", seeds=range(32), worlds=16)
+    played = problem.play(range(32), numbers)
+    torn = ~np.isfinite(played.losses)
+    assert torn.sum() > 10
+    done = np.flatnonzero(played.solved & ~torn)
+    assert len(done) >= 2
+    for k in done[:3]:
+        least = watched(Watched(), played.actions[k], k)[1]
+        assert least > 0.45

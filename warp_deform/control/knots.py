@@ -1,0 +1,95 @@
+"""Knots in open chains: a loose overhand knot, and whether a chain is knotted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["overhand_knot", "untied"]
+
+_OPENED = 0.6
+"""How much of the trefoil is cut away on either side of a lobe's end [rad]."""
+_RISE = 0.55
+"""Height of the strands above and below the middle, so that they touch where they cross."""
+_EPSILON = 1e-12
+
+
+def overhand_knot(beads: int, spacing: float, loops: float) -> np.ndarray:
+    """Beads (beads, 3) [m] of a loose overhand knot, from one end at +x to the other at -x.
+
+    A trefoil that is opened at one of its lobes, whose ends are bent outwards. Its lobes reach
+    three times `loops` spacings from its centre, the origin, and the lowest bead touches the table.
+    """
+    t = np.linspace(_OPENED - np.pi, np.pi - _OPENED, 400)
+    x, y = np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t)
+    knot = np.column_stack([loops * x, loops * y, -_RISE * np.sin(3 * t)])
+    first = _tail(knot[0], knot[0] - knot[1], loops)
+    last = _tail(knot[-1], knot[-1] - knot[-2], loops)
+    curve = np.concatenate([first[::-1], knot, last])
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
+    at = way[-1] / 2 + np.arange(beads) - (beads - 1) / 2
+    points = np.column_stack([np.interp(at, way, column) for column in curve.T])
+    points[:, 2] += 0.5 - points[:, 2].min()
+    return spacing * points
+
+
+def _tail(begin: np.ndarray, way: np.ndarray, loops: float) -> np.ndarray:
+    """Points from a lobe's end (3,) on along `way` (3,), around and outwards; in spacings."""
+    outwards = np.array([np.sign(begin[0]), 0.0, 0.0])
+    end = np.array([5.0 * loops * outwards[0], -3.5 * loops, -_RISE])
+    length = np.linalg.norm(end - begin)
+    level = length * np.append(way[:2], 0.0) / np.hypot(way[0], way[1])
+    u = np.linspace(0.0, 1.0, 100)[1:, None]
+    bend = (2 * u**3 - 3 * u**2 + 1) * begin + (u**3 - 2 * u**2 + u) * level
+    bend += (3 * u**2 - 2 * u**3) * end + (u**3 - u**2) * length * outwards
+    return np.concatenate([bend, [end + 100.0 * outwards]])
+
+
+def untied(points: np.ndarray) -> bool:
+    """Whether an open chain through `points` (P, 3) has no knot.
+
+    Points are taken out as long as no link goes through the triangle of a point and its two
+    neighbours. A chain without a knot ends as one straight link. Its ends stay where they are, so
+    one that still sticks out through two loops counts as tied.
+
+    Source: Koniaris and Muthukumar, Phys. Rev. Lett. 66 (1991); Taylor, Nature 406 (2000).
+    """
+    chain = np.asarray(points, dtype=float)
+    while len(chain) > 2:
+        corners = chain[:-2], chain[1:-1], chain[2:]
+        pierced = _pierced(corners, chain[:-1], np.diff(chain, axis=0))
+        triangle, link = np.indices(pierced.shape)
+        # links that begin or end at its corners do not go through a triangle
+        pierced &= (link < triangle - 1) | (link > triangle + 2)
+        (free,) = np.nonzero(~pierced.any(axis=1))
+        if not len(free):
+            return False
+        chain = np.delete(chain, _together(free, chain) + 1, axis=0)
+    return True
+
+
+def _together(free: np.ndarray, chain: np.ndarray) -> np.ndarray:
+    """Triangles out of `free`, by number, whose middle points can be taken out at once."""
+    some = free[free % 2 == free[0] % 2]
+    corners = chain[some], chain[some + 1], chain[some + 2]
+    # two that nothing goes through may still be in the way of each other's new links
+    pierced = _pierced(corners, corners[0], corners[2] - corners[0])
+    touching = np.abs(some[:, None] - some) <= 2
+    return some[:1] if (pierced & ~touching).any() else some
+
+
+def _pierced(corners: tuple[np.ndarray, ...], begins: np.ndarray, ways: np.ndarray) -> np.ndarray:
+    """Whether triangles of corners (n, 3) are gone through by links (m, 3) from `begins`: (n, m).
+
+    Source: Moeller and Trumbore, Journal of Graphics Tools 2 (1997).
+    """
+    a, b, c = (corner[:, None] for corner in corners)
+    across = np.cross(ways, c - a)
+    scale = ((b - a) * across).sum(-1)
+    flat = np.abs(scale) < _EPSILON * np.abs(ways).max() ** 3
+    scale = np.where(flat, np.inf, scale)
+    offset = begins - a
+    turned = np.cross(offset, b - a)
+    u = (offset * across).sum(-1) / scale
+    v = (ways * turned).sum(-1) / scale
+    t = ((c - a) * turned).sum(-1) / scale
+    return ~flat & (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
