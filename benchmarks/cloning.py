@@ -10,8 +10,9 @@ episodes with seeds from 10,000, which nothing was chosen on. With --refined the
 refined as trajectories first. With --planned a swing is demonstrated by a network that plans it,
 trained for a minute, in place of a search for one goal after the other; its training counts as
 collecting. One row a task and source of data, appended to the results: successes
-with Wilson's 95 % interval [%], mean score, mean steps of the solved, CPU seconds of the updates,
-and of what collected and refined. cable-line-notarget begins with the first bead held and has 600
+with Wilson's 95 % interval [%], of swings how many came within 10, 5, 2 and 1 cm, mean score, mean
+steps of the solved, CPU seconds of the updates, and of what collected and refined.
+cable-line-notarget begins with the first bead held and has 600
 steps.
 """
 
@@ -40,6 +41,7 @@ from learning.evaluation.protocol import FIRST_SEED
 from learning.evaluation.summary import wilson
 from learning.refinement.trajectories import TrajectoryConfig, refine_trajectories
 from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.control.whip import WhipTarget
 from warp_deform.quiet import quiet_warp
 
 TASKS: dict[str, dict[str, Any]] = {
@@ -48,6 +50,11 @@ TASKS: dict[str, dict[str, Any]] = {
     "cable-line-notarget": {"start": "held", "horizon": 600},
 }
 SNAPSHOTS, VALIDATE = 5, 32
+DISTANCE = {
+    "whip-target": lambda score: -WhipTarget.tolerance * np.log2(score),
+    "whip": lambda score: -np.log(score) / 10,
+}
+"""How far the end, or the beads over the square root of 3, are from the goal by the score [m]."""
 
 
 def main() -> None:
@@ -113,6 +120,10 @@ def cloned(task: str, options: argparse.Namespace) -> dict[str, Any]:
     played = play(chunks.how, cloner.policy, "test", options.episodes)
     solved = [p for p in played if p.solved]
     low, high = wilson(len(solved), len(played))
+    within: dict[str, int] = {}
+    if task in DISTANCE:
+        away = DISTANCE[task](np.array([max(p.score, 1e-9) for p in played]))
+        within = {f"within_{cm}_cm": int((away < cm / 100).sum()) for cm in (10, 5, 2, 1)}
     return {
         "task": task,
         "data": "planned" if options.planned else "refined" if options.refined else "demonstrated",
@@ -127,6 +138,7 @@ def cloned(task: str, options: argparse.Namespace) -> dict[str, Any]:
         "n_success": len(solved),
         "low": low,
         "high": high,
+        **within,
         "mean_score": float(np.mean([p.score for p in played])),
         "mean_steps": float(np.mean([p.steps for p in solved])) if solved else None,
         "guards": sum(p.ended.startswith("physics") for p in played),

@@ -5,13 +5,12 @@
 Goals are those of test seeds from 10,000; scores, totals and losses are means over them. "idle"
 does nothing, "chance" draws actions evenly, one plan a goal, "script" is `FoldPlayer` or
 `SpreadPlayer` with fixed picks, `PathPlayer` with a fixed path, or a fixed motion, where a task has
-one. "random",
-"cem" and "cmaes" are `optimize` over the plans of `EpisodeProblem`, with S CPU seconds a goal;
-"adam", from the best of 50 draws, and "cem+adam" descend by the gradients of `LedProblem`, where a
-task holds one thing. A total is
-the sum of the scores of all steps, DLO-Lab's return; a score is that of the end; away is the task's
-loss at the end. `solved` and `guards` count goals. What has a row of as many goals and seconds is
-left out, so the command goes on after an interruption.
+one. "random", "cem" and "cmaes" are `optimize` over the plans of `EpisodeProblem`, with S CPU
+seconds a goal. "adam" and "lbfgs", from the best of 50 draws, and "cem+adam" descend by the
+gradients of `LedProblem`, where a task holds one thing. A total is the sum of the scores of all
+steps, DLO-Lab's return; a score is that of the end; away is the task's loss at the end. `solved`
+and `guards` count goals. What has a row of as many goals and seconds is left out, so the command
+goes on after an interruption.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ TASKS = (
     "push-cable", "fold-fabric-1", "fold-fabric-3", "unfold-fabric-1", "unfold-fabric-3",
     "gather", "wire", "unknot",
 )  # fmt: skip
-DESCENTS = ("adam", "cem+adam")
+DESCENTS = ("adam", "lbfgs", "cem+adam")
 HELD = ("push-cable", "gather", "wire", "unknot")
 """Where they are possible."""
 SEARCHES = ("random", "cem", "cmaes", *DESCENTS)

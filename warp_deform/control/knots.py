@@ -10,7 +10,6 @@ _OPENED = 0.6
 """How much of the trefoil is cut away on either side of a lobe's end [rad]."""
 _RISE = 0.55
 """Height of the strands above and below the middle, so that they touch where they cross."""
-_EPSILON = 1e-12
 
 
 def overhand_knot(beads: int, spacing: float, loops: float) -> np.ndarray:
@@ -55,8 +54,7 @@ def untied(points: np.ndarray) -> bool:
     """
     chain = np.asarray(points, dtype=float)
     while len(chain) > 2:
-        corners = chain[:-2], chain[1:-1], chain[2:]
-        pierced = _pierced(corners, chain[:-1], np.diff(chain, axis=0))
+        pierced = _pierced(chain[:-2], chain[1:-1], chain[2:], chain[:-1], chain[1:])
         triangle, link = np.indices(pierced.shape)
         # links that begin or end at its corners do not go through a triangle
         pierced &= (link < triangle - 1) | (link > triangle + 2)
@@ -70,26 +68,40 @@ def untied(points: np.ndarray) -> bool:
 def _together(free: np.ndarray, chain: np.ndarray) -> np.ndarray:
     """Triangles out of `free`, by number, whose middle points can be taken out at once."""
     some = free[free % 2 == free[0] % 2]
-    corners = chain[some], chain[some + 1], chain[some + 2]
+    a, b, c = chain[some], chain[some + 1], chain[some + 2]
     # two that nothing goes through may still be in the way of each other's new links
-    pierced = _pierced(corners, corners[0], corners[2] - corners[0])
+    pierced = _pierced(a, b, c, a, c)
     touching = np.abs(some[:, None] - some) <= 2
     return some[:1] if (pierced & ~touching).any() else some
 
 
-def _pierced(corners: tuple[np.ndarray, ...], begins: np.ndarray, ways: np.ndarray) -> np.ndarray:
-    """Whether triangles of corners (n, 3) are gone through by links (m, 3) from `begins`: (n, m).
+def _pierced(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, begins: np.ndarray, ends: np.ndarray
+) -> np.ndarray:
+    """Whether triangles of corners (n, 3) each are gone through by links (m, 3) each: (n, m).
 
-    Source: Moeller and Trumbore, Journal of Graphics Tools 2 (1997).
+    A line goes through a triangle if it passes all of its edges on the same side. On which side two
+    lines pass each other is an inner product of their Pluecker coordinates.
     """
-    a, b, c = (corner[:, None] for corner in corners)
-    across = np.cross(ways, c - a)
-    scale = ((b - a) * across).sum(-1)
-    flat = np.abs(scale) < _EPSILON * np.abs(ways).max() ** 3
-    scale = np.where(flat, np.inf, scale)
-    offset = begins - a
-    turned = np.cross(offset, b - a)
-    u = (offset * across).sum(-1) / scale
-    v = (ways * turned).sum(-1) / scale
-    t = ((c - a) * turned).sum(-1) / scale
-    return ~flat & (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
+    ways, moments = _line(begins, ends)
+    sides = []
+    for corner, other in ((a, b), (b, c), (c, a)):
+        way, moment = _line(corner, other)
+        sides.append(way @ moments.T + moment @ ways.T)
+    one, two, three = sides
+    through = ((one >= 0) & (two >= 0) & (three >= 0)) | ((one <= 0) & (two <= 0) & (three <= 0))
+    normals = _cross(b - a, c - a)
+    levels = (normals * a).sum(axis=1, keepdims=True)
+    # what lies in the triangle's plane does not count
+    return through & ((normals @ begins.T > levels) != (normals @ ends.T > levels))
+
+
+def _line(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pluecker coordinates of lines through points (n, 3): directions and moments."""
+    return ends - begins, _cross(begins, ends)
+
+
+def _cross(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Cross products (n, 3); of a few vectors this is much faster than NumPy's."""
+    ahead, behind = [1, 2, 0], [2, 0, 1]
+    return one[:, ahead] * two[:, behind] - one[:, behind] * two[:, ahead]
