@@ -135,7 +135,7 @@ def main() -> None:
                 continue
             seeds = range(10_000, 10_000 + options.goals)
             made = LedProblem if task in HELD else EpisodeProblem
-            problem = problem or made(task, seeds)
+            problem = problem or made(task, seeds, worlds=-(-options.goals // 8) * 8)
             played, took = played_by(problem, task, method, options.seconds)
             row |= {**told(played), **took, "revision": asdict(running_revision())}
             rows[key(row)] = row

@@ -175,6 +175,10 @@ class ControlWorlds:
             return _NOTHING
         return self.task.held_particle, self.task.held_body
 
+    @property
+    def _ends_when_solved(self) -> bool:
+        return not isinstance(self.task, ControlTask) or self.task.ends_when_solved
+
     def _begin(self, slots: Sequence[int], grasps: Mapping[int, Grasp]) -> None:
         """Take slots under control, with what they hold from the start."""
         self.worlds.solver.config = self._led_config
@@ -312,7 +316,7 @@ class ControlWorlds:
             change = np.where(first[:, None], 0.0, rows - self._last[slots])
             rewards = rewards - self.action_penalty * (change**2).sum(axis=1)
         self._last[slots] = rows
-        ends = not isinstance(self.task, ControlTask) or self.task.ends_when_solved
+        ends = self._ends_when_solved
         done = {}
         for slot, reward in zip(slots, rewards, strict=True):
             success = bool(self.worlds.solved(slot))

@@ -87,7 +87,9 @@ class LedProblem(EpisodeProblem):
         from .tensor_worlds import TensorControlWorlds
 
         count = self.control.worlds.count
-        self._tensors = self._tensors or TensorControlWorlds(self.task, count)
+        self._tensors = self._tensors or TensorControlWorlds(
+            self.task, count, judged=self.task.ends_when_solved
+        )
         worlds = self._tensors
         # slots without a plan play the last one again
         filled = np.concatenate([of, np.repeat(of[-1:], count - len(of))])

@@ -72,16 +72,27 @@ class TensorControlWorlds(ControlWorlds):
     Args:
         task: see `ControlWorlds`, as are the others
         memory: most bytes of what is recorded
+        judged: whether every step says what is solved. For searches that do not ask: whether a
+            cable has a knot takes longer to tell than the step that led it there
 
     Raises:
-        InputError: nothing is held from the start, another mode than "tip_delta_position", or
-            rewards that have no derivative.
+        InputError: nothing is held from the start, another mode than "tip_delta_position", rewards
+            that have no derivative, or a task that ends when it is solved is not judged.
     """
 
     def __init__(
-        self, task: str | Task, count: int = 1, *, memory: int = 2**30, **options: Any
+        self,
+        task: str | Task,
+        count: int = 1,
+        *,
+        memory: int = 2**30,
+        judged: bool = True,
+        **options: Any,
     ) -> None:
         super().__init__(task, count, **options)
+        self.judged = judged
+        if not judged and self._ends_when_solved:
+            raise InputError(f"{self.task.name} ends when it is solved: it has to be judged")
         if self.targets.mode != "tip_delta_position":
             raise InputError(
                 f"derivatives are there in control_mode tip_delta_position, not {self.targets.mode}"
@@ -285,12 +296,11 @@ class TensorControlWorlds(ControlWorlds):
         rewards = rewards - self.action_penalty * torch.where(later, change, 0.0)
         rewards = torch.where(torch.from_numpy(fine), rewards, 0.0)
         self._left, self._actions = left, actions
-        success = np.array(
-            [bool(live[s]) and bool(self.worlds.solved(s)) for s in range(len(live))]
-        )
+        asked = live & self.judged
+        success = np.array([bool(asked[s]) and self.worlds.solved(s) for s in range(len(live))])
         self._solved = np.where(success, self._solved + 1, 0)
-        ends = not isinstance(self.task, ControlTask) or self.task.ends_when_solved
-        terminated = live & (~trusted | (ends & (self._solved >= SOLVED_STEPS)))
+        done = self._ends_when_solved & (self._solved >= SOLVED_STEPS)
+        terminated = live & (~trusted | done)
         truncated = live & ~terminated & (self.steps >= self.horizon)
         return TensorStep(rewards, terminated, truncated, success)
 

@@ -53,6 +53,23 @@ def test_everything_has_the_bits_of_the_environment(task: str, start: str) -> No
         assert hashes[0] == hashes[1]
 
 
+def test_who_does_not_ask_what_is_solved_gets_the_same_rewards(
+    worlds: TensorControlWorlds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worlds.reset(SEEDS)
+    actions = moves(3, 2)
+    with torch.no_grad():
+        rewards = [worlds.advance(row).rewards for row in actions]
+        monkeypatch.setattr(worlds, "judged", False)
+        monkeypatch.setattr(worlds.worlds, "solved", lambda slot: pytest.fail("it is asked"))
+        worlds.reset(SEEDS)
+        steps = [worlds.advance(row) for row in actions]
+    assert all(torch.equal(step.rewards, a) for step, a in zip(steps, rewards, strict=True))
+    assert not any(step.success.any() for step in steps)
+    with pytest.raises(InputError, match="it has to be judged"):
+        TensorControlWorlds("cable-line-notarget", 8, start="held", judged=False)
+
+
 def test_rewards_lead_back_to_actions_as_differences_do(worlds: TensorControlWorlds) -> None:
     def total(actions: torch.Tensor) -> torch.Tensor:
         worlds.reset(SEEDS)
