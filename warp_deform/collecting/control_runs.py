@@ -23,7 +23,7 @@ from ..episodes import (
 from ..errors import InputError, WarpDeformError
 from ..tasks.task import Task
 from ..worlds.loop import SLOTS, SOLVED
-from .recording import episode_info, origin
+from .recording import episode_info, observe, origin
 
 __all__ = [
     "ControlRun",
@@ -169,29 +169,12 @@ def _reset(control: ControlWorlds, new: Mapping[int, ControlRun]) -> None:
 
 
 def _row(control: ControlWorlds, slot: int, reward: float, pictures: bool) -> Step:
-    """The row of a slot's present state; `record_control` fills in the action."""
-    worlds = control.worlds
-    episode = worlds.episodes[slot]
-    snapshot = episode.snapshot
-    truth = worlds.task.ground_truth(episode.layout, snapshot)
-    return Step(
-        color=snapshot.images.color if pictures else np.zeros((0, 0, 3), np.uint8),
+    """The row of a slot's present state, without heights; `record_control` fills in the action."""
+    tip = np.array(control.worlds.episodes[slot].tip, dtype=float)
+    return replace(
+        observe(control.worlds, slot, images=pictures),
         height=np.zeros((0, 0), np.float32),
-        action=None,
-        score=float(worlds.score(slot)),
-        success=bool(worlds.solved(slot)),
-        physics_ok=episode.physics_ok,
-        sim_seconds=float(episode.sim_seconds),
-        state_hash=worlds.hash(slot),
-        outcome=None,
-        particle_q=snapshot.particle_q,
-        particle_qd=snapshot.particle_qd,
-        body_q=snapshot.body_q,
-        body_qd=snapshot.body_qd,
-        ground_truth=np.asarray(truth, dtype=np.float32),
-        control=ControlRow(
-            np.array(episode.tip, dtype=float), control.holding(slot), float(reward)
-        ),
+        control=ControlRow(tip, control.holding(slot), float(reward)),
     )
 
 

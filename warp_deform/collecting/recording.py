@@ -33,17 +33,20 @@ _TASK_CLASS = "task_class"
 """Where an episode of a task from elsewhere says which class that was."""
 
 
-def observe(worlds: Worlds, slot: int) -> Step:
-    """The row of a slot's present state, its images included; `record` fills in the action."""
+def observe(worlds: Worlds, slot: int, *, images: bool = True) -> Step:
+    """The row of a slot's present state; `record` fills in the action.
+
+    Args:
+        images: whether they are drawn; without them those of the row are empty
+    """
     episode = worlds.episodes[slot]
     snapshot = episode.snapshot
-    images = snapshot.images
     return Step(
-        color=images.color,
-        height=images.height,
+        color=snapshot.images.color if images else np.zeros((0, 0, 3), np.uint8),
+        height=snapshot.images.height if images else np.zeros((0, 0), np.float32),
         action=None,
         score=float(worlds.score(slot)),
-        success=worlds.solved(slot),
+        success=bool(worlds.solved(slot)),
         physics_ok=episode.physics_ok,
         sim_seconds=float(episode.sim_seconds),
         state_hash=worlds.hash(slot),
