@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
+from ..support.checked import Interval, check_number
 from .control_task import ControlTask
 from .episode_problem import EpisodeProblem
 from .plan_players import OpenPlayer, Player
-from .smooth_plans import tensor_actions_of
+from .smooth_plans import KNOTS, numbers_of, tensor_actions_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -36,10 +37,14 @@ class LedProblem(EpisodeProblem):
 
     Args:
         task: see `EpisodeProblem`, as are the others
+        bundle: plans whose gradients are taken for one: the plan's own, and those of others near
+            it. What counts is the mean of their directions, for the steepest would outweigh all
+            others. Source: bundled gradients (Suh, Pang, Tedrake, RA-L 2022)
+        spread: of the others' numbers around the plan's, at six points in time
 
     Raises:
-        InputError: the tip does not hold one thing from start to end, or what `player` does depends
-            on what it sees.
+        InputError: the tip does not hold one thing from start to end, what `player` does depends on
+            what it sees, or `bundle` is less than 1.
     """
 
     def __init__(
@@ -49,8 +54,13 @@ class LedProblem(EpisodeProblem):
         *,
         player: Player | None = None,
         worlds: int = 16,
+        bundle: int = 1,
+        spread: float = 0.1,
     ) -> None:
+        check_number(bundle, "bundle", Interval(low=1, whole=True))
         super().__init__(task, seeds, player=player, worlds=worlds)
+        self.bundle, self.spread = bundle, spread
+        self._rng = np.random.default_rng(0)
         found = self.task
         if found.held_particle is None and found.held_body is None:
             raise InputError(f"{found.name} may take and let go, which has no derivative")
@@ -73,6 +83,18 @@ class LedProblem(EpisodeProblem):
 
         Where a guard fires the losses are inf, and the gradients mean nothing.
         """
+        losses, gradients = self._parts(numbers, goals)
+        if self.bundle == 1:
+            return losses, gradients
+        directions = _directions(losses, gradients)
+        for _ in range(self.bundle - 1):
+            knots = self._rng.normal(0.0, self.spread, (len(goals), KNOTS, numbers.shape[2]))
+            near = numbers + numbers_of(knots, numbers.shape[1])
+            directions += _directions(*self._parts(near, goals))
+        sizes = np.linalg.norm(gradients, axis=(1, 2), keepdims=True)
+        return losses, sizes * directions / self.bundle
+
+    def _parts(self, numbers: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         room = self.control.worlds.count
         parts = [
             self._gradients(goals[first : first + room], numbers[first : first + room])
@@ -111,3 +133,11 @@ class LedProblem(EpisodeProblem):
         (gradients,) = torch.autograd.grad(losses[torch.from_numpy(trusted)].sum(), free)
         worlds.detach()
         return np.where(trusted, losses.detach().numpy(), np.inf), gradients.numpy()
+
+
+def _directions(losses: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+    """Gradients (n, K, 3) of length 1; of what cannot be used 0."""
+    sizes = np.linalg.norm(gradients, axis=(1, 2))
+    usable = np.isfinite(losses) & np.isfinite(sizes) & (sizes > 0.0)
+    scale = np.where(usable, 1.0 / np.where(usable, sizes, 1.0), 0.0)
+    return np.where(usable[:, None, None], gradients, 0.0) * scale[:, None, None]

@@ -302,3 +302,23 @@ def test_gradients_are_refused_where_there_are_none() -> None:
         LedProblem("fold-fabric-1", [0], worlds=8)
     with pytest.raises(InputError, match="depend on what is seen"):
         LedProblem("push-cable", [0], worlds=8, player=FoldPlayer(ControlConfig(), "targets", 2, 1))
+
+
+def test_a_bundle_is_the_mean_of_directions_around_a_plan() -> None:
+    alone, tight, wide = (
+        LedProblem("push-cable", [0, 1], worlds=8, bundle=bundle, spread=spread)
+        for bundle, spread in ((1, 0.1), (3, 0.0), (3, 0.1))
+    )
+    plans = np.random.default_rng(0).normal(0.0, 0.4, (2, *alone.shape))
+    plans[:, :, 2:] -= plans[:, :, :2]  # across the cable
+    numbers, goals = alone.refined(plans), np.arange(2)
+    losses, gradients = alone.gradients(numbers, goals)
+    assert np.abs(gradients).max() > 0
+    for problem, same in ((tight, True), (wide, False)):
+        bundled_losses, bundled = problem.gradients(numbers, goals)
+        assert np.array_equal(bundled_losses, losses)
+        assert np.allclose(bundled, gradients, rtol=1e-9, atol=0) == same
+        sizes, most = (np.linalg.norm(g, axis=(1, 2)) for g in (bundled, gradients))
+        assert (sizes <= most * (1 + 1e-12)).all() and np.isfinite(bundled).all()
+    with pytest.raises(InputError, match="bundle"):
+        LedProblem("push-cable", [0], worlds=8, bundle=0)
