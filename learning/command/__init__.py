@@ -1,1 +1,1 @@
-"""The verbs of the `warp-deform` command that train, evaluate, refine and convert."""
+"""The verbs that train, evaluate, report, refine, correct, distill, convert, and open the page."""

@@ -1,1 +1,1 @@
-"""Policies for control at 20 Hz, trained by analytic gradients (APG)."""
+"""Policies for control at 20 Hz: trained by gradients (APG, SHAC, plan) or cloned, and tested."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..control.control_task import ControlTask
 from ..control.control_worlds import ControlWorlds
+from ..control.episode_problem import EpisodeProblem
 from ..control.plan_search import optimize
 from ..control.registry import control_task
 from ..control.swing_problem import SwingProblem
@@ -41,7 +42,7 @@ __all__ = [
 ]
 
 SEARCHED = "cem"
-"""Who demonstrates swings: the search of `warp_deform.control.optimize`."""
+"""Who demonstrates what is held from the start: the search of `warp_deform.control.optimize`."""
 _WORLDS = 32
 """Plans that are simulated side by side in a search; their number changes no bit."""
 
@@ -57,14 +58,14 @@ def check_control(settings: CollectSettings) -> None:
         raise InputError(f"horizon is {settings.horizon}; it must be 1 control step or more")
     if settings.evaluations < 1:
         raise InputError(f"evaluations is {settings.evaluations}; it must be 1 or more")
-    if _is_swing(task):
+    if _is_searched(task):
         fixed = {"control_mode": (None, LED_MODES[0]), "horizon": (None,), "start": ("free",)}
         for name, allowed in fixed.items():
             if getattr(settings, name) not in allowed:
                 flag = name.replace("_", "-")
-                raise InputError(f"{task.name} is a swing, which has no choice of --{flag}")
+                raise InputError(f"a search demonstrates {task.name}; it has no choice of --{flag}")
         if settings.demonstrator != "scripted":
-            raise InputError(f"{task.name} is a swing: a search demonstrates it, nobody else")
+            raise InputError(f"a search demonstrates {task.name}, and nobody else")
 
 
 def describe_control(settings: CollectSettings) -> dict[str, Any]:
@@ -76,7 +77,7 @@ def describe_control(settings: CollectSettings) -> dict[str, Any]:
         "horizon": how.horizon,
         "pictures": settings.pictures,
         "config": task_config(task),
-        **({"evaluations": settings.evaluations} if _is_swing(task) else {}),
+        **({"evaluations": settings.evaluations} if _is_searched(task) else {}),
     }
 
 
@@ -116,15 +117,16 @@ def _led_task(settings: CollectSettings) -> LedTask:
     return LedTask(type(task), settings.robot, mode, start=settings.start, horizon=settings.horizon)
 
 
-def _is_swing(task: Task) -> bool:
-    return isinstance(task, ControlTask) and task.held_particle is not None
+def _is_searched(task: Task) -> bool:
+    """Whether something is held from the start, so that no pick demonstrates it."""
+    return isinstance(task, ControlTask) and (task.held_particle, task.held_body) != (None, None)
 
 
 def _demonstrator(
     control: ControlWorlds, settings: CollectSettings
 ) -> tuple[Callable[[Mapping[int, ControlRun]], None], Act, str]:
     """What is done at the start of runs, who acts in them, and the name of that."""
-    if _is_swing(control.task):
+    if _is_searched(control.task):
         plans = _Plans(settings)
         return plans.start, plans.act, SEARCHED
     tips = TipDemonstrator(control, settings.demonstrator)
@@ -143,6 +145,7 @@ class _Plans:
 
     def __init__(self, settings: CollectSettings) -> None:
         self._settings = settings
+        self._swings = not {"box", "bag"} & set(control_task(settings.task).objects)
         self._actions: dict[int, np.ndarray] = {}
 
     def start(self, runs: Mapping[int, ControlRun]) -> None:
@@ -153,11 +156,16 @@ class _Plans:
         return {slot: self._actions[run.seed][len(run.actions)] for slot, run in runs.items()}
 
     def _found(self, seed: int) -> np.ndarray:
-        problem = SwingProblem(
-            self._settings.task, [seed], worlds=_WORLDS, robot=self._settings.robot
+        task, robot, budget = (
+            getattr(self._settings, name) for name in ("task", "robot", "evaluations")
         )
-        found = optimize(problem, SEARCHED, evaluations=self._settings.evaluations, seed=seed)
-        return np.asarray(problem.actions(found.numbers[0]), np.float32)
+        if self._swings:
+            swing = SwingProblem(task, [seed], worlds=_WORLDS, robot=robot)
+            found = optimize(swing, SEARCHED, evaluations=budget, seed=seed)
+            return np.asarray(swing.actions(found.numbers[0]), np.float32)
+        episode = EpisodeProblem(task, [seed], worlds=_WORLDS, robot=robot)
+        found = optimize(episode, SEARCHED, evaluations=budget, seed=seed)
+        return np.asarray(episode.play([0], found.numbers).actions[0], np.float32)
 
 
 def replay_acts(actions: Mapping[int, Sequence[np.ndarray]]) -> Act:

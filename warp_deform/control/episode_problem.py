@@ -71,6 +71,7 @@ class EpisodeProblem:
         task: a name, or a `ControlTask`
         player: what the numbers of a plan mean; None: what suits the task
         worlds: that run side by side, a multiple of 8
+        robot: whose reach limits the tip
 
     Raises:
         InputError: the task is not made for control, there are no seeds, or `worlds` is no multiple
@@ -84,10 +85,11 @@ class EpisodeProblem:
         *,
         player: Player | None = None,
         worlds: int = 16,
+        robot: str = "ur5",
     ) -> None:
         if worlds < 1 or worlds % _LANES or not len(seeds):
             raise InputError(f"worlds must be a multiple of {_LANES}, and seeds one or more")
-        self.control = ControlWorlds(task, worlds, lanes=_LANES)
+        self.control = ControlWorlds(task, worlds, robot=robot, lanes=_LANES)
         found = self.control.task
         if not isinstance(found, ControlTask):
             raise InputError(f"{found.name} is not made for control, so it has no plans")

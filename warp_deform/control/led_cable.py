@@ -1,4 +1,4 @@
-"""What ports of DLO-Lab's tasks share: a cable whose one end is led for 100 steps.
+"""What ports of DLO-Lab's tasks share: a cable of which one bead is led for 100 steps.
 
 Source: DLO-Lab (arXiv 2606.04206). Its rewards are exp(-cost), with costs of lengths in metres on a
 rope whose vertices are 2 cm apart. Costs here have the same formulas, of lengths told in that

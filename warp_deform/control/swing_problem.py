@@ -37,8 +37,8 @@ class SwingProblem:
         robot: whose reach limits the tip
 
     Raises:
-        InputError: the task holds nothing from the start, or there are no seeds, or `worlds` is no
-            multiple of 8.
+        InputError: the task holds nothing from the start, or has bodies; or there are no seeds, or
+            `worlds` is no multiple of 8.
     """
 
     def __init__(
@@ -55,6 +55,11 @@ class SwingProblem:
         found = self._control.task
         if not isinstance(found, ControlTask) or found.held_particle is None:
             raise InputError(f"{found.name} holds nothing from the start, so it is no swing")
+        if "box" in found.objects:
+            raise InputError(
+                f"{found.name} has bodies, which are not put back after a swing: search its plans "
+                "with EpisodeProblem or LedProblem"
+            )
         self.task, self.seeds = found, [int(seed) for seed in seeds]
         self._solver = self._control.worlds.solver
         self.steps = self._control.horizon

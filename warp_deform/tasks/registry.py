@@ -1,7 +1,8 @@
 """The tasks by name: those of this package, and those that users register.
 
-A new task of this package is one file and one line here; the tests run over this dict. Others are
-registered by `warp_deform.register_task`, or offered by installed distributions.
+`TASKS` are the paper's, and all tests of tasks run over them. A new task of this package is one
+file and one line in `FURTHER_TASKS`, with tests of its own. Others are registered by
+`warp_deform.register_task`, or offered by installed distributions.
 """
 
 from __future__ import annotations

@@ -12,12 +12,14 @@ import pytest
 
 import warp_deform  # noqa: F401  (registers the ids)
 from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.control_demos import ControlChunk, attempt_control_chunk
 from warp_deform.collecting.control_runs import ControlRun, without_idle_end
 from warp_deform.collecting.control_video import film_control
 from warp_deform.collecting.replay import verify
 from warp_deform.collecting.video import FPS, STILL_SECONDS
 from warp_deform.command.main import main
 from warp_deform.control.control_worlds import ControlWorlds
+from warp_deform.control.swing_problem import SwingProblem
 from warp_deform.control.tip_demonstrator import TipDemonstrator
 from warp_deform.episodes import (
     CONTROL,
@@ -201,7 +203,7 @@ def test_bad_input_is_one_line_and_leaves_no_folder(
 def test_a_swing_has_no_choices_and_no_other_task_is_led_by_its_velocity(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no choice of --start"):
         config(tmp_path, task="whip", start="held")
-    with pytest.raises(InputError, match="a search demonstrates it"):
+    with pytest.raises(InputError, match="a search demonstrates whip, and nobody else"):
         config(tmp_path, task="whip", demonstrator="visible")
     with pytest.raises(InputError, match="played with a jaw"):
         config(tmp_path, task="cable-mask-goal")
@@ -260,3 +262,17 @@ def with_extra(episode: Episode, extra: dict) -> Episode:
 def with_first(episode: Episode, **changes: object) -> Episode:
     first = dataclasses.replace(episode.steps[0], **changes)  # type: ignore[arg-type]
     return dataclasses.replace(episode, steps=(first, *episode.steps[1:]))
+
+
+def test_what_holds_a_box_is_searched_among_its_episodes(tmp_path: Path) -> None:
+    """A swing puts back no boxes; gather and push-cable begin with a search all the same."""
+    with pytest.raises(InputError, match="gather has bodies"):
+        SwingProblem("gather", [0], worlds=8)
+    out = tmp_path / "demos"
+    settings = CollectConfig(
+        task="push-cable", episodes=1, out=out, workers=1, control=True, evaluations=25
+    )
+    with pytest.raises(InputError, match="a search demonstrates push-cable, and nobody else"):
+        collect(dataclasses.replace(settings, demonstrator="visible"))
+    (attempt,) = itertools.islice(attempt_control_chunk(ControlChunk(settings, out, (0,))), 1)
+    assert attempt.actions == 120 and 0.6 < attempt.score < 1.0, "an untouched cable has 0.57"

@@ -1,4 +1,4 @@
-"""What every task has to hold, over the whole registry: a new task inherits these tests."""
+"""What every task of the benchmark has to hold."""
 
 from __future__ import annotations
 

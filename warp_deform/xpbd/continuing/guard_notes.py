@@ -70,7 +70,8 @@ class GuardNotes:
         bad = np.zeros(len(worlds), bool)
         for name in _GUARDED:
             bad |= seen[name] > (getattr(limits, _LIMITS[name]) if name in _LIMITS else 0.0)
-        return {int(w): self.values(int(w), runs).problems(int(w), limits) for w in worlds[bad]}
+        fired = {int(w): self.values(int(w), runs).problems(int(w), limits) for w in worlds[bad]}
+        return {w: problems for w, problems in fired.items() if problems}
 
     def values(self, world: int, runs: LaneRuns) -> WatchValues:
         """What is noted of a world, as of one launch."""
