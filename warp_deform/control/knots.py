@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..support.checked import real_array
+
 __all__ = ["overhand_knot", "untied"]
 
 _OPENED = 0.6
 """How much of the trefoil is cut away on either side of a lobe's end [rad]."""
+_SHAKEN = 1e-5
+"""By how much of a link points are shaken before they are looked at."""
 _RISE = 0.55
 """Height of the strands above and below the middle, so that they touch where they cross."""
 
@@ -51,8 +55,16 @@ def untied(points: np.ndarray) -> bool:
     one that still sticks out through two loops counts as tied.
 
     Source: Koniaris and Muthukumar, Phys. Rev. Lett. 66 (1991); Taylor, Nature 406 (2000).
+
+    Raises:
+        InputError: `points` has another shape or is not finite.
     """
-    chain = np.asarray(points, dtype=float)
+    chain = real_array(points, (len(points), 3), name="points", finite=True)
+    if len(chain) > 1:
+        # beads on a table lie in one plane, where "through" has no meaning; strands that do not
+        # touch go by each other as before
+        links = np.linalg.norm(np.diff(chain, axis=0), axis=1)
+        chain = chain + np.random.default_rng(0).normal(0.0, _SHAKEN * links.max(), chain.shape)
     while len(chain) > 2:
         pierced = _pierced(chain[:-2], chain[1:-1], chain[2:], chain[:-1], chain[1:])
         triangle, link = np.indices(pierced.shape)
@@ -92,7 +104,6 @@ def _pierced(
     through = ((one >= 0) & (two >= 0) & (three >= 0)) | ((one <= 0) & (two <= 0) & (three <= 0))
     normals = _cross(b - a, c - a)
     levels = (normals * a).sum(axis=1, keepdims=True)
-    # what lies in the triangle's plane does not count
     return through & ((normals @ begins.T > levels) != (normals @ ends.T > levels))
 
 

@@ -11,10 +11,28 @@ from warp_deform.control import ControlConfig, ControlWorlds, EpisodeProblem
 from warp_deform.control.knots import overhand_knot, untied
 from warp_deform.control.led_cable import CABLE
 from warp_deform.control.unknot import UNTIE, Unknot
+from warp_deform.errors import InputError
 from warp_deform.xpbd.guards import ProblemKind
 
 FINE = 12
 """Looks a control step of 50 ms: what goes at 2 m/s has come 8 mm, a bead is 14 mm wide."""
+
+FLAT = np.array((
+    (4685, -3898, 71), (4657, -3760, 71), (4628, -3621, 71), (4608, -3481, 71),
+    (4602, -3340, 71), (4625, -3201, 71), (4697, -3079, 71), (4804, -2987, 71),
+    (4929, -2920, 71), (5043, -2863, 132), (5120, -2760, 191), (5178, -2675, 93),
+    (5255, -2559, 71), (5382, -2496, 71), (5473, -2388, 71), (5569, -2284, 71),
+    (5649, -2167, 71), (5691, -2032, 71), (5629, -1905, 71), (5487, -1896, 71),
+    (5351, -1914, 103), (5340, -2023, 192), (5337, -2147, 123), (5247, -2243, 71),
+    (5151, -2347, 71), (5069, -2461, 71), (5026, -2596, 71), (5050, -2736, 71),
+    (5163, -2821, 71), (5272, -2911, 71), (5387, -2829, 71), (5371, -2688, 71),
+    (5350, -2590, 171), (5287, -2464, 170), (5321, -2368, 72), (5411, -2259, 71),
+    (5508, -2156, 71), (5551, -2022, 85), (5411, -2038, 71), (5269, -2034, 71),
+    (5128, -2042, 71), (4987, -2034, 71), (4847, -2011, 71), (4711, -1972, 71),
+    (4582, -1915, 71), (4462, -1841, 71), (4356, -1747, 71), (4270, -1635, 71),
+    (4209, -1507, 71), (4169, -1371, 71),
+))  # fmt: skip
+"""Beads of a knot that lies on the table [0.1 mm]: most are in one plane."""
 
 
 class Watched(Unknot):
@@ -70,6 +88,18 @@ def test_chains_without_a_knot_are_untied_however_they_lie() -> None:
     for chain in (spiral, coil, flat, knot[[0, -1]], knot[:3], knot[14:]):
         assert untied(chain)
     assert not untied(np.concatenate([np.add(knot, [0.3, 0.0, 0.0]), knot])), "one beside the other"
+
+
+def test_a_knot_whose_beads_lie_in_one_plane_is_one() -> None:
+    """What goes through a triangle in whose plane it begins is left to rounding."""
+    assert not untied(FLAT / 1e4) and not untied(FLAT[::-1] / 1e4)
+    flat = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 2, 0], [0, 2, 0]])
+    for chain in (flat, flat * 0, flat[:1], flat[:0]):
+        assert untied(chain)
+    with pytest.raises(InputError, match="all finite"):
+        untied(np.where(FLAT == 71, np.nan, FLAT))
+    with pytest.raises(InputError, match="points"):
+        untied(flat[:, :2])
 
 
 def test_beads_start_a_diameter_apart_on_the_table_and_touch_where_they_cross() -> None:
