@@ -13,7 +13,8 @@ Strands must not pass through each other, by which a knot that is drawn tight wo
 Here the cable would stretch first: beads touch before strands cross, an overlap is undone at once
 (`recovery`), and a link of more than 1.15 times its length makes a guard fire, which ends the
 episode. For one link to go through another between beads that do not overlap, both have to be 1.41
-times as long.
+times as long. One pair is left out: nothing moves the held bead or the pinned one, so a tip that
+aims at the pin leads the one through the other.
 
 Differences. DLO-Lab has two arms, which hold vertices 2 and 37 of a rope of elastic rods, in a knot
 from a file, with 100 steps of 20 ms or more; radius, mass and stiffness vary there. What it calls
