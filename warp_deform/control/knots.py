@@ -48,11 +48,12 @@ def _tail(begin: np.ndarray, way: np.ndarray, loops: float) -> np.ndarray:
 
 
 def untied(points: np.ndarray) -> bool:
-    """Whether an open chain through `points` (P, 3) has no knot.
+    """Whether an open chain through `points` (P, 3) is seen to have no knot.
 
     Points are taken out as long as no link goes through the triangle of a point and its two
-    neighbours. A chain without a knot ends as one straight link. Its ends stay where they are, so
-    one that still sticks out through two loops counts as tied.
+    neighbours. What ends as one straight link has no knot. What does not may also be a tangle that
+    this does not get straight; ends stay where they are, so one that still sticks out through two
+    loops counts as tied.
 
     Source: Koniaris and Muthukumar, Phys. Rev. Lett. 66 (1991); Taylor, Nature 406 (2000).
 
@@ -64,7 +65,11 @@ def untied(points: np.ndarray) -> bool:
         # beads on a table lie in one plane, where "through" has no meaning; strands that do not
         # touch go by each other as before
         links = np.linalg.norm(np.diff(chain, axis=0), axis=1)
-        chain = chain + np.random.default_rng(0).normal(0.0, _SHAKEN * links.max(), chain.shape)
+        chain = (
+            chain
+            - chain.mean(axis=0)
+            + np.random.default_rng(0).normal(0.0, _SHAKEN * np.median(links), chain.shape)
+        )
     while len(chain) > 2:
         pierced = _pierced(chain[:-2], chain[1:-1], chain[2:], chain[:-1], chain[1:])
         triangle, link = np.indices(pierced.shape)

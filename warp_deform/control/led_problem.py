@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..support.checked import Interval, check_number
+from ..support.checked import NOT_NEGATIVE, Interval, check_number
 from .control_task import ControlTask
 from .episode_problem import EpisodeProblem
 from .plan_players import OpenPlayer, Player
@@ -38,13 +38,15 @@ class LedProblem(EpisodeProblem):
     Args:
         task: see `EpisodeProblem`, as are the others
         bundle: plans whose gradients are taken for one: the plan's own, and those of others near
-            it. What counts is the mean of their directions, for the steepest would outweigh all
-            others. Source: bundled gradients (Suh, Pang, Tedrake, RA-L 2022)
+            it. What counts is the mean of their directions, at the length of the own one, for the
+            steepest would outweigh all others. Not for lbfgs, whose line search wants the slope of
+            the loss; a budget in evaluations counts the own one alone. Source: bundled gradients
+            (Suh, Pang, Tedrake, RA-L 2022)
         spread: of the others' numbers around the plan's, at six points in time
 
     Raises:
         InputError: the tip does not hold one thing from start to end, what `player` does depends on
-            what it sees, or `bundle` is less than 1.
+            what it sees, `bundle` is less than 1, or `spread` negative.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class LedProblem(EpisodeProblem):
         spread: float = 0.1,
     ) -> None:
         check_number(bundle, "bundle", Interval(low=1, whole=True))
+        check_number(spread, "spread", NOT_NEGATIVE)
         super().__init__(task, seeds, player=player, worlds=worlds)
         self.bundle, self.spread = bundle, spread
         self._rng = np.random.default_rng(0)

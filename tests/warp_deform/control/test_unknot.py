@@ -172,7 +172,7 @@ def test_by_the_physics_of_other_cables_it_would_come_untied_so() -> None:
     assert control.worlds.episodes[0].physics_ok and control.worlds.solved(0) and least < 0.4
 
 
-def test_whatever_is_searched_for_no_strand_goes_through_another() -> None:
+def test_what_low_and_wild_plans_untie_they_untie_round_the_strands() -> None:
     """Wild and low plans: most tear the cable, and what comes untied did so round the strands."""
     rng = np.random.default_rng(0)
     numbers = rng.normal(0.0, 0.5, (32, 10, 3)) - [0.0, 0.0, 0.4]
