@@ -145,7 +145,7 @@ class _Plans:
 
     def __init__(self, settings: CollectSettings) -> None:
         self._settings = settings
-        self._swings = not {"box", "bag"} & set(control_task(settings.task).objects)
+        self._has_boxes = "box" in control_task(settings.task).objects
         self._actions: dict[int, np.ndarray] = {}
 
     def start(self, runs: Mapping[int, ControlRun]) -> None:
@@ -159,7 +159,7 @@ class _Plans:
         task, robot, budget = (
             getattr(self._settings, name) for name in ("task", "robot", "evaluations")
         )
-        if self._swings:
+        if not self._has_boxes:
             swing = SwingProblem(task, [seed], worlds=_WORLDS, robot=robot)
             found = optimize(swing, SEARCHED, evaluations=budget, seed=seed)
             return np.asarray(swing.actions(found.numbers[0]), np.float32)

@@ -317,6 +317,7 @@ def test_a_bundle_is_the_mean_of_directions_around_a_plan() -> None:
     for problem, same in ((tight, True), (wide, False)):
         bundled_losses, bundled = problem.gradients(numbers, goals)
         assert np.array_equal(bundled_losses, losses)
+        assert np.array_equal(problem.gradients(numbers, goals)[1], bundled), "no state stays"
         assert np.allclose(bundled, gradients, rtol=1e-9, atol=0) == same
         sizes, most = (np.linalg.norm(g, axis=(1, 2)) for g in (bundled, gradients))
         assert (sizes <= most * (1 + 1e-12)).all() and np.isfinite(bundled).all()
