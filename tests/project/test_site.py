@@ -17,7 +17,7 @@ from fixtures.places import ROOT
 
 EVERY_PACKAGE = ["warp_deform", "warp_deform.objects", "warp_deform.solver", "warp_deform.rollout",
                  "warp_deform.worlds", "warp_deform.episodes", "warp_deform.planning",
-                 "warp_deform.robots", "warp_deform.gradcheck", "hardware",
+                 "warp_deform.robots", "warp_deform.gradcheck", "warp_deform.control", "hardware",
                  "hardware.emulator"]  # fmt: skip
 
 needs_mkdocs = pytest.mark.skipif(

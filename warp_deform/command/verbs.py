@@ -16,7 +16,7 @@ from ..gradcheck.config import GradcheckConfig
 from ..quiet import quiet_warp
 from ..robots import RobotName
 from ..support.flag_range import COUNT, COUNT_OR_NONE, SEED, FlagRange
-from ..tasks.registration import env_id
+from ..tasks.registration import control_id, env_id
 from ..tasks.registry import TASKS, all_tasks
 from ..tasks.registry import task as find_task
 from .main import CommandOptions, Outcome
@@ -50,12 +50,14 @@ class ListOptions(CommandOptions):
     """List the tasks with their Gymnasium ids, goals, numbers of actions and objects.
 
     The benchmark's tasks come first, then others of this package, of installed packages, and of
-    --task-module.
+    --task-module; last those that are only for control at 20 Hz.
     """
 
 
 def list_tasks(options: ListOptions) -> Outcome:
-    """The benchmark's tasks, in the paper's order, then the others."""
+    """The benchmark's tasks, in the paper's order, then the others, then those of control."""
+    from ..control.registry import CONTROL_TASKS
+
     known, wrong = all_tasks()
     tasks: list[dict[str, Any]] = [
         {
@@ -81,9 +83,19 @@ def list_tasks(options: ListOptions) -> Outcome:
                 ", ".join(task["objects"]),
             )
         )
+    control: list[dict[str, Any]] = [
+        {"name": name, "env_id": control_id(name), "objects": list(task.objects)}
+        for name, task in CONTROL_TASKS.items()
+    ]
+    control_rows = [("control task", "Gymnasium id", "objects")] + [
+        (task["name"], task["env_id"], ", ".join(task["objects"])) for task in control
+    ]
     for line in wrong:
         print(f"warp-deform: warning: {line}", file=sys.stderr)
-    return Outcome(data={"tasks": tasks, "warnings": wrong}, text=_table(rows))
+    return Outcome(
+        data={"tasks": tasks, "control_tasks": control, "warnings": wrong},
+        text=f"{_table(rows)}\n\n{_table(control_rows)}",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,7 +29,7 @@ from ..objects.cable import Cable, add_cable, cable_line
 from ..objects.colors import GRAY
 from ..tasks.free_space import FreeSpace
 from ..tasks.task import Layout, Snapshot, Stage
-from .cable_shape import CableShapeControl
+from .cable_goal import CableGoalTask
 from .led_cable import CABLE
 from .modes import ControlConfig
 
@@ -55,7 +55,7 @@ _AT_ONCE = 0.9
 """Share of the greatest speed at which it goes at most."""
 
 
-class PushCable(CableShapeControl):
+class PushCable(CableGoalTask):
     """Every bead as after other pushes."""
 
     name = "push-cable"

@@ -24,6 +24,7 @@ CONTROL_TASKS: dict[str, type[ControlTask]] = {
         Gather, Wire, Unknot,
     )
 }  # fmt: skip
+"""The tasks that are only for control, by their names; each has an id, see `warp-deform list`."""
 
 
 def control_task(task: str | Task) -> Task:

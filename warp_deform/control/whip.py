@@ -32,7 +32,7 @@ from ..tasks.ground_truth import Row, Rows
 from ..tasks.losses import lengths
 from ..tasks.task import Layout, Snapshot, Stage
 from ..xpbd.config import SolverConfig
-from .cable_shape import CableShapeControl
+from .cable_goal import CableGoalTask
 from .modes import ControlConfig
 from .smooth_plans import smooth_plan
 
@@ -48,7 +48,7 @@ _START = (0.5, -0.16)
 """Where the held end lies on average [m]; the cable lies across the middle of the table."""
 
 
-class Whip(CableShapeControl):
+class Whip(CableGoalTask):
     """Every bead as after another swing."""
 
     name = "whip"

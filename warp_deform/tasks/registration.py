@@ -46,7 +46,7 @@ def register_environments() -> None:
     for task in (*TASKS, *FURTHER_TASKS, *offered()):
         _register(task)
     for task in CONTROL_ALONE:
-        _register_control(f"WarpDeform/{_words(task)}-v{CONTROL_VERSION}", task)
+        _register_control(control_id(task), task)
 
 
 def register_task(task: Registered) -> Registered:
@@ -76,8 +76,12 @@ def register_task(task: Registered) -> Registered:
 
 
 def control_id(task: str) -> str:
-    """Gymnasium id of the control of `task`: of `cable-ring` `WarpDeform/CableRing-Control-v1`."""
-    return f"WarpDeform/{_words(task)}-Control-v{CONTROL_VERSION}"
+    """Gymnasium id of the control of `task`: of `cable-ring` `WarpDeform/CableRing-Control-v1`.
+
+    Tasks that are only for control need no such word: `whip` is `WarpDeform/Whip-v1`.
+    """
+    words = _words(task) + ("" if task in CONTROL_ALONE else "-Control")
+    return f"WarpDeform/{words}-v{CONTROL_VERSION}"
 
 
 def _register(task: str) -> None:

@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from fixtures.episode_samples import make_episode
@@ -19,8 +20,10 @@ from warp_deform import __version__
 from warp_deform.command import doctor
 from warp_deform.command import main as cli
 from warp_deform.command.main import CommandOptions, Outcome, Verb, main
+from warp_deform.control import CONTROL_TASKS
 from warp_deform.episodes import EpisodeWriter
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.tasks.registration import register_environments
 from warp_deform.tasks.registry import FURTHER_TASKS, TASKS
 
 
@@ -222,9 +225,14 @@ def test_the_shell_completes_verbs_flags_and_tasks(
 
 def test_list_keeps_its_contract(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--json"]) == 0
-    tasks = json.loads(capfd.readouterr().out)["tasks"]
+    listed = json.loads(capfd.readouterr().out)
+    tasks = listed["tasks"]
     names = [task["name"] for task in tasks]
     assert names == [*TASKS, *FURTHER_TASKS]
+    control = {task["name"]: task["env_id"] for task in listed["control_tasks"]}
+    assert list(control) == list(CONTROL_TASKS)
+    register_environments()
+    assert all(gymnasium.spec(name).kwargs["task"] == task for task, name in control.items())
     assert [task["name"] for task in tasks if task["benchmark"]] == list(TASKS)
     # the paper's tasks come first, in its order; a task of anybody's own may follow
     paper = [name for name in PAPER if name in TASKS]

@@ -21,10 +21,10 @@ from .control_task import ControlTask
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["CableShapeControl"]
+__all__ = ["CableGoalTask"]
 
 
-class CableShapeControl(ControlTask):
+class CableGoalTask(ControlTask):
     """A cable whose every bead is to be where another plan has led it."""
 
     cable: ClassVar[CableConfig] = CableConfig()

@@ -1,4 +1,4 @@
-"""Ports of published tasks: starts, scores by their sources, bits in any company, and cheats."""
+"""Tasks for control: starts, costs of their sources, bits in any company, gradients, cheats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tasks that are made for control: goals that can be reached, and scripts that reach them."""
+"""Swings and folds: goals that can be reached, scores by their sources, scripts that reach them."""
 
 from __future__ import annotations
 
