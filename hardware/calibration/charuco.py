@@ -100,7 +100,7 @@ def find_corners(rgb: np.ndarray, board: BoardSpec) -> Corners:
         total = (board.columns - 1) * (board.rows - 1)
         raise InputError(
             f"{count} of the board's {total} corners are seen, {_MIN_CORNERS} are needed; more "
-            "light, no glare, the whole board in the picture, and the right board?"
+            "light, no glare, the whole board in the picture; check that it is the configured board"
         )
     return Corners(ids.ravel(), np.asarray(pixels, dtype=np.float64).reshape(-1, 2))
 

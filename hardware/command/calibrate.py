@@ -65,7 +65,7 @@ class _PlaceFlags(_SetupFlags):
     """Joint positions [rad] of the home pose, from which pictures are taken. The default is what
     --setup has stored, or else the vendor's. They are stored with what is measured."""
     workspace: WorkspaceFlag = None
-    """Ends of the workspace along x and y [m]. The default is what --setup has stored, or else
+    """Limits of the workspace along x and y [m]. The default is what --setup has stored, or else
     0.335 0.635 -0.3 0.3. They are stored with what is measured."""
 
 

@@ -31,7 +31,7 @@ class EmulateOptions(CommandOptions):
     object_width: Annotated[float | None, arg(metavar="M"), FlagRange(0.0, 0.08)] = None
     """Width [m] of the object that every grasp finds. The default is no object."""
     workspace: WorkspaceFlag = None
-    """Ends of the workspace [m] along x and y, into which the chain is tossed, as of `run`."""
+    """Limits of the workspace [m] along x and y, into which the chain is tossed, as of `run`."""
     paced: bool = False
     """Run at 1 kHz by the wall clock, as a robot does. The default is as fast as possible, in
     lock-step."""

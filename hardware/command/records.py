@@ -21,7 +21,7 @@ class ScoreOptions(CommandOptions):
     """Compute the scores of recorded episodes anew, from their masks."""
 
     episodes: _Folders
-    """Folders that `run` or `collect` recorded; interrupted ones are welcome."""
+    """Folders that `run` or `collect` recorded; interrupted ones are accepted."""
 
 
 def score(options: ScoreOptions) -> Outcome:
@@ -87,7 +87,7 @@ class ReplayOptions(CommandOptions):
     """Compute masks and overlaps of an episode again from its pictures, and compare them."""
 
     episode: Annotated[Positional[Path], arg(metavar="EPISODE")]
-    """Folder that `run` or `collect` recorded; an interrupted one is welcome."""
+    """Folder that `run` or `collect` recorded; an interrupted one is accepted."""
     video: Annotated[Path | None, arg(metavar="FILE.mp4")] = None
     """Also write a film of the plans, with two pictures a second."""
 

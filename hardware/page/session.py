@@ -170,7 +170,7 @@ class OperatorSession:
             self._take(STOP, "stopped", post)
             return
         if time.monotonic() - self._halted < HALTS_S:
-            raise InputError("it was told to stop already; where it goes on, press Stop once more")
+            raise InputError("a stop was asked for already; if the arm moves on, press Stop again")
         self._halted = time.monotonic()
         self._halt()
         self._do_line(Job("line", {"text": "Stop was pressed at the page"}), post)

@@ -70,7 +70,7 @@ class RigConfig:
     """Joint positions of the home pose [rad]. A setup has them from its calibration, and others are
     refused. With --camera sim they may be any at which the arm can wait."""
     workspace: WorkspaceFlag = None
-    """Ends of the workspace along x and y [m], with the same rules as --home."""
+    """Limits of the workspace along x and y [m], with the same rules as --home."""
     joint_speed: Annotated[float, FlagRange(1e-3, 0.2)] = 0.05
     """Share of the joints' greatest speeds, between poses. At most 0.2; begin with 0.05."""
 

@@ -46,8 +46,8 @@ class RefineOptions(RefineSettings, CommandOptions):
     evaluations: Annotated[int, arg(metavar="N"), COUNT] = 250
     """With --trajectories: simulated episodes that the search for one may spend."""
     horizon: Annotated[int | None, arg(metavar="N"), COUNT] = None
-    """With --trajectories: control steps after which picks and places are given up that are led at
-    20 Hz. By default the environment's, 200 for tasks of the benchmark."""
+    """With --trajectories: control steps after which a replay of picks and places at 20 Hz is given
+    up. By default the environment's, 200 for tasks of the benchmark."""
     video: Annotated[Path | None, arg(metavar="FILE")] = None
     """With --trajectories: film two refined episodes beside their originals into this MP4."""
 

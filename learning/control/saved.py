@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from torch import nn
 
@@ -11,10 +11,11 @@ from warp_deform.errors import InputError
 
 from ..runs.folder import RunFolder, read_snapshot
 from .actor import Actor, PlanActor
+from .settings import GradientMethod
 
 __all__ = ["load_actor", "save_actor"]
 
-_METHODS = ("apg", "plan", "shac")
+_METHODS = sorted(get_args(GradientMethod))
 
 
 def save_actor(

@@ -30,8 +30,8 @@ class ControlTrainSettings:
     """Gradients of whole episodes (apg), or of short horizons with a critic (shac), or of plans: a
     network that plans a whole swing from its first observation (plan)."""
     minutes: Annotated[float, arg(metavar="M"), FlagRange(0.01, 1e5)] = 5.0
-    """CPU minutes for the updates, as far as the costs measured at the beginning tell. Validation
-    is not covered."""
+    """CPU minutes for the updates, planned from the costs that are measured at the beginning.
+    Validation is not covered."""
     updates: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Number of updates, in place of --minutes."""
     worlds: Annotated[int, arg(metavar="N"), FlagRange(1, 4096)] = 32
@@ -42,7 +42,7 @@ class ControlTrainSettings:
     horizon: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Control steps of an episode. By default, the task's; 200 for tasks of the benchmark."""
     lr: Annotated[float | None, arg(metavar="LR"), FlagRange(1e-12, 1e3)] = None
-    """Step size of Adam at first; it falls linearly to 0. By default, the method's."""
+    """Learning rate of Adam at first; it falls linearly to 0. By default, the method's."""
     snapshots: Annotated[int, arg(metavar="N"), COUNT] = 5
     """Number of snapshots, evenly spread."""
     validate: Annotated[int, arg(metavar="N"), FlagRange(1, 50_000)] = 64

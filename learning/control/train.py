@@ -64,7 +64,7 @@ class ControlTrainConfig(ControlTrainSettings):
     own: ApgConfig | ShacConfig | PlanConfig | None = None
     """Of the method, in place of its defaults; `lr` changes it."""
     progress: bool = True
-    """Tell of it on stderr, see `warp_deform.support.progress`."""
+    """Show progress on stderr, see `warp_deform.support.progress`."""
 
     def __post_init__(self) -> None:
         if self.method not in _METHODS:

@@ -57,7 +57,7 @@ class DistillConfig(DistillSettings):
     """The settings of a distillation, checked."""
 
     progress: bool = True
-    """Tell of it on stderr, see `warp_deform.support.progress`."""
+    """Show progress on stderr, see `warp_deform.support.progress`."""
 
     def __post_init__(self) -> None:
         AgentDescription(task=self.task, agent=self.learner, config={})  # refuses a misfit

@@ -25,7 +25,7 @@ class DistillSettings:
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """Name of the task, see `warp-deform list`."""
     minutes: Annotated[float, arg(metavar="M"), FlagRange(0.1, 1e5)] = 60.0
-    """CPU minutes for all but the test, as far as the costs measured at the beginning tell."""
+    """CPU minutes for all but the test, planned from the costs measured at the beginning."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder for everything. The policy is the run in DIR/run."""
     agent: Literal["auto", "transporter", "goal-split", "goal-stack"] = "auto"

@@ -94,7 +94,7 @@ def read_recording(source: Path, *, number: int, steps: int, task: str) -> Episo
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         # an InputError is a ValueError, whose text says it all
         said = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        raise InputError(f"{where} is not as the original writes it: {said}") from error
+        raise InputError(f"{where} is not in the format of the original: {said}") from error
     made = tuple(
         Step(
             color=maps[t][0],

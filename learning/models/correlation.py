@@ -25,7 +25,7 @@ def correlate_direct(features: Tensor, kernels: Tensor) -> Tensor:
 
 
 def correlate_fft(features: Tensor, kernels: Tensor) -> Tensor:
-    """As `correlate_direct`, through the convolution theorem."""
+    """Mean products (B, R, H - S, W - S) as `correlate_direct`, through the convolution theorem."""
     size = kernels.shape[-1]
     rows, columns = features.shape[-2:]
     # Periodic images do not reach the part that is kept, whatever the padding to smooth sizes.

@@ -118,7 +118,7 @@ class MixtureMLP(nn.Module):
         self.register_buffer("turns", turns, persistent=False)
 
     def forward(self, state: Tensor) -> tuple[Mixture, Tensor | None]:
-        """The mixture, and lift logits where there is a choice."""
+        """The mixture of states (B, d), and lift logits where there is a choice."""
         angles = state * self.turns
         z = torch.cat([state, angles.cos(), angles.sin()], dim=1)
         h = torch.cat([functional.relu(self.first(z)), z], dim=1)

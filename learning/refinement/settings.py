@@ -46,5 +46,5 @@ class TrajectorySettings(FolderSettings):
     evaluations: int = 250
     """Simulated episodes that the search for one may spend; one with derivatives counts 2.5."""
     horizon: int | None = None
-    """Control steps after which picks and places are given up that are led at 20 Hz; None: as the
+    """Control steps after which a replay of picks and places at 20 Hz is given up; None: as the
     environment."""

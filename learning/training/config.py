@@ -31,7 +31,7 @@ class TrainConfig(TrainSettings):
     network: TransporterConfig | None = None
     """In place of the preset's; rotations and lifts are the task's in any case."""
     progress: bool = True
-    """Tell of it on stderr, see `warp_deform.support.progress`."""
+    """Show progress on stderr, see `warp_deform.support.progress`."""
 
     def __post_init__(self) -> None:
         find_task(self.task)

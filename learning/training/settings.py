@@ -56,7 +56,7 @@ class TrainMethod:
     batch: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Transitions per step. By default, the preset's."""
     lr: Annotated[float | None, arg(metavar="LR"), FlagRange(1e-12, 1e3)] = None
-    """Step size of Adam. By default, the preset's."""
+    """Learning rate of Adam. By default, the preset's."""
     snapshots: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Number of snapshots, evenly spread. By default, `paper` keeps 10, and `fast` keeps one after
     7.5, 15, 30, 60 and 100 % of the steps."""
@@ -71,8 +71,8 @@ class TrainMethod:
     """Also stop after this many snapshots in a row that brought nothing; 0: never. This needs
     validation. By default, 2 for `fast` agents over pictures, and 0 for others."""
     precision: PrecisionName = "auto"
-    """In which the networks of agents over pictures convolve. `auto` takes bfloat16 for `fast` on a
-    processor that multiplies it natively, and float32 otherwise."""
+    """Number format of the convolutions in agents that see pictures. `auto` takes bfloat16 for
+    `fast` on a processor that multiplies it natively, and float32 otherwise."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the network computes. Under `torchrun`, each process takes one GPU."""
     untrained: bool = False

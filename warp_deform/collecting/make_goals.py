@@ -63,7 +63,7 @@ def make_goals(
     began = time.perf_counter()
     if kind == CONSTRUCTED:
         if demonstrator != "scripted":
-            raise InputError(f"nobody demonstrates constructed goals: leave out {demonstrator!r}")
+            raise InputError(f"constructed goals need no demonstrator: leave out {demonstrator!r}")
         check_seeds(seed, count)
         _construct(task, Path(out), range(seed, seed + count), robot)
         attempts = count

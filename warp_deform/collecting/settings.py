@@ -26,7 +26,7 @@ class CollectSettings:
     """What to collect, and how."""
 
     task: Annotated[Positional[str], arg(metavar="TASK")]
-    """Name of the task; `warp-deform list` shows all but those for `--control` alone."""
+    """Name of the task; `warp-deform list` shows all. Those for control need `--control`."""
     episodes: Annotated[int, arg(aliases=["-n"], metavar="N"), COUNT] = 10
     """How many successes to keep: the first N in the order of their seeds."""
     seed: Annotated[int, SEED] = 0

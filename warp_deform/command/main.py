@@ -273,11 +273,12 @@ def _usage() -> str:
 
 def _completion() -> str:
     """The script that `--completion` prints: flags are those of every verb's help."""
+    from ..control.registry import CONTROL_TASKS
     from ..tasks.external import offered
     from ..tasks.registry import FURTHER_TASKS, TASKS
     from .completion import completion_script
 
-    tasks = (*TASKS, *FURTHER_TASKS, *offered())
+    tasks = (*TASKS, *FURTHER_TASKS, *offered(), *CONTROL_TASKS)
     words: dict[str, list[str]] = {}
     for name, verb in VERBS.items():
         said = io.StringIO()

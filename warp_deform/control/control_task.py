@@ -53,7 +53,7 @@ class ControlTask(Task):
         return None
 
     def plan_for(self, layout: Layout, rng: np.random.Generator) -> np.ndarray | None:
-        """The same, of an episode that starts like `layout`."""
+        """Actions (T, 3) of a plan for an episode that starts like `layout`; see `plan_to_goal`."""
         return self.plan_to_goal(rng)
 
     def is_goal(self, particle_q: np.ndarray) -> bool:

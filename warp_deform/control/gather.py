@@ -103,7 +103,7 @@ class Gather(LedCable):
         particle_q: Tensor,
         body_q: Tensor,
     ) -> Tensor:
-        """DLO-Lab's cost of every state, lengths in its metres."""
+        """DLO-Lab's cost of every state (W,), without unit; lengths are in its metres."""
         rope, boxes = self.in_source(particle_q), self.in_source(body_q[..., :3])
         away = lengths(rope[:, :, None] - boxes[:, None])  # (W, P, 3)
         ends = away[:, [0, -1]].amin(-1)

@@ -29,8 +29,8 @@ CONTROL_MODES: dict[str, tuple[str, ...]] = {
 }
 """What the numbers of an action are called, by mode.
 
-In others' words these are `pd_ee_target_delta_pos`, `pd_ee_target_delta_pose`, a Cartesian
-`pd_joint_vel` and an absolute pose.
+In others' words these are `pd_ee_target_delta_pos`, `pd_ee_target_delta_pose`, a Cartesian velocity
+and an absolute pose.
 """
 _KNOTS = 4
 """Knots a step of a tip that changes its velocity evenly."""

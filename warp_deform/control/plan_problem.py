@@ -119,7 +119,7 @@ class Search:
         return self._noted(self._rows, numbers, losses)
 
     def refined(self, numbers: np.ndarray) -> np.ndarray:
-        """The same plans with the numbers that a descent wants."""
+        """The plans (G, K, 3) with as many numbers (G, K', 3) as a descent wants."""
         return cast(DifferentiableProblem, self.problem).refined(numbers)
 
     def refine(self) -> None:

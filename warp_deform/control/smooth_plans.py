@@ -31,7 +31,7 @@ def numbers_of(knots: np.ndarray, steps: int) -> np.ndarray:
 
 
 def tensor_actions_of(knots: Tensor, steps: int) -> Tensor:
-    """`actions_of` for tensors of torch."""
+    """Actions (..., T, 3) of free numbers (..., K, 3), as `actions_of`, of tensors in torch."""
     numbers = knots.new_tensor(_spread(knots.shape[-2], steps)) @ knots
     return numbers / (1 + (numbers**2).sum(dim=-1, keepdim=True)).sqrt()
 

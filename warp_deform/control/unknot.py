@@ -113,7 +113,7 @@ class Unknot(LedCable):
         particle_q: Tensor,
         body_q: Tensor,
     ) -> Tensor:
-        """DLO-Lab's cost of every state, lengths in its metres."""
+        """DLO-Lab's cost of every state (W,), without unit; lengths are in its metres."""
         import torch
 
         rope = self.in_source(particle_q)

@@ -113,7 +113,7 @@ class WhipTarget(Whip):
         particle_q: Tensor,
         body_q: Tensor,
     ) -> Tensor:
-        """Distance of the free end from the target [m]."""
+        """Distance (W,) of the free end from the target [m]."""
         goals = particle_q.new_tensor(np.stack([layout.targets[0] for layout in layouts]))
         return lengths(particle_q[:, -1] - goals)
 

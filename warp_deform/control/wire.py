@@ -110,7 +110,7 @@ class Wire(LedCable):
         particle_q: Tensor,
         body_q: Tensor,
     ) -> Tensor:
-        """DLO-Lab's cost of every state, lengths in its metres."""
+        """DLO-Lab's cost of every state (W,), without unit; lengths are in its metres."""
         places = np.stack([layout.targets for layout in layouts])
         rope, target = self.in_source(particle_q), self.in_source(particle_q.new_tensor(places))
         away = lengths(rope[:, :, None] - target[:, None])  # (W, P, P)

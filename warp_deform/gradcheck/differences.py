@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..rollout.differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
+from ..rollout.differentiable import DifferentiableRollout, Gradients
 from ..rollout.rollouts import GripPath
 from ..support.quaternion import quat_by_rotation
 from ..worlds.worlds import Worlds
+from ..xpbd.config import WORLD_PARAMETERS
 from ..xpbd.packing.parts import PARTS, parts
 from .draws import Draw, touching_of
 from .limits import RATIO, central, kink

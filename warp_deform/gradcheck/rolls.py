@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..rollout.differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
+from ..rollout.differentiable import DifferentiableRollout, Gradients
 from ..worlds.worlds import Worlds
+from ..xpbd.config import WORLD_PARAMETERS
 from ..xpbd.packing.parts import PARTS, set_parts
 from .branches import counted, taken
 from .draws import Draw, touching_of

@@ -96,6 +96,9 @@ def edges_and_pairs(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def boundary_loops(faces: np.ndarray) -> list[list[int]]:
     """The boundaries of a surface, each as its vertices in order, longest first.
 
+    Args:
+        faces: vertices of its triangles (F, 3)
+
     Raises:
         InputError: two boundaries meet in a vertex.
     """

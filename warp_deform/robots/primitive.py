@@ -204,7 +204,7 @@ def carry(
     hover: float,
     config: PrimitiveConfig,
 ) -> tuple[Motion, GripPath]:
-    """Lift, carry and lower what `grasp` holds, then wait; the path for the solver, and the tip's.
+    """Lift, carry and lower what `grasp` holds, then wait.
 
     A bead or a body is lowered until it meets something, a vertex of a fabric or a bag only where
     `sheet_meets` says so, else to a fixed height. The retreat to `hover` follows the release and is
@@ -212,9 +212,16 @@ def carry(
     be, is carried at the height it was taken at: it would be pressed through what lies under it.
 
     Args:
+        action: pick x, y, yaw, place x, y, yaw, lift (7,) [m, rad]
+        grasp: what the tip holds, and its height when it took it
         stage: speeds and pauses
         floor: lowest height of the tip over the place point [m], where what is held rests on the
             table
+        hover: height of the tip after the release [m]
+        config: of the primitive
+
+    Returns:
+        The tip's motion with its retreat, and the path of what it holds, for the solver.
     """
     pick, place, lift = action[:3], action[3:6], float(action[6])
     if grasp.body is not None:

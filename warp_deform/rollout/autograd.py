@@ -12,10 +12,11 @@ from torch.autograd.function import once_differentiable
 
 from ..errors import InputError
 from ..objects.push import Push
+from ..xpbd.config import WORLD_PARAMETERS
 from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
 from ..xpbd.packing.parts import PARTS
-from .differentiable import WORLD_PARAMETERS, DifferentiableRollout, Gradients
+from .differentiable import DifferentiableRollout, Gradients
 from .rollouts import GripPath
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..objects.push import Push
 from ..support.checked import POSITIVE, check_number
+from ..xpbd.config import WORLD_PARAMETERS
 from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
 from ..xpbd.lanes.tape import Kind
@@ -20,8 +21,6 @@ from .rollouts import GripPath, prepare
 from .world_rows import WorldRows
 
 __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is here
-
-WORLD_PARAMETERS = ("damping", "table_friction", "contact_friction", "stiffness")
 
 
 @dataclass(frozen=True, eq=False)

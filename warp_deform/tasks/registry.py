@@ -57,7 +57,7 @@ TASKS: dict[str, type[Task]] = {
 """Task classes by the paper's names, in the paper's order."""
 
 FURTHER_TASKS: dict[str, type[Task]] = {cls.name: cls for cls in (CableMaskGoal,)}
-"""Tasks that are not of the benchmark: of the paper's physical experiments."""
+"""Other tasks of this package: so far that of the paper's physical experiments."""
 
 
 _OURS = TASKS | FURTHER_TASKS

@@ -36,10 +36,7 @@ if TYPE_CHECKING:  # annotations only: listing the tasks loads no simulator
 
     from ..rendering.topdown import TopDown
 
-__all__ = ["PHYSICS", "Action", "Layout", "Snapshot", "Stage", "Task"]
-
-PHYSICS = ("damping", "table_friction", "contact_friction", "stiffness")
-"""What of the physics may differ between episodes, see `SolverFusedXPBD.set_world`."""
+__all__ = ["Action", "Layout", "Snapshot", "Stage", "Task"]
 
 Action = np.ndarray
 """(7,) float64: pick x, y [m], yaw [rad], place x, y [m], yaw [rad], lift [m]."""
@@ -62,7 +59,7 @@ class Layout:
             it
         configs: by their number, objects whose config differs from the task's in this episode: the
             colour of a bag, colour, size and mass of a body that is one box
-        physics: those of `PHYSICS` that differ from the task's in this episode
+        physics: of `warp_deform.xpbd.config.WORLD_PARAMETERS`, those that differ from the task's
         look: how pictures of this episode depart from the truth, where the task draws masks
     """
 

@@ -28,7 +28,8 @@ from ..solver.solver import SolverFusedXPBD
 from ..support.checked import real_array
 from ..tasks.free_space import FreeSpace
 from ..tasks.registry import task_of
-from ..tasks.task import PHYSICS, Layout, Snapshot, Task
+from ..tasks.task import Layout, Snapshot, Task
+from ..xpbd.config import WORLD_PARAMETERS
 from .episode import (
     LAYOUT_STREAM,
     Carry,
@@ -217,7 +218,7 @@ class Worlds:
     def _set_physics(self, slot: int, layout: Layout) -> None:
         """Give a slot the physics of its episode."""
         usual, own = self.task.solver, layout.physics
-        self.solver.set_world(slot, **{n: own.get(n, getattr(usual, n)) for n in PHYSICS})
+        self.solver.set_world(slot, **{n: own.get(n, getattr(usual, n)) for n in WORLD_PARAMETERS})
 
     def _construct_goals(
         self, layouts: Mapping[int, Layout], seeds: Mapping[int, int]
@@ -285,12 +286,11 @@ class Worlds:
         return Execution(action)
 
     def lead(self, actions: Mapping[int, np.ndarray]) -> dict[int, Carry]:
-        """Move the tips down to what they take, and stop there: how they would carry it, by slot.
+        """Move the tips of actions (7,) down to what they take: how they would carry it, by slot.
 
         Slots whose tip takes nothing, or cannot go there, are left out.
         """
-        executions = {slot: self._checked(slot, action) for slot, action in actions.items()}
-        return lead_down(self, executions)
+        return lead_down(self, {slot: self._checked(slot, a) for slot, a in actions.items()})
 
     def control_loop(self, rate: float = 20.0) -> ControlLoop:
         """The loop that leads tips of slots at `rate` [Hz]; `TipControl` drives it.

@@ -8,7 +8,10 @@ from ..errors import InputError
 from ..support.checked import NOT_NEGATIVE, POSITIVE, Interval, check_fields
 from .guards import GuardLimits
 
-__all__ = ["SolverConfig"]
+__all__ = ["WORLD_PARAMETERS", "SolverConfig"]
+
+WORLD_PARAMETERS = ("damping", "table_friction", "contact_friction", "stiffness")
+"""What may differ from world to world, see `set_world`, and has derivatives."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +42,8 @@ class SolverConfig:
     rest_seconds: float = 0.05
     """At rest for so long ends a world's rollout [s]."""
     viscosity: float = 0.0
-    """Rate at which neighbours in a fabric take on one velocity, but for its turning [1/s]; refused
-    where it would be unstable with the fabrics' meshes and the substep."""
+    """Damping rate of the relative velocity between neighbours in a fabric, rigid rotation left out
+    [1/s]; refused where it would be unstable with the fabrics' meshes and the substep."""
     sleep_speed: float = 0.0
     """Particles of fabrics with a lower mean speed fall asleep where something carries them [m/s];
     0: none does."""

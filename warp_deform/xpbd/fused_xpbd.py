@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..support.checked import COUNT, NOT_NEGATIVE, POSITIVE, check_number
 from ..support.threads import default_threads
 from .bundle import write_bundle
-from .config import SolverConfig
+from .config import WORLD_PARAMETERS, SolverConfig
 from .group_launch import GroupLaunch
 from .guards import PhysicsError, Problem, WatchValues
 from .kernels.forward import forward_kernel
@@ -109,9 +109,9 @@ class FusedXPBD:
         Where one changes, no fabric sleeps on.
         """
         for name, value in parameters.items():
-            known = ("damping", "table_friction", "contact_friction", "stiffness")
-            if name not in known:
-                raise InputError(f"a world has no parameter {name!r}; it has {', '.join(known)}")
+            if name not in WORLD_PARAMETERS:
+                known = ", ".join(WORLD_PARAMETERS)
+                raise InputError(f"a world has no parameter {name!r}; it has {known}")
             check_number(value, name, POSITIVE if name == "stiffness" else NOT_NEGATIVE)
             place = self.data.per_world(f"group.{name}", world)
             if (place != place.dtype.type(value)).any():

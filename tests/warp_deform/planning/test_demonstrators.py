@@ -119,7 +119,7 @@ def test_the_command_refuses_an_unknown_demonstrator(capsys: pytest.CaptureFixtu
 def test_constructed_goals_take_no_demonstrator(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["goals", LINE, "--out", "x", "--kind", "constructed", "--demonstrator", "mpc"]
     assert main(arguments) == 2
-    assert "nobody demonstrates constructed goals" in capsys.readouterr().err
+    assert "constructed goals need no demonstrator" in capsys.readouterr().err
 
 
 # -- acting

@@ -12,6 +12,7 @@ import warp as wp
 from ...objects.push import MOST_PUSHES
 from ...support.quaternion import quat_rotate
 from ..bodies.box_box import POINTS
+from ..config import WORLD_PARAMETERS
 from ..springs.tether import NO_TETHER
 from .groups import NUMPY, PackedWorlds
 from .mirrored import Mirrored
@@ -143,7 +144,7 @@ class SolverData(PackedWorlds):
             ("shape_start", shape_start[:-1]),
         ):
             self.add_constant(f"group.{name}", np.asarray(values), wp.int32, np.int32)
-        for name in ("active", "damping", "table_friction", "contact_friction", "stiffness",
+        for name in ("active", *WORLD_PARAMETERS,
                      "calm_steps", "calm_after", "least_steps", "most_steps"):  # fmt: skip
             self.add_array(f"group.{name}", groups, t.V, (L,), number)
         self.add_array("group.gravity", groups, t.V3, (3, L), number)
@@ -274,7 +275,7 @@ class SolverData(PackedWorlds):
         return self.lane_of(self.arrays[name], world)
 
     def lane_of(self, array: Mirrored, world: int) -> np.ndarray:
-        """The same of an array that is not the solver's own."""
+        """A world's rows (P, ...) of an array in lanes that is not the solver's own, a view."""
         group, lane = divmod(int(self.slot[world]), self.lanes)
         rows = slice(self.group_particle[group], self.group_particle[group + 1])
         return array.view[rows][..., lane]

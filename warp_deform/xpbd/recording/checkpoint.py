@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..config import WORLD_PARAMETERS
 from ..packing.data import WATCHED, SolverData
 from ..packing.mirrored import Mirrored
 
@@ -23,9 +24,8 @@ INPUTS = (
     "springs.length", "springs.compliance", "springs.limit", "springs.floor", "topology.radius",
     "pairs.distance", "particles.w0", "particles.tether", "bodies.w0", "bodies.inertia",
     "bodies.inverse_inertia", "shapes.friction", "shapes.center", "shapes.half",
-    "shapes.rotation", "group.active", "group.damping", "group.table_friction",
-    "group.contact_friction", "group.stiffness", "group.gravity", "group.calm_steps",
-    "group.calm_after", "group.least_steps",
+    "shapes.rotation", "group.active", *(f"group.{name}" for name in WORLD_PARAMETERS),
+    "group.gravity", "group.calm_steps", "group.calm_after", "group.least_steps",
     "group.most_steps", "grips.knot_end", "grips.offset", "grips.turn", "grips.lower_start",
     "grips.lower_end", "grips.push", "grips.push_steps", "grips.push_acceleration", "grips.time",
     "grips.position", "grips.rotation",

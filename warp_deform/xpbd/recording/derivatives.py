@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..config import WORLD_PARAMETERS
 from ..lanes.tape import Kind
 from ..packing.data import SolverData
 from ..packing.mirrored import Mirrored
@@ -16,8 +17,8 @@ __all__ = ["Derivatives", "spring_rows"]
 
 _BODY = ("x", "q", "v", "omega")
 _ADJOINT_OF = {"particles.x": "x", "particles.v": "v"} | {f"bodies.{n}": f"body.{n}" for n in _BODY}
-_OUT = ("x", "v", "damping", "table_friction", "contact_friction", "stiffness", "time", "position",
-        "rotation", "fired", *(f"body.{n}" for n in _BODY), "body.w")  # fmt: skip
+_OUT = ("x", "v", *WORLD_PARAMETERS, "time", "position", "rotation", "fired",
+        *(f"body.{n}" for n in _BODY), "body.w")  # fmt: skip
 _OF_PARTS = ("mass", "radius", "softness", "rest")
 
 
@@ -50,7 +51,7 @@ class Derivatives:
         arrays |= {name: self._mirrored(particles, t.V, (L,)) for name in ("w", "mass", "radius")}
         springs = _spring_places(data)[1]
         arrays |= {name: self._mirrored(springs, t.V, (L,)) for name in ("softness", "rest")}
-        for name in ("damping", "table_friction", "contact_friction", "stiffness"):
+        for name in WORLD_PARAMETERS:
             arrays[name] = self._mirrored(groups, t.V, (L,))
         arrays["time"] = self._mirrored(knots, t.S, ())
         arrays["position"] = self._mirrored(knots, t.R3, (3,))
