@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import newton
     from torch import Tensor
 
-__all__ = ["CABLE", "LedCable", "fix", "pin"]
+__all__ = ["CABLE", "LedCable", "fix", "pin", "weigh_down"]
 
 _SPACING = 0.02
 """Between two vertices of the source's ropes [m]."""
@@ -39,6 +39,14 @@ CABLE = SolverConfig(
 def pin(builder: newton.ModelBuilder, cable: Cable, bead: int) -> None:
     """Fix a bead where it is: it has no mass, so nothing moves it."""
     builder.particle_mass[cable.particles[bead]] = 0.0
+
+
+def weigh_down(builder: newton.ModelBuilder, cable: Cable, bead: int) -> None:
+    """Make a bead as heavy as 10,000: no pull moves it, but what a tip leads does not go through it.
+
+    Between a pinned bead and a held one nothing acts, since neither has a mass to be moved.
+    """
+    builder.particle_mass[cable.particles[bead]] *= 1e4
 
 
 def fix(builder: newton.ModelBuilder, box: Box) -> None:

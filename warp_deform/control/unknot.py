@@ -1,7 +1,7 @@
-"""unknot: untie a loose overhand knot in a cable, one end of which is pinned.
+"""unknot: untie a loose overhand knot in a cable, one end of which is weighed down.
 
 Definition (ours). A cable of 50 beads a diameter apart, 0.7 m, lies in a loose overhand knot. Its
-third bead is pinned where it lies. The tip holds bead 37, which lies in the knot between the last
+third bead is weighed down where it lies. The tip holds bead 37, which lies in the knot between the last
 two crossings, and keeps it. It has 100 steps of 50 ms, at up to 1 m/s. Solved: the cable has no
 knot, see `knots.untied`.
 
@@ -13,8 +13,7 @@ Strands must not pass through each other, by which a knot that is drawn tight wo
 Here the cable would stretch first: beads touch before strands cross, an overlap is undone at once
 (`recovery`), and a link of more than 1.15 times its length makes a guard fire, which ends the
 episode. For one link to go through another between beads that do not overlap, the squares of their
-lengths have to sum to four spacings' squares. One pair is left out: nothing moves the held bead or
-the pinned one, so a tip that aims at the pin leads the one into the other.
+lengths have to sum to four spacings' squares. A held bead that is led at the weight pushes it aside.
 
 Differences. DLO-Lab has two arms, which hold vertices 2 and 37 of a rope of elastic rods, in a knot
 from a file, with 100 steps of 20 ms or more; radius, mass and stiffness vary there, and an episode
@@ -39,7 +38,7 @@ from ..tasks.losses import lengths
 from ..tasks.task import Layout, Snapshot
 from ..xpbd.guards import GuardLimits
 from .knots import overhand_knot, untied
-from .led_cable import CABLE, LedCable, pin
+from .led_cable import CABLE, LedCable, weigh_down
 
 if TYPE_CHECKING:
     import newton
@@ -55,12 +54,12 @@ UNTIE = np.array(
     + [[0.0, 0.1, -0.075], [0.0, 0.0, -0.075], [0.0, 0.0, 0.0]]
 )
 """A plan of `SmoothPlayer` that unties: up, so that the end slips out under the strand over it, and
-away from the pinned end."""
+away from the heavy end."""
 
-_PINNED = (0.45, -0.35)
-"""Where the pinned bead lies on average [m]."""
+_HEAVY = (0.45, -0.35)
+"""Where the heavy bead lies on average [m]."""
 _SHIFT = 0.01
-"""Spread of the pinned bead along x and y [m]."""
+"""Spread of the heavy bead along x and y [m]."""
 _TURN = 0.1
 """Spread of the knot's direction [rad]."""
 _LOOPS = (1.4, 1.7)
@@ -81,29 +80,29 @@ class Unknot(LedCable):
     held_particle = 37
 
     cable: ClassVar[CableConfig] = CableConfig(beads=50, radius=CableConfig().spacing / 2)
-    pinned: ClassVar[int] = 2
+    heavy: ClassVar[int] = 2
 
     def add_objects(self, builder: newton.ModelBuilder) -> tuple[Cable, ...]:
         """Add the cable."""
         cable = add_cable(builder, self.cable, self._knot(1.5, 0.0))
-        pin(builder, cable, self.pinned)
+        weigh_down(builder, cable, self.heavy)
         return (cable,)
 
     def sample(self, rng: np.random.Generator, space: FreeSpace) -> Layout:
-        """The cable in a knot; targets (1, 3): the pinned bead."""
+        """The cable in a knot; targets (1, 3): the heavy bead."""
         beads = self._knot(rng.uniform(*_LOOPS), rng.normal(0.0, _TURN))
         beads[:, :2] += rng.normal(0.0, _SHIFT, 2)
-        return Layout(particle_q=beads, body_q=np.zeros((0, 7)), targets=beads[[self.pinned]])
+        return Layout(particle_q=beads, body_q=np.zeros((0, 7)), targets=beads[[self.heavy]])
 
     def _knot(self, loops: float, turn: float) -> np.ndarray:
-        """Beads (50, 3) [m], from the pinned end on along y, which is turned by `turn` [rad]."""
+        """Beads (50, 3) [m], from the heavy end on along y, which is turned by `turn` [rad]."""
         beads = overhand_knot(self.cable.beads, self.cable.spacing, loops)
         along, across = (
             np.array([-np.sin(turn), np.cos(turn)]),
             np.array([np.cos(turn), np.sin(turn)]),
         )
         beads[:, :2] = beads[:, 1:2] * across - beads[:, :1] * along
-        beads[:, :2] += _PINNED - beads[self.pinned, :2]
+        beads[:, :2] += _HEAVY - beads[self.heavy, :2]
         return beads
 
     def losses(
