@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..support.checked import real_array
+from ..support.checked import POSITIVE, Interval, check_number, real_array
 
 __all__ = ["overhand_knot", "untied"]
 
@@ -12,6 +12,8 @@ _OPENED = 0.6
 """How much of the trefoil is cut away on either side of a lobe's end [rad]."""
 _SHAKEN = 1e-5
 """By how much of a link points are shaken before they are looked at."""
+_LOOPS = Interval(low=1.0, high=100.0)
+"""Sizes of loops, in thirds of their reach in spacings."""
 _RISE = 0.55
 """Height of the strands above and below the middle, so that they touch where they cross."""
 
@@ -21,7 +23,13 @@ def overhand_knot(beads: int, spacing: float, loops: float) -> np.ndarray:
 
     A trefoil that is opened at one of its lobes, whose ends are bent outwards. Its lobes reach
     three times `loops` spacings from its centre, the origin, and the lowest bead touches the table.
+
+    Raises:
+        InputError: `spacing` is not positive, `loops` is below 1, where strands would lie in each
+            other, or there are too few beads to go round the knot.
     """
+    check_number(spacing, "spacing", POSITIVE)
+    check_number(loops, "loops", _LOOPS)
     t = np.linspace(_OPENED - np.pi, np.pi - _OPENED, 400)
     x, y = np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t)
     knot = np.column_stack([loops * x, loops * y, -_RISE * np.sin(3 * t)])
@@ -29,6 +37,8 @@ def overhand_knot(beads: int, spacing: float, loops: float) -> np.ndarray:
     last = _tail(knot[-1], knot[-1] - knot[-2], loops)
     curve = np.concatenate([first[::-1], knot, last])
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
+    inner = way[len(first) + len(knot) - 1] - way[len(first)]
+    check_number(beads, "beads", Interval(low=int(np.ceil(inner)) + 2, whole=True))
     at = way[-1] / 2 + np.arange(beads) - (beads - 1) / 2
     points = np.column_stack([np.interp(at, way, column) for column in curve.T])
     points[:, 2] += 0.5 - points[:, 2].min()
@@ -64,12 +74,11 @@ def untied(points: np.ndarray) -> bool:
     if len(chain) > 1:
         # beads on a table lie in one plane, where "through" has no meaning; strands that do not
         # touch go by each other as before
+        chain = chain - chain.mean(axis=0)
+        chain /= max(np.abs(chain).max(), np.finfo(float).tiny)  # products of lengths stay finite
         links = np.linalg.norm(np.diff(chain, axis=0), axis=1)
-        chain = (
-            chain
-            - chain.mean(axis=0)
-            + np.random.default_rng(0).normal(0.0, _SHAKEN * np.median(links), chain.shape)
-        )
+        shake = np.random.default_rng(0).normal(0.0, _SHAKEN * np.median(links), chain.shape)
+        chain = chain + shake
     while len(chain) > 2:
         pierced = _pierced(chain[:-2], chain[1:-1], chain[2:], chain[:-1], chain[1:])
         triangle, link = np.indices(pierced.shape)

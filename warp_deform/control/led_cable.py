@@ -42,7 +42,7 @@ def pin(builder: newton.ModelBuilder, cable: Cable, bead: int) -> None:
 
 
 def weigh_down(builder: newton.ModelBuilder, cable: Cable, bead: int) -> None:
-    """Make a bead as heavy as 10,000: no pull moves it, but what a tip leads does not go through it.
+    """Make a bead as heavy as 10,000: no pull moves it, and what a tip leads pushes it aside.
 
     Between a pinned bead and a held one nothing acts, since neither has a mass to be moved.
     """

@@ -1,9 +1,9 @@
 """unknot: untie a loose overhand knot in a cable, one end of which is weighed down.
 
 Definition (ours). A cable of 50 beads a diameter apart, 0.7 m, lies in a loose overhand knot. Its
-third bead is weighed down where it lies. The tip holds bead 37, which lies in the knot between the last
-two crossings, and keeps it. It has 100 steps of 50 ms, at up to 1 m/s. Solved: the cable has no
-knot, see `knots.untied`.
+third bead is weighed down where it lies. The tip holds bead 37, which lies in the knot between the
+last two crossings, and keeps it. It has 100 steps of 50 ms, at up to 1 m/s. Solved: the cable has
+no knot, see `knots.untied`.
 
 Source: Unknotting of DLO-Lab. The cost is its own, with lengths in the source's metres (see
 `led_cable`): the average crossing number, of midpoints of links and softened by 2 cm, and 100 times
@@ -13,7 +13,8 @@ Strands must not pass through each other, by which a knot that is drawn tight wo
 Here the cable would stretch first: beads touch before strands cross, an overlap is undone at once
 (`recovery`), and a link of more than 1.15 times its length makes a guard fire, which ends the
 episode. For one link to go through another between beads that do not overlap, the squares of their
-lengths have to sum to four spacings' squares. A held bead that is led at the weight pushes it aside.
+lengths have to sum to four spacings' squares. A held bead that is led at the weight pushes it
+aside.
 
 Differences. DLO-Lab has two arms, which hold vertices 2 and 37 of a rope of elastic rods, in a knot
 from a file, with 100 steps of 20 ms or more; radius, mass and stiffness vary there, and an episode

@@ -86,7 +86,8 @@ def test_chains_without_a_knot_are_untied_however_they_lie() -> None:
     coil = np.column_stack([np.cos(angle), np.sin(angle), 0.1 * angle])
     flat = np.column_stack([knot[:, :2], np.zeros(50)])
     for chain in (spiral, coil, flat, knot[[0, -1]], knot[:3], knot[14:]):
-        assert untied(chain)
+        assert untied(chain) and untied(1e200 * chain)
+    assert not untied(1e200 * knot) and not untied(1e-200 * knot) and not untied(knot + 1e3)
     assert not untied(np.concatenate([np.add(knot, [0.3, 0.0, 0.0]), knot])), "one beside the other"
 
 
@@ -133,6 +134,19 @@ def test_the_cost_is_its_sources() -> None:
     straight = layout.particle_q[:1] + np.arange(50)[:, None] * [0.0, task.cable.spacing, 0.0]
     state.particle_q = straight
     assert task.cost(layout, state) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("sizes", "said"),
+    [
+        ((50, 0.0, 1.5), "spacing"), ((50, np.nan, 1.5), "spacing"), ((50, 0.01, 0.5), "loops"),
+        ((50, 0.01, -1.5), "loops"), ((10, 0.01, 1.5), "beads"), ((0, 0.01, 1.5), "beads"),
+        ((50, 0.01, 10.0), "beads"), ((50.5, 0.01, 1.5), "beads"),
+    ],
+)  # fmt: skip
+def test_a_knot_that_cannot_be_is_refused(sizes: tuple[float, ...], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        overhand_knot(*sizes)
 
 
 # -- how it comes untied
