@@ -3,10 +3,9 @@
     python benchmarks/ports.py [--tasks TASK...] [--methods METHOD...] [--goals N] [--seconds S]
 
 Goals are those of test seeds from 10,000; scores, totals and losses are means over them. "idle"
-does nothing, "chance" draws actions evenly, one plan a goal, "script" is `FoldPlayer` or
-`SpreadPlayer` with fixed picks, `PathPlayer` with a fixed path, or a fixed motion, where a task has
-one. "random", "cem" and "cmaes" are `optimize` over the plans of `EpisodeProblem`, with S CPU
-seconds a goal. "adam" and "lbfgs", from the best of 50 draws, and "cem+adam" descend by the
+does nothing, "chance" draws actions evenly, one plan a goal, "script" is one plan for all goals,
+where a task has one. "random", "cem" and "cmaes" are `optimize` over the plans of `EpisodeProblem`,
+with S CPU seconds a goal. "adam" and "lbfgs", from the best of 50 draws, and "cem+adam" descend by the
 gradients of `LedProblem`, where a task holds one thing; "bundled" is adam by the mean of 8. A total
 is the sum of the scores of all steps, DLO-Lab's return; a score is that of the end; away is the
 task's loss at the end. `solved` and `guards` count goals. What has a row of as many goals and
@@ -25,7 +24,7 @@ import numpy as np
 
 from warp_deform.control import EpisodeProblem, LedProblem, optimize
 from warp_deform.control.episode_problem import PlayedPlans
-from warp_deform.control.plan_players import FoldPlayer, Player, SpreadPlayer
+from warp_deform.control.plan_players import Player
 from warp_deform.control.unknot import UNTIE
 from warp_deform.control.wire import THROUGH
 from warp_deform.support.revision import running_revision
@@ -44,12 +43,13 @@ METHODS = ("idle", "chance", "script", *SEARCHES)
 SCRIPTS = {
     "fold-fabric-1": np.array([[-1, -1, 1, 1]]),
     "fold-fabric-3": np.array([[-1, -1, -0.1, -0.1], [1, -1, 0.1, -0.1], [-1, 1, -0.1, 0.1]]),
+    "unfold-fabric-1": np.array([[0.0, -1.0, 0.0]]),
+    "unfold-fabric-3": np.array([[0.0, -1.0, 0.0]]),
     "wire": THROUGH,
     "unknot": UNTIE,
 }
-"""Picks and places that fold, see `FoldPlayer`, a path, see `PathPlayer`, and a motion, see
-`SmoothPlayer`."""
-SCRIPTED = (*SCRIPTS, "unfold-fabric-1", "unfold-fabric-3")
+"""Picks and places that fold, see `FoldPlayer`, every corner to its place, see `SpreadPlayer`, a
+path, see `PathPlayer`, and a motion, see `SmoothPlayer`."""
 
 
 class Chance:
@@ -105,11 +105,7 @@ def played_by(
     player: Player = Idle() if method == "idle" else Chance()
     if method == "script":
         numbers, player = np.zeros((problem.goals, *usual.shape)), usual
-        if task in SCRIPTS:
-            numbers += SCRIPTS[task]
-        else:
-            assert isinstance(usual, FoldPlayer), "others have no script"
-            player = SpreadPlayer(usual.control, usual.flat, usual.columns, usual.shape[0])
+        numbers += SCRIPTS[task]
     problem.player = player
     played = problem.play(goals, numbers)
     problem.player = usual
@@ -135,7 +131,7 @@ def main() -> None:
                 "task": task, "method": method, "goals": options.goals,
                 "seconds": options.seconds if method in SEARCHES else 0.0,
             }  # fmt: skip
-            suits = task in HELD if method in DESCENTS else method != "script" or task in SCRIPTED
+            suits = task in HELD if method in DESCENTS else method != "script" or task in SCRIPTS
             if key(row) in rows or not suits:
                 continue
             seeds = range(10_000, 10_000 + options.goals)

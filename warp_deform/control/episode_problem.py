@@ -14,7 +14,14 @@ from .control_task import ControlTask
 from .control_worlds import ControlWorlds
 from .fold_fabric import FoldFabric1
 from .led_cable import LedCable
-from .plan_players import FoldPlayer, PathPlayer, Player, PushPlayer, SmoothPlayer
+from .plan_players import (
+    FoldPlayer,
+    PathPlayer,
+    Player,
+    PushPlayer,
+    SmoothPlayer,
+    SpreadPlayer,
+)
 from .push_cable import PushCable
 from .unfold_fabric import UnfoldFabric1
 from .wire import Wire
@@ -202,7 +209,8 @@ def _player(task: ControlTask) -> Player:
         return PushPlayer(task.control, task.pushes)
     if isinstance(task, Wire):
         return PathPlayer(task.control, task.held_particle, task.horizon)
+    if isinstance(task, UnfoldFabric1):
+        return SpreadPlayer(task.control, "targets", task.fabric.columns, task.horizon // 60)
     if isinstance(task, FoldFabric1):
-        flat = "targets" if isinstance(task, UnfoldFabric1) else "particle_q"
-        return FoldPlayer(task.control, flat, task.fabric.columns, task.horizon // 60)
+        return FoldPlayer(task.control, "particle_q", task.fabric.columns, task.horizon // 60)
     return SmoothPlayer(task.horizon)
