@@ -4,11 +4,11 @@
 
 Goals are those of test seeds from 10,000; scores, totals and losses are means over them. "idle"
 does nothing, "chance" draws actions evenly, one plan a goal, "script" is one plan for all goals,
-where a task has one. "random", "cem" and "cmaes" are `optimize` over the plans of `EpisodeProblem`,
-with S CPU seconds a goal. "adam" and "lbfgs", from the best of 50 draws, and "cem+adam" descend by the
-gradients of `LedProblem`, where a task holds one thing; "bundled" is adam by the mean of 8. A total
-is the sum of the scores of all steps, DLO-Lab's return; a score is that of the end; away is the
-task's loss at the end. `solved` and `guards` count goals. What has a row of as many goals and
+where a task has one. "random", "cem" and "cmaes" are `optimize` over plans of `EpisodeProblem`,
+with S CPU seconds a goal. "adam" and "lbfgs", from the best of 50 draws, and "cem+adam" descend by
+the gradients of `LedProblem`, where a task holds one thing; "bundled" is adam by the mean of 8. A
+total is the sum of the scores of all steps, DLO-Lab's return; a score is that of the end; away is
+the task's loss at the end. `solved` and `guards` count goals. What has a row of as many goals and
 seconds is left out, so the command goes on after an interruption.
 """
 

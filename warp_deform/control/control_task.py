@@ -37,6 +37,14 @@ class ControlTask(Task):
     first_actions: ClassVar[int] = 0
     """Picks and places that have made the start, see `first_action`."""
 
+    @property
+    def solved_first(self) -> bool:
+        """Whether searches take any plan that solves for better than all that do not.
+
+        Where a low loss is not yet success.
+        """
+        return False
+
     def first_action(self, snapshot: Snapshot, rng: np.random.Generator) -> Action:
         """One of the picks and places that make the start."""
         raise TypeError(f"{self.name} starts as it was laid out")

@@ -29,6 +29,8 @@ from .wire import Wire
 __all__ = ["PlayedPlans"]  # `warp_deform.control` has `EpisodeProblem`
 
 _LANES = 8
+_UNSOLVED = 100.0
+"""More than any loss of a task that wants to be `solved_first`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +138,11 @@ class EpisodeProblem:
         return SmoothPlayer(self.control.horizon, numbers.shape[-2])
 
     def evaluate(self, numbers: np.ndarray) -> np.ndarray:
-        """Losses (G, N) of plans (G, N, *shape); inf where a guard fires."""
+        """What plans (G, N, *shape) lose, which searches make small (G, N); inf where a guard fires.
+
+        It is the loss at the end, or what the return lacks where the task pays on the way, and for
+        a task that wants to be `solved_first` 100 more where it is not solved.
+        """
         count, each = numbers.shape[:2]
         of = np.repeat(np.arange(count), each)
         played = self.play(of, numbers.reshape(-1, *numbers.shape[2:]))
@@ -144,7 +150,12 @@ class EpisodeProblem:
         if self._pays:
             lacks = 1.0 - played.returns / self.control.horizon
             losses = np.where(np.isfinite(losses), lacks, np.inf)
+        losses = losses + self._unsolved(played.solved)
         return np.where(np.isfinite(losses), losses, np.inf).reshape(count, each)
+
+    def _unsolved(self, solved: np.ndarray) -> np.ndarray:
+        """What plans (n,) lose by not solving."""
+        return np.where(solved, 0.0, _UNSOLVED if self.task.solved_first else 0.0)
 
     def play(self, of: Sequence[int] | np.ndarray, numbers: np.ndarray) -> PlayedPlans:
         """Play plans (n, *shape), each for the goal of that number (n,)."""

@@ -96,6 +96,11 @@ class Gather(LedCable):
         ]
         return Layout(particle_q=beads, body_q=np.array(boxes), targets=beads[:1])
 
+    @property
+    def solved_first(self) -> bool:
+        """True: the cost of boxes that stand together has more terms than their distances."""
+        return True
+
     def losses(
         self,
         layouts: Sequence[Layout],

@@ -136,8 +136,10 @@ class LedProblem(EpisodeProblem):
         losses = losses[: len(of)]
         trusted = worlds.trusted[: len(of)]
         (gradients,) = torch.autograd.grad(losses[torch.from_numpy(trusted)].sum(), free)
+        solved = np.array([worlds.worlds.solved(slot) for slot in range(len(of))])
+        found = losses.detach().numpy() + self._unsolved(solved)
         worlds.detach()
-        return np.where(trusted, losses.detach().numpy(), np.inf), gradients.numpy()
+        return np.where(trusted, found, np.inf), gradients.numpy()
 
 
 def _directions(losses: np.ndarray, gradients: np.ndarray) -> np.ndarray:

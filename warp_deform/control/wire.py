@@ -103,6 +103,11 @@ class Wire(LedCable):
         """False: the best return has a cable that lies near the gap soon, and never through it."""
         return False
 
+    @property
+    def solved_first(self) -> bool:
+        """True: a cable that lies near the gap costs little, and is not laid."""
+        return True
+
     def losses(
         self,
         layouts: Sequence[Layout],

@@ -109,6 +109,21 @@ def test_a_path_far_to_one_side_wires_the_cable_at_every_goal() -> None:
     assert losses[0] == pytest.approx(played.losses[0], abs=5e-3) and np.isfinite(slopes).all()
 
 
+def test_a_plan_that_wires_is_better_than_any_that_lies_near() -> None:
+    """The cable lies along the gap at little cost, or through it at whatever cost."""
+    problem = LedProblem("wire", [0], worlds=8)
+    draws = np.random.default_rng(0).normal(0.0, 1.5, (16, *problem.shape))
+    numbers = np.concatenate([THROUGH[None], draws])
+    played, losses = problem.play([0] * 17, numbers), problem.evaluate(numbers[None])[0]
+    sound = np.isfinite(losses)
+    assert played.solved[0] and (sound & ~played.solved).any()
+    assert (losses[sound] == played.losses[sound] + 100.0 * ~played.solved[sound]).all()
+    moves = problem.refined(THROUGH[None])
+    assert problem.gradients(np.concatenate([moves, 0 * moves]), np.zeros(2, int))[
+        0
+    ] == pytest.approx([played.losses[0], 100.0 + problem.play([0], 0 * moves).losses[0]], abs=1e-4)
+
+
 def test_posts_stand_fast_whatever_is_pulled_around_them() -> None:
     control = ControlWorlds("wire", 1, action_penalty=0.0)
     control.reset({0: 0})
