@@ -138,7 +138,7 @@ class EpisodeProblem:
         return SmoothPlayer(self.control.horizon, numbers.shape[-2])
 
     def evaluate(self, numbers: np.ndarray) -> np.ndarray:
-        """What plans (G, N, *shape) lose, which searches make small (G, N); inf where a guard fires.
+        """What plans (G, N, *shape) lose (G, N), and searches make small; inf where a guard fires.
 
         It is the loss at the end, or what the return lacks where the task pays on the way, and for
         a task that wants to be `solved_first` 100 more where it is not solved.
