@@ -24,7 +24,7 @@ from ..episodes.episode import Observation
 from ..twin.twin import TwinLook
 from ..vision.task_frame import PIXEL_RATIO, fits_task, to_base
 from ..vision.top_down_view import TopDownView
-from .finger_room import has_finger_room
+from .finger_clearance import has_finger_clearance
 
 __all__ = [
     "FailedPicks",
@@ -207,7 +207,7 @@ class PolicyChooser:
         proposed = []
         for _ in range(_MOST_PROPOSALS):
             proposed.append(self._policy.act(_picture(seen.mask), goal, avoid=avoid))
-            if has_finger_room(seen.mask, self._in_base(proposed[-1]), view=self._view):
+            if has_finger_clearance(seen.mask, self._in_base(proposed[-1]), view=self._view):
                 break
             avoid.append((proposed[-1][:2], _NEAR))
         else:

@@ -11,7 +11,7 @@ from warp_deform.errors import InputError
 
 from ..episodes.episode import Chooser
 from ..episodes.goals import GoalMask
-from ..rig.config import AgentName
+from ..rig.config import ChooserName
 from ..rig.rig import Rig
 from .choosers import PolicyChooser, RandomChooser, ScriptedChooser
 from .human import HumanChooser, Show, click_pick_and_place, type_pick_and_place
@@ -20,7 +20,7 @@ __all__ = ["make_chooser"]
 
 
 def make_chooser(
-    agent: AgentName,
+    agent: ChooserName,
     rig: Rig,
     goal: GoalMask | None,
     *,

@@ -26,6 +26,7 @@ from warp_deform.errors import InputError
 from ..support.closing import Closing
 from .arguments import check_joints, check_pose, check_range, shown
 from .arrival import check_arrival, has_arrived, pressed_contact
+from .home_path import home_waypoints, pose_above
 from .limits import SafetyLimits
 from .motion_checks import LineSolver, MotionChecks, as_lines
 from .panda import GRIPPER_MAX_WIDTH, HOME_Q, PandaKinematics
@@ -44,7 +45,6 @@ from .robot import (
 from .sinking import Sinking
 from .stop_latch import StopLatch
 from .straight_line import straight_line
-from .way_home import home_waypoints, pose_above
 
 __all__ = ["SafeRobot"]
 

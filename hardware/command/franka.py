@@ -22,7 +22,7 @@ from warp_deform.errors import InputError
 from warp_deform.quiet import quiet_warp
 from warp_deform.support.flag_range import FlagRange
 
-from ..rig.config import AgentName
+from ..rig.config import ChooserName
 from .calibrate import CALIBRATE, CalibrateOptions
 from .capture import CaptureGoalOptions, capture_goal
 from .doctor import DoctorOptions, doctor
@@ -49,7 +49,7 @@ class RunOptions(RigOptions):
     Nothing needs to be installed or prepared for `--robot sim`.
     """
 
-    agent: AgentName = "planner"
+    agent: ChooserName = "planner"
     """Who chooses the actions. planner simulates actions on the chain that the mask shows; policy
     acts as --policy was trained; scripted knows the simulated chain; random moves any point of the
     cable; with human you click, and with typed you type, where to pick and place."""
@@ -75,7 +75,7 @@ class CollectOptions(RunOptions):
     The packed episodes are a dataset for `warp-deform train cable-mask-goal`.
     """
 
-    agent: AgentName = "human"
+    agent: ChooserName = "human"
     """Who chooses the actions: the agents of `run`."""
     episodes: Annotated[int, arg(aliases=["-n"], metavar="N"), FlagRange(1, 100_000)] = 1
     """Episodes to record."""

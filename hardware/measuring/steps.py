@@ -20,7 +20,7 @@ from ..calibration.reach import check_workplace
 from ..calibration.workplace import Workplace
 from ..cameras.camera import CameraIntrinsics
 from ..episodes.operators import until_cleared
-from ..rig.config import REAL_ROBOTS, SILENT_LENSES, RigConfig
+from ..rig.config import CAMERAS_WITHOUT_INTRINSICS, REAL_ROBOTS, RigConfig
 from ..rig.rig import open_robot, read_intrinsics, read_table
 from ..rig.workplace import workplace_of
 from ..support.json_file import read_json, read_numbers
@@ -112,7 +112,7 @@ def keep(config: RigConfig, calibration: Calibration) -> Path:
 
 def lens_of(config: RigConfig) -> CameraIntrinsics | None:
     """Return the measured intrinsics of a camera that does not tell its own; None for others."""
-    if config.camera not in SILENT_LENSES:
+    if config.camera not in CAMERAS_WITHOUT_INTRINSICS:
         return None
     return read_intrinsics(config.setup / "lens.json")
 

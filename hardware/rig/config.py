@@ -11,11 +11,11 @@ from tyro.conf import arg
 from warp_deform.support.flag_range import SEED, FlagRange
 
 __all__ = [
+    "CAMERAS_WITHOUT_INTRINSICS",
     "NETWORKED_ROBOTS",
     "REAL_ROBOTS",
-    "SILENT_LENSES",
-    "AgentName",
     "CameraName",
+    "ChooserName",
     "HomeFlag",
     "RigConfig",
     "RobotName",
@@ -25,7 +25,7 @@ __all__ = [
 
 RobotName = Literal["dry_run", "sim", "panda", "fr3", "frankapy"]
 CameraName = Literal["sim", "file", "uvc", "realsense", "azure-kinect"]
-AgentName = Literal["planner", "policy", "scripted", "random", "human", "typed"]
+ChooserName = Literal["planner", "policy", "scripted", "random", "human", "typed"]
 
 SetupFlag = Annotated[Path, arg(metavar="DIR")]
 HomeFlag = Annotated[
@@ -41,7 +41,7 @@ REAL_ROBOTS: tuple[RobotName, ...] = ("panda", "fr3", "frankapy")
 """Those that are outside of this process."""
 NETWORKED_ROBOTS: tuple[RobotName, ...] = ("panda", "fr3")
 """Those of them whose control box is spoken to directly, at `RigConfig.host`."""
-SILENT_LENSES: tuple[CameraName, ...] = ("uvc",)
+CAMERAS_WITHOUT_INTRINSICS: tuple[CameraName, ...] = ("uvc",)
 """Cameras that do not tell their intrinsics: `calibrate lens` measures them."""
 
 

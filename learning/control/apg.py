@@ -25,7 +25,7 @@ from warp_deform.control.tensor_worlds import TensorControlWorlds
 from warp_deform.support.checked import POSITIVE, check_fields
 
 from .actor import Actor, BoundedSlopes, look_around, pressed
-from .kept import put_back, tensors_of
+from .checkpoint import put_back, tensors_of
 
 __all__ = ["Apg", "ApgConfig"]
 

@@ -32,7 +32,7 @@ from warp_deform.errors import InputError
 from warp_deform.support.checked import POSITIVE, check_fields
 
 from .actor import PlanActor
-from .kept import put_back, tensors_of
+from .checkpoint import put_back, tensors_of
 
 __all__ = ["Plan", "PlanConfig"]
 

@@ -34,7 +34,7 @@ from warp_deform.control.tensor_worlds import TensorControlWorlds
 from warp_deform.support.checked import BELOW_ONE, COUNT, POSITIVE, SHARE, check_fields
 
 from .actor import Actor, BoundedSlopes, as_actions, layers, look_around, pressed
-from .kept import put_back, tensors_of
+from .checkpoint import put_back, tensors_of
 
 __all__ = ["Critic", "Shac", "ShacConfig", "td_lambda"]
 

@@ -21,7 +21,7 @@ from fixtures.franka_episodes import (
 )
 
 from hardware.agents.choosers import RandomChooser, ScriptedChooser, still_chain, to_action
-from hardware.agents.finger_room import has_finger_room
+from hardware.agents.finger_clearance import has_finger_clearance
 from hardware.agents.human import HumanChooser
 from hardware.agents.planner import PlannerChooser, PlannerConfig, SeenChain, chord_error
 from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig, refusal
@@ -179,7 +179,7 @@ def test_fingers_need_room_beside_the_strand() -> None:
 
     def room(mask: np.ndarray, yaw: float) -> bool:
         action = PickPlaceAction((0.45, 0.0), yaw, (0.5, 0.0), yaw)
-        return has_finger_room(mask, action, view=TWIN.view)
+        return has_finger_clearance(mask, action, view=TWIN.view)
 
     assert room(lone, np.pi / 2) and not room(lone, 0.0), "along the strand both fingers meet it"
     verdicts = {gap: room(lone | TASK.mask(chain(0.45 + gap)), np.pi / 2) for gap in (0.022, 0.032)}

@@ -168,7 +168,7 @@ def test_a_pick_without_finger_room_is_passed_over_unless_there_is_no_other(
 
         asked.clear()
         chooser.reset()
-        monkeypatch.setattr("hardware.agents.choosers.has_finger_room", room)
+        monkeypatch.setattr("hardware.agents.choosers.has_finger_clearance", room)
 
     after(2)
     action = chosen(chooser, 0.45)

@@ -11,10 +11,10 @@ from warp_deform.robots.jaw import JawConfig
 from ..arm.pick_place import PickPlaceAction, PickPlaceConfig
 from ..vision.top_down_view import TopDownView
 
-__all__ = ["has_finger_room"]
+__all__ = ["has_finger_clearance"]
 
 
-def has_finger_room(
+def has_finger_clearance(
     mask: np.ndarray,
     action: PickPlaceAction,
     *,
