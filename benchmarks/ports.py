@@ -104,8 +104,7 @@ def played_by(
     numbers = np.arange(problem.goals, dtype=float)[:, None, None]
     player: Player = Idle() if method == "idle" else Chance()
     if method == "script":
-        numbers, player = np.zeros((problem.goals, *usual.shape)), usual
-        numbers += SCRIPTS[task]
+        numbers, player = np.zeros((problem.goals, *usual.shape)) + SCRIPTS[task], usual
     problem.player = player
     played = problem.play(goals, numbers)
     problem.player = usual

@@ -55,7 +55,8 @@ class OptimizedPlans:
     Attributes:
         numbers: free numbers of the best plans (G, K, 3); methods that descend have more of them
             than the problem's shape says, see `DifferentiableProblem.refined`
-        losses: of these (G,); inf where every plan made a guard fire
+        losses: of these (G,), as `evaluate` of the problem has them; inf where every plan made a
+            guard fire
         evaluations: plans that were evaluated, with gradients or without: mean over the goals
         gradients: of these, plans with gradients
         unusable: of all goals, plans whose gradients were not all finite numbers, or of a state

@@ -56,7 +56,8 @@ _KERNEL_OPTIONS: dict[str, Any] = {
 
 _CHECKS: dict[str, Any] = {"optimization_level": 1, "cpu_compiler_flags": "-march=native"}
 """Checks are what float64 without lanes is for, and they wait for the compiler more than they run.
-These compile in two thirds of the time and run about as fast."""
+Without the inlining above, what has boxes compiles in three quarters of the time, and runs as fast.
+"""
 
 
 def kernel_options(scalar: Any, lanes: int) -> dict[str, Any]:
