@@ -42,13 +42,13 @@ SEARCHES = ("random", "cem", "cmaes", *DESCENTS)
 METHODS = ("idle", "chance", "script", *SEARCHES)
 SCRIPTS = {
     "fold-fabric-1": np.array([[-1, -1, 1, 1]]),
-    "fold-fabric-3": np.array([[-1, -1, -0.1, -0.1], [1, -1, 0.1, -0.1], [-1, 1, -0.1, 0.1]]),
+    "fold-fabric-3": np.array([[0.0, -1.0, 0.0]]),
     "unfold-fabric-1": np.array([[0.0, -1.0, 0.0]]),
     "unfold-fabric-3": np.array([[0.0, -1.0, 0.0]]),
     "wire": THROUGH,
     "unknot": UNTIE,
 }
-"""Picks and places that fold, see `FoldPlayer`, every corner to its place, see `SpreadPlayer`, a
+"""A pick and place that folds, see `FoldPlayer`, every corner to its place, see `CornerPlayer`, a
 path, see `PathPlayer`, and a motion, see `SmoothPlayer`."""
 
 

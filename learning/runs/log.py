@@ -103,7 +103,8 @@ class TrainingLog:
             WarpDeformError: a line is due, and the mean loss is not finite.
         """
         for name, value in losses.items():
-            self._sums[name] = self._sums.get(name, torch.zeros(())) + value.detach().cpu()
+            # Where they are: to fetch them at every step would hold up a GPU.
+            self._sums[name] = self._sums.get(name, 0) + value.detach()
         self._count += 1
         if step % LINE_STEPS and not last:
             return

@@ -12,6 +12,7 @@ import numpy as np
 from ..control.control_task import ControlTask
 from ..control.control_worlds import ControlWorlds
 from ..control.episode_problem import EpisodeProblem
+from ..control.plan_players import CornerPlayer
 from ..control.plan_search import optimize
 from ..control.registry import control_task
 from ..control.swing_problem import SwingProblem
@@ -19,6 +20,7 @@ from ..control.tip_demonstrator import LED_MODES, TipDemonstrator, usual_mode
 from ..episodes import EpisodeWriter
 from ..errors import InputError
 from ..tasks.task import Task
+from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 from ..worlds.loop import SOLVED
 from .control_runs import (
     Act,
@@ -43,6 +45,8 @@ __all__ = [
 
 SEARCHED = "cem"
 """Who demonstrates what is held from the start: the search of `warp_deform.control.optimize`."""
+_SPREAD = 0.5
+"""Of the numbers that carries of corners are drawn by, whose unit is 5 mm."""
 _WORLDS = 32
 """Plans that are simulated side by side in a search; their number changes no bit."""
 
@@ -58,14 +62,15 @@ def check_control(settings: CollectSettings) -> None:
         raise InputError(f"horizon is {settings.horizon}; it must be 1 control step or more")
     if settings.evaluations < 1:
         raise InputError(f"evaluations is {settings.evaluations}; it must be 1 or more")
-    if _is_searched(task):
+    who = _demonstrates(task)
+    if who is not None:
         fixed = {"control_mode": (None, LED_MODES[0]), "horizon": (None,), "start": ("free",)}
         for name, allowed in fixed.items():
             if getattr(settings, name) not in allowed:
                 flag = name.replace("_", "-")
-                raise InputError(f"a search demonstrates {task.name}; it has no choice of --{flag}")
+                raise InputError(f"{who} {task.name}; there is no choice of --{flag}")
         if settings.demonstrator != "scripted":
-            raise InputError(f"a search demonstrates {task.name}, and nobody else")
+            raise InputError(f"{who} {task.name}, and nobody else")
 
 
 def describe_control(settings: CollectSettings) -> dict[str, Any]:
@@ -122,6 +127,18 @@ def _is_searched(task: Task) -> bool:
     return isinstance(task, ControlTask) and (task.held_particle, task.held_body) != (None, None)
 
 
+def _carries_corners(task: Task) -> bool:
+    """Whether carries of a fabric's corners demonstrate it, see `CornerPlayer`."""
+    return isinstance(task, ControlTask) and task.carries_corners
+
+
+def _demonstrates(task: Task) -> str | None:
+    """Who demonstrates a task by itself, as messages say it; None: a demonstrator by its name."""
+    if _is_searched(task):
+        return "a search demonstrates"
+    return "carries of corners demonstrate" if _carries_corners(task) else None
+
+
 def _demonstrator(
     control: ControlWorlds, settings: CollectSettings
 ) -> tuple[Callable[[Mapping[int, ControlRun]], None], Act, str]:
@@ -129,12 +146,41 @@ def _demonstrator(
     if _is_searched(control.task):
         plans = _Plans(settings)
         return plans.start, plans.act, SEARCHED
+    if _carries_corners(control.task):
+        carries = _Carries(control)
+        return carries.start, carries.act, settings.demonstrator
     tips = TipDemonstrator(control, settings.demonstrator)
     return (
         lambda runs: tips.start(list(runs)),
         lambda runs: tips.act(list(runs)),
         settings.demonstrator,
     )
+
+
+class _Carries:
+    """Carries corners of a fabric to about their places, by numbers that are drawn by the seed."""
+
+    def __init__(self, control: ControlWorlds) -> None:
+        self._control = control
+        self._players: dict[int, CornerPlayer] = {}
+
+    def start(self, runs: Mapping[int, ControlRun]) -> None:
+        task = self._control.task
+        for slot, run in runs.items():
+            player = CornerPlayer(task.control, task.fabric.columns, task.horizon // 60)
+            rng = episode_rng(run.seed, DEMONSTRATOR_STREAM)
+            layout = self._control.worlds.episodes[slot].layout
+            player.begin(rng.normal(0.0, _SPREAD, (1, *player.shape)), [layout])
+            self._players[slot] = player
+
+    def act(self, runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+        worlds, targets = self._control.worlds, self._control.targets
+        rows: dict[int, np.ndarray | None] = {}
+        for slot, run in runs.items():
+            tip, particle_q = targets.asked[slot, :3], worlds.solver.particle_q(slot)
+            row = self._players[slot].rows(len(run.actions), tip[None], particle_q[None])[0]
+            rows[slot] = np.clip(row, -1.0, 1.0).astype(np.float32)
+        return rows
 
 
 class _Plans:

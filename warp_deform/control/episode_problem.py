@@ -13,14 +13,15 @@ from ..worlds.state import WorldState
 from .control_task import ControlTask
 from .control_worlds import ControlWorlds
 from .fold_fabric import FoldFabric1
+from .fold_fabric_3 import FoldFabric3
 from .led_cable import LedCable
 from .plan_players import (
+    CornerPlayer,
     FoldPlayer,
     PathPlayer,
     Player,
     PushPlayer,
     SmoothPlayer,
-    SpreadPlayer,
 )
 from .push_cable import PushCable
 from .unfold_fabric import UnfoldFabric1
@@ -220,8 +221,8 @@ def _player(task: ControlTask) -> Player:
         return PushPlayer(task.control, task.pushes)
     if isinstance(task, Wire):
         return PathPlayer(task.control, task.held_particle, task.horizon)
-    if isinstance(task, UnfoldFabric1):
-        return SpreadPlayer(task.control, "targets", task.fabric.columns, task.horizon // 60)
+    if isinstance(task, UnfoldFabric1 | FoldFabric3):
+        return CornerPlayer(task.control, task.fabric.columns, task.horizon // 60)
     if isinstance(task, FoldFabric1):
-        return FoldPlayer(task.control, "particle_q", task.fabric.columns, task.horizon // 60)
+        return FoldPlayer(task.control, task.fabric.columns, task.horizon // 60)
     return SmoothPlayer(task.horizon)

@@ -11,9 +11,9 @@ both sides, without DaXBench's factor 0.99 a step.
 
 Differences. DaXBench's cloth has 16 x 32 particles on 0.2 x 0.4 m, simulated as springs under a
 gravity of 0.5; its goals were folded by hand; its three actions are whole picks and places of 40
-moves each. Solved is ours: vertices lie within 15 mm of their places on average, where
-each has its own. Numbers of theirs and of ours never belong into one row of a table without that
-sentence.
+moves each. Solved is ours: vertices lie within 15 mm of their places on average, where each has its
+own, and none higher than 30 mm, so that no fold counts while it is held in the air. Numbers of
+theirs and of ours never belong into one row of a table without that sentence.
 
 Numbers to beat: a score of 0.40 (DaXBench's PPO), 0.82 by imitation (ILD). On our fabric the score
 says little: half as long as DaXBench's, it has 0.92 before it is touched, and 0.98 when folded. So
@@ -47,6 +47,8 @@ _SHIFT = 0.05
 """Spread of the start along x and y [m], as DaXBench's."""
 _CORNER = 0
 """The vertex that is to lie on the opposite one."""
+_FOLD_HEIGHT = 0.03
+"""Of a fabric that lies in folds, whose crease stands up to 20 mm [m]."""
 
 
 class FoldFabric1(ControlTask):
@@ -66,6 +68,11 @@ class FoldFabric1(ControlTask):
     fabric: ClassVar[ClothConfig] = FABRIC
     tolerance: ClassVar[float] = 0.015
     """Mean distance [m] of the vertices from their places at which it is solved."""
+
+    @property
+    def carries_corners(self) -> bool:
+        """A straight pick and place leaves the vertices 3 cm from their places."""
+        return True
 
     def add_objects(self, builder: newton.ModelBuilder) -> tuple[Cloth]:
         """Add the fabric, flat in the middle of the table."""
@@ -104,8 +111,17 @@ class FoldFabric1(ControlTask):
         return float(np.exp(-5 * (pairs.min(axis=0).mean() + pairs.min(axis=1).mean())))
 
     def solved(self, layout: Layout, snapshot: Snapshot) -> bool:
-        """Whether the vertices lie within 15 mm of their places on average."""
-        return self.away(layout, snapshot) < self.tolerance
+        """Whether the fabric lies, its vertices within 15 mm of their places on average."""
+        return self.away(layout, snapshot) < self.tolerance and self.lies(snapshot)
+
+    @property
+    def greatest_height(self) -> float:
+        """Of a fabric that lies as it is to lie [m]."""
+        return _FOLD_HEIGHT
+
+    def lies(self, snapshot: Snapshot) -> bool:
+        """Whether no part of the fabric is held up."""
+        return bool(snapshot.particle_q[:, 2].max() < self.greatest_height)
 
     def demonstrate(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator

@@ -14,16 +14,17 @@ from .push_cable import push_actions
 from .smooth_plans import actions_of
 
 __all__ = [
+    "CornerPlayer",
     "FoldPlayer",
     "OpenPlayer",
     "PathPlayer",
     "Player",
     "PushPlayer",
     "SmoothPlayer",
-    "SpreadPlayer",
-]
+    ]
 
 _FOLD_STEPS = 60
+_LET_GO = (0.0, 0.0, 0.0, -1.0)
 _OVER, _DOWN, _CARRY, _WAIT, _GO = 12, 16, 48, 53, 60
 """Step at which the tip is over a vertex, on it, at the end of a carry, calm, and up again."""
 _HOVER = 0.06
@@ -140,17 +141,16 @@ class FoldPlayer:
     fabric, whose corners are at -1 and 1; a number beyond counts as the corner's, of places as 1.5.
 
     Args:
-        flat: entry of the layout that holds the flat fabric (P, 3) [m], rows by columns
-        columns: of it
+        columns: of the fabric, which lies flat at first
     """
 
-    def __init__(self, control: ControlConfig, flat: str, columns: int, picks: int) -> None:
-        self.control, self.flat, self.columns = control, flat, columns
+    def __init__(self, control: ControlConfig, columns: int, picks: int) -> None:
+        self.control, self.columns = control, columns
         self.shape = (picks, 4)
 
     def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
         """See `Player`."""
-        sheets = np.stack([getattr(layout, self.flat) for layout in layouts])[..., :2]
+        sheets = np.stack([layout.particle_q for layout in layouts])[..., :2]
         across = np.linspace(-1.0, 1.0, self.columns)
         nearest = np.abs(np.clip(numbers[..., :2], -1, 1)[..., None] - across).argmin(-1)
         self._vertices = nearest[..., 1] * self.columns + nearest[..., 0]
@@ -165,50 +165,53 @@ class FoldPlayer:
         """See `Player`."""
         k, t = divmod(step, _FOLD_STEPS)
         if k >= self._places.shape[1]:
-            return np.tile([0.0, 0.0, 0.0, -1.0], (len(tips), 1))
+            return np.tile(_LET_GO, (len(tips), 1))
         if t == 0:
             self._from = particle_q[np.arange(len(tips)), self._vertices[:, k]].astype(float)
         return carry_rows(t, tips, self._from, self._places[:, k], self.control)
 
 
-class SpreadPlayer(FoldPlayer):
-    """Carries corners of a fabric to about where they lie when it is flat, 60 steps each.
+class CornerPlayer:
+    """Carries corners of a fabric to about their places in the goal, 60 steps each.
 
     Numbers are three a carry. The first one's size says which corner: below 2 the one that is
     farthest from its place, below 4 the next one, and so on. The others say how much farther than
     5 mm outwards, and how far sideways, from its place it is laid [5 mm]: a corner that is drawn
     beyond its place smooths creases.
+
+    Args:
+        columns: of the fabric, whose vertices have their places in the layout's `targets`
     """
 
-    def __init__(self, control: ControlConfig, flat: str, columns: int, picks: int) -> None:
-        super().__init__(control, flat, columns, picks)
-        self.shape = (picks, 3)
+    def __init__(self, control: ControlConfig, columns: int, carries: int) -> None:
+        self.control, self.columns = control, columns
+        self.shape = (carries, 3)
 
     def begin(self, numbers: np.ndarray, layouts: Sequence[Layout]) -> None:
         """See `Player`."""
-        flat = np.stack([getattr(layout, self.flat) for layout in layouts])
-        self._corners = np.array([0, self.columns - 1, -self.columns, -1]) % flat.shape[1]
-        self._flat = flat[:, self._corners, :2]
-        outwards = self._flat - self._flat.mean(axis=1, keepdims=True)
+        goals = np.stack([layout.targets for layout in layouts])
+        self._corners = np.array([0, self.columns - 1, -self.columns, -1]) % goals.shape[1]
+        self._goals = goals[:, self._corners, :2]
+        outwards = self._goals - self._goals.mean(axis=1, keepdims=True)
         outwards /= np.linalg.norm(outwards, axis=2, keepdims=True)
         self._ways = np.stack([outwards, outwards[..., ::-1] * [-1.0, 1.0]], axis=2)
         self._ranks = np.minimum(np.abs(numbers[..., 0]) / 2, 3).astype(int)
         self._beyond = _BEYOND * (numbers[..., 1:] + [1.0, 0.0])
-        self._vertices = np.zeros(numbers.shape[:2], int)
-        self._places = np.zeros((*numbers.shape[:2], 2))
         self._from = np.zeros((len(numbers), 3))
+        self._to = np.zeros((len(numbers), 2))
 
     def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
         """See `Player`."""
         k, t = divmod(step, _FOLD_STEPS)
-        if t == 0 and k < self._places.shape[1]:
-            each = np.arange(len(tips))
-            away = np.linalg.norm(particle_q[:, self._corners, :2] - self._flat, axis=2)
-            corner = (-away).argsort(axis=1)[each, self._ranks[:, k]]
-            self._vertices[:, k] = self._corners[corner]
-            beyond = (self._beyond[:, k, :, None] * self._ways[each, corner]).sum(axis=1)
-            self._places[:, k] = self._flat[each, corner] + beyond
-        return super().rows(step, tips, particle_q)
+        if k >= len(self._ranks[0]):
+            return np.tile(_LET_GO, (len(tips), 1))
+        if t == 0:
+            each, corners = np.arange(len(tips)), particle_q[:, self._corners].astype(float)
+            away = np.linalg.norm(corners[..., :2] - self._goals, axis=2)
+            chosen = (-away).argsort(axis=1)[each, self._ranks[:, k]]
+            beyond = (self._beyond[:, k, :, None] * self._ways[each, chosen]).sum(axis=1)
+            self._from, self._to = corners[each, chosen], self._goals[each, chosen] + beyond
+        return carry_rows(t, tips, self._from, self._to, self.control)
 
 
 def carry_rows(

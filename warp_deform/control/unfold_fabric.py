@@ -4,8 +4,9 @@ Definition (ours). A fabric of 0.2 m and 10 x 10 vertices lay flat on the table,
 (standard deviation along each axis) and turned at random. Then the tip folded it one or three
 times: it laid a vertex, drawn at random, onto another one at least 8 cm away. Starts that show more
 than 85 % of the square are drawn again. The goal is the flat fabric where it was. The tip is free
-at first and has 600 steps of 50 ms, at up to 1 m/s. The episode ends as soon as it was
-solved for five steps: when the fabric covers 95 % of the square that it lay on.
+at first and has 600 steps of 50 ms, at up to 1 m/s. The episode ends as soon as it was solved for
+five steps: when the fabric covers 95 % of the square that it lay on, and nothing of it is higher
+than 10 mm.
 
 Source: Unfold-Cloth-1 and -3 of DaXBench (Chen et al., ICLR 2023), with the score of
 `fold-fabric-1`.
@@ -43,6 +44,8 @@ _PIXELS = 100
 """Of a side of the square, by which coverage is counted."""
 _FOLDED = 0.85
 """Greatest coverage of a start."""
+_FLAT_HEIGHT = 0.010
+"""Of a fabric that lies flat, in one layer of 4 mm [m]."""
 
 
 class UnfoldFabric1(FoldFabric1):
@@ -88,8 +91,13 @@ class UnfoldFabric1(FoldFabric1):
         return True
 
     def solved(self, layout: Layout, snapshot: Snapshot) -> bool:
-        """Whether the fabric covers 95 % of the square that it lay on."""
-        return self.coverage(layout, snapshot) >= self.covered
+        """Whether the fabric lies, and covers 95 % of the square that it lay on."""
+        return self.coverage(layout, snapshot) >= self.covered and self.lies(snapshot)
+
+    @property
+    def greatest_height(self) -> float:
+        """Of a flat fabric [m]."""
+        return _FLAT_HEIGHT
 
     def coverage(self, layout: Layout, snapshot: Snapshot) -> float:
         """Share of the square that the fabric covers, seen from above."""

@@ -211,6 +211,33 @@ def test_a_swing_has_no_choices_and_no_other_task_is_led_by_its_velocity(tmp_pat
         TipDemonstrator(ControlWorlds("whip", 8, mode="tip_velocity", lanes=8))
 
 
+@pytest.mark.parametrize("task", ["fold-fabric-1", "fold-fabric-3"])
+def test_folds_are_demonstrated_and_end_on_the_table(task: str, tmp_path: Path) -> None:
+    """A straight pick and place, as other tasks are demonstrated, folds none of them."""
+    together = collect(config(tmp_path / "both", task=task, seed=3))
+    assert (together.attempts, together.successes) == (2, 2)
+    alone = collect(config(tmp_path / "one", task=task, seed=4, episodes=1))
+    assert alone.successes == 1 and verify(tmp_path / "one", workers=1)["mismatches"] == 0
+    (name, kept), *_ = sorted(files(tmp_path / "one").items())
+    assert files(tmp_path / "both")[name] == kept, "a carry depends on its seed alone"
+    episode = EpisodeReader(tmp_path / "one", control=True).read(4)
+    last = episode.steps[-1]
+    assert last.success and last.particle_q[:, 2].max() < 0.03 and episode.info.demonstrator
+    first, second = (
+        np.array([step.action for step in EpisodeReader(tmp_path / "both", control=True).read(k)
+                  .steps[:-1]][:40]) for k in (3, 4)
+    )  # fmt: skip
+    assert not np.array_equal(first, second)
+
+
+def test_folds_have_no_other_demonstrator(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="carries of corners demonstrate fold-fabric-1, and nob"):
+        config(tmp_path, task="fold-fabric-1", demonstrator="visible")
+    for name, value in (("start", "held"), ("horizon", 30), ("control_mode", "tip_delta_pose")):
+        with pytest.raises(InputError, match=f"no choice of --{name.replace('_', '-')}"):
+            config(tmp_path, task="fold-fabric-3", **{name: value})
+
+
 def row(success: bool) -> Step:
     empty = np.zeros((0, 3), np.float32)
     return Step(

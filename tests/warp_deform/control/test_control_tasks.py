@@ -327,7 +327,7 @@ def test_gradients_are_refused_where_there_are_none() -> None:
     with pytest.raises(InputError, match="may take and let go"):
         LedProblem("fold-fabric-1", [0], worlds=8)
     with pytest.raises(InputError, match="depend on what is seen"):
-        LedProblem("push-cable", [0], worlds=8, player=FoldPlayer(ControlConfig(), "targets", 2, 1))
+        LedProblem("push-cable", [0], worlds=8, player=FoldPlayer(ControlConfig(), 2, 1))
 
 
 def test_a_bundle_is_the_mean_of_directions_around_a_plan() -> None:
