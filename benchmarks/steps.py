@@ -74,9 +74,7 @@ def jobs(name: str, kind: str, folder: Path) -> Jobs:
         )
         losses = agent(Batch(image, pick, place, torch.zeros(1), none))
         if kind != "plain":
-            trained.zero_grad()
-            losses.total().backward()
-            trained.step(taken)
+            trained.step(taken, trained.gradient(losses.total()))
             return
         optimizer.zero_grad()
         losses.total().backward()

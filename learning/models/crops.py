@@ -7,11 +7,25 @@ precision, so the result is equal bit for bit.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["crop_reach", "rotated_crops"]
+__all__ = ["Sampling", "crop_reach", "crop_sampling", "rotated_crops", "sampled_crops"]
+
+
+class Sampling(NamedTuple):
+    """Which pixels of maps crops are made of.
+
+    Attributes:
+        where: (B, R size size) int64, pixels of the maps, counted row by row
+        inside: (B, R size size) bool; where it is False, zero is seen
+    """
+
+    where: Tensor
+    inside: Tensor
 
 
 def rotated_crops(
@@ -45,16 +59,49 @@ def rotated_crops(
             for map_, (row, column) in zip(features, corners, strict=True)
         ]
         return torch.stack(pieces)[:, None]
-    batch, channels, rows, columns = features.shape
+    sampling = crop_sampling(
+        centres,
+        size=size,
+        n_rotations=n_rotations,
+        shape=shape or (features.shape[2], features.shape[3]),
+        origin=origin,
+        columns=features.shape[3],
+    )
+    there = Sampling(*(each.to(features.device) for each in sampling))
+    return sampled_crops(features, there, size=size)
+
+
+def crop_sampling(
+    centres: Tensor,
+    *,
+    size: int,
+    n_rotations: int,
+    shape: tuple[int, int],
+    origin: tuple[int, int] = (0, 0),
+    columns: int | None = None,
+) -> Sampling:
+    """The pixels, on the CPU, that `rotated_crops` reads; its arguments are that function's.
+
+    Args:
+        columns: of the windows, where it is not the map's
+    """
     v, u = _sources(centres.numpy(), size=size, n_rotations=n_rotations)
-    map_rows, map_columns = shape or (rows, columns)
-    inside = (u >= 0) & (u < map_rows) & (v >= 0) & (v < map_columns)
+    inside = (u >= 0) & (u < shape[0]) & (v >= 0) & (v < shape[1])
     u, v = np.where(inside, u - origin[0], 0), np.where(inside, v - origin[1], 0)
-    where = torch.from_numpy(u * columns + v).to(features.device).reshape(batch, 1, -1)
+    where = u * (columns or shape[1]) + v
+    return Sampling(
+        torch.from_numpy(where.reshape(len(where), -1)),
+        torch.from_numpy(inside.reshape(len(inside), -1)),
+    )
+
+
+def sampled_crops(features: Tensor, sampling: Sampling, *, size: int) -> Tensor:
+    """Crops (B, R, C, size, size) of maps (B, C, H, W) on the same device."""
+    batch, channels = features.shape[:2]
+    where, inside = (each[:, None] for each in sampling)
     sampled = features.flatten(2).gather(2, where.expand(-1, channels, -1))
-    seen = torch.from_numpy(inside).to(features.device).reshape(batch, 1, -1)
-    sampled = torch.where(seen, sampled, torch.zeros((), device=features.device))
-    return sampled.reshape(batch, channels, n_rotations, size, size).transpose(1, 2)
+    sampled = torch.where(inside, sampled, torch.zeros((), device=features.device))
+    return sampled.reshape(batch, channels, -1, size, size).transpose(1, 2)
 
 
 def crop_reach(size: int, n_rotations: int) -> int:

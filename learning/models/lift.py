@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from warp_deform.errors import InputError
 
-from .crops import rotated_crops
+from .crops import Sampling, crop_sampling, rotated_crops, sampled_crops
 from .images import CHANNELS, NETWORK_CHANNELS, normalise
 
 __all__ = ["LiftHead"]
@@ -65,9 +65,25 @@ class LiftHead(nn.Module):
 
     def forward(self, image: Tensor, pick: Tensor) -> Tensor:
         """Logits (B, n_lifts); `pick` (B, 2) int64 row and column within the image."""
+        x, half = self._framed(image), self.crop // 2
+        return self._chosen(rotated_crops(x, pick.cpu() + half, size=self.crop, n_rotations=1))
+
+    def sampled(self, image: Tensor, crops: Sampling) -> Tensor:
+        """As `forward`, with the pixels of the crops, on the same device; see `sampling`."""
+        return self._chosen(sampled_crops(self._framed(image), crops, size=self.crop))
+
+    def sampling(self, pick: Tensor, shape: tuple[int, int]) -> Sampling:
+        """What `sampled` cuts out of images of a shape (H, W) for picks (B, 2), on the CPU."""
+        framed = shape[0] + self.crop, shape[1] + self.crop
+        centres = pick + self.crop // 2
+        return crop_sampling(centres, size=self.crop, n_rotations=1, shape=framed)
+
+    def _framed(self, image: Tensor) -> Tensor:
         half = self.crop // 2
-        x = normalise(functional.pad(image[:, : self.channels], (half, half, half, half)))
-        x = rotated_crops(x, pick.cpu() + half, size=self.crop, n_rotations=1)[:, 0]
+        return normalise(functional.pad(image[:, : self.channels], (half, half, half, half)))
+
+    def _chosen(self, crops: Tensor) -> Tensor:
+        x = crops[:, 0]
         for convolution in self.convolutions:
             x = functional.relu(convolution(x), inplace=True)
         logits: Tensor = self.choose(x.flatten(1))

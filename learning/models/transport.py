@@ -103,6 +103,8 @@ class Transport(nn.Module):
         )
         self.key, self.query = network(marks=marks), network()
         self.goal = network(marks=marks) if goal_split else None
+        weights = _around_pick(crop, focus=focus, even=config.equivariant)
+        self.register_buffer("_weights", weights, persistent=False)
 
     def forward(self, image: Tensor, pick: Tensor, *, n_rotations: int = 1) -> Tensor:
         """Place logits (B, R, H, W); `pick` (B, 2) int64 row and column within the image."""
@@ -142,9 +144,8 @@ class Transport(nn.Module):
 
     def correlated(self, key: Tensor, kernels: Tensor) -> Tensor:
         """Place logits of framed features (B, 3, H + S, W + S) and crops (B, R, 3, S, S)."""
-        weights = _around_pick(self.crop, focus=self.focus, even=self.config.equivariant)
         correlate = correlate_direct if self.exact else correlate_fft
-        return self.gain * correlate(key, kernels * weights.to(kernels))
+        return self.gain * correlate(key, kernels * self._weights.to(kernels))
 
 
 def pick_mark(x: Tensor, pick: Tensor) -> Tensor:

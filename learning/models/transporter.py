@@ -23,12 +23,12 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE
 
 from .attention import Attention
+from .batch import Batch, Labels, Losses, labels_of, losses_of
 from .choice import choose
 from .images import CHANNELS, image_tensor
 from .lift import LiftHead
@@ -173,40 +173,6 @@ PRESETS = {
 }
 
 
-class Batch(NamedTuple):
-    """Labelled images, in network pixels.
-
-    Attributes:
-        image: (B, 4 k, H, W) float32, raw (see `image_tensor`): the current picture, then the
-            goal's
-        pick: (B, 2) int64, row and column
-        place: (B, 2) int64, row and column
-        theta: (B,) float, pick yaw minus place yaw [rad]
-        lift: (B,) int64, index into the configuration's lifts
-    """
-
-    image: Tensor
-    pick: Tensor
-    place: Tensor
-    theta: Tensor
-    lift: Tensor
-
-
-class Losses(NamedTuple):
-    """Cross entropies [nat], means over a batch; no two share a parameter.
-
-    Their sum may therefore be minimised at once. `lift` is 0 where there is one lift.
-    """
-
-    attention: Tensor
-    transport: Tensor
-    lift: Tensor
-
-    def total(self) -> Tensor:
-        """Their sum."""
-        return self.attention + self.transport + self.lift
-
-
 class PixelActions(NamedTuple):
     """What to do in each of B pictures.
 
@@ -298,27 +264,17 @@ class Transporter(nn.Module):
         Raises:
             InputError: an image of another shape, or a labelled pixel outside of it.
         """
-        image = batch.image
+        image, n = batch.image, self.config.n_rotations_train
         self._check(image)
-        picks = _flat("pick", batch.pick, self.config.shape)
-        places = _flat("place", batch.place, self.config.shape)
-        n = self.config.n_rotations_train
+        labels = labels_of(batch, self.config.shape, n_rotations=n)
         if self.pick_place is not None:
             heat, logits = self.pick_place.both(image, batch.pick, n_rotations=n)
         else:
             heat = self.attention(image)
             logits = self.transport(image, batch.pick, n_rotations=n)
-        attention = functional.cross_entropy(heat.flatten(1), picks.to(image.device))
-        # Halves go to even, as in the original.
-        rotation = torch.round(batch.theta.double() / (2 * math.pi / n)).long() % n
-        label = rotation.to(image.device) * math.prod(self.config.shape) + places.to(image.device)
-        transport = functional.cross_entropy(logits.flatten(1), label)
-        lift = attention.new_zeros(())
-        if self.lift is not None:
-            lift = functional.cross_entropy(
-                self.lift(image, batch.pick), batch.lift.to(image.device)
-            )
-        return Losses(attention, transport, lift)
+        lifts = None if self.lift is None else self.lift(image, batch.pick)
+        there = Labels(*(each.to(image.device) for each in labels))
+        return losses_of(heat, logits, lifts, there)
 
     @torch.no_grad()
     def act(self, image: Tensor, *, avoid: Tensor | None = None) -> PixelActions:
@@ -386,14 +342,3 @@ class GoalStack(Transporter):
     name = "goal-stack"
     pictures = 2
     crop_before_query = True
-
-
-def _flat(name: str, pixel: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Index (B,) of pixels (B, 2) in a flattened image."""
-    limit = torch.tensor(shape, device=pixel.device)
-    outside = ((pixel < 0) | (pixel >= limit)).any(dim=1)
-    if outside.any():
-        raise InputError(
-            f"{name}: pixel {pixel[outside][0].tolist()} lies outside of {shape[0]} x {shape[1]}"
-        )
-    return pixel[:, 0] * shape[1] + pixel[:, 1]

@@ -60,20 +60,19 @@ class Trained:
         """What snapshots hold, by name."""
         return self._parts(self._flat.detach() if self._average is None else self._average)
 
-    def zero_grad(self) -> None:
-        """Forget gradients."""
-        for each in self._parameters.values():
+    def gradient(self, loss: Tensor) -> Tensor:
+        """Of a loss, by all weights, one after another."""
+        parameters = self._parameters.values()
+        for each in parameters:
             each.grad = None
+        loss.backward()
+        parts = (torch.zeros_like(each) if each.grad is None else each.grad for each in parameters)
+        return torch.cat([each.flatten() for each in parts])
 
     @torch.no_grad()
-    def step(self, number: int) -> None:
+    def step(self, number: int, gradient: Tensor) -> None:
         """Take the optimiser's step, counted from 1, and count it into the average."""
-        self._flat.grad = torch.cat(
-            [
-                (torch.zeros_like(each) if each.grad is None else each.grad).flatten()
-                for each in self._parameters.values()
-            ]
-        )
+        self._flat.grad = gradient
         self.optimizer.step()
         if self._average is not None:
             self._average.lerp_(self._flat.detach(), 1.0 - self._plan.kept_at(number))

@@ -5,6 +5,8 @@ interrupted goes on exactly as it would have, from the last stored state. Bits a
 CPU only: on CUDA, the gradients of bilinear interpolation and of gathering pixels are sums in no
 fixed order.
 
+On a GPU a step of agents whose networks are computed together is one CUDA graph (graphed.py).
+
 Several processes, one a GPU or a core, train together under `torchrun`: each draws its own batch,
 and gradients are averaged (torch's DistributedDataParallel).
 
@@ -14,6 +16,7 @@ ours.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import time
 from dataclasses import asdict, dataclass, replace
@@ -37,6 +40,7 @@ from ..policy.policy import AGENTS, Agent, AgentDescription
 from ..runs.folder import RunFolder
 from ..runs.log import TrainingLog, load_tensorboard
 from .config import TrainConfig
+from .graphed import GraphedLosses, can_be_graphed
 from .held_out import HeldOut
 from .processes import join_processes
 from .schedules import Schedule
@@ -48,6 +52,7 @@ __all__ = ["TrainReport", "train"]
 
 _STREAM = 7
 """Keeps the generators of training apart from those of episodes."""
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -145,6 +150,19 @@ def train(config: TrainConfig) -> TrainReport:
         network: nn.Module = DistributedDataParallel(agent) if world > 1 else agent
         due_steps, store = set(plan.snapshot_steps()), state_steps(plan)
 
+        # A step's losses and gradient, of a batch that depends on nothing but seed, step and rank
+        def batch(step: int, where: torch.device) -> tuple[Any, ...]:
+            rng = np.random.default_rng([_STREAM, config.seed, step, rank])
+            return _batch(data, agent, plan, config.augment, rng, where)
+
+        def one_by_one(step: int) -> tuple[Any, torch.Tensor]:
+            losses = network(*batch(step, device))
+            return losses, trained.gradient(losses.total())
+
+        at_once: Any = contextlib.nullcontext(one_by_one)
+        if device.type == "cuda" and world == 1 and can_be_graphed(agent):
+            at_once = GraphedLosses(agent, lambda k: batch(k, _CPU)[0], steps=plan.steps)
+
         bar = progress_bar(
             f"train {config.task}",
             plan.steps,
@@ -159,22 +177,15 @@ def train(config: TrainConfig) -> TrainReport:
             tensorboard=config.tensorboard,
             enabled=rank == 0,
         )
-        with log, bar as advance:
+        with log, bar as advance, at_once as losses_at:
             for step in range(first + 1, plan.steps + 1):
                 if stopped:
                     break
-                # A batch that depends on nothing but seed, step and rank
-                rng = np.random.default_rng([_STREAM, config.seed, step, rank])
-                inputs = _batch(data, agent, plan, config.augment, rng, device)
-
                 # One step of the optimiser
+                losses, gradient = losses_at(step)
                 lr = trained.optimizer.param_groups[0]["lr"] = plan.lr_at(step)
-                trained.zero_grad()
-                losses = network(*inputs)
-                loss = losses.total()
-                loss.backward()
-                trained.step(step)
-                log.add(step, {"loss": loss, **losses._asdict()}, lr=lr)
+                trained.step(step, gradient)
+                log.add(step, {"loss": losses.total(), **losses._asdict()}, lr=lr)
 
                 # Snapshots, and what an interrupted run goes on from
                 due, last = step in due_steps, step == plan.steps

@@ -45,14 +45,6 @@ class ControlTask(Task):
         """
         return False
 
-    @property
-    def carries_corners(self) -> bool:
-        """Whether it is demonstrated by carries of a fabric's corners, in an arc, one after another.
-
-        Where a straight pick and place, as of `demonstrate`, does not do it.
-        """
-        return False
-
     def first_action(self, snapshot: Snapshot, rng: np.random.Generator) -> Action:
         """One of the picks and places that make the start."""
         raise TypeError(f"{self.name} starts as it was laid out")

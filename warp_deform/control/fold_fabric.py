@@ -69,11 +69,6 @@ class FoldFabric1(ControlTask):
     tolerance: ClassVar[float] = 0.015
     """Mean distance [m] of the vertices from their places at which it is solved."""
 
-    @property
-    def carries_corners(self) -> bool:
-        """A straight pick and place leaves the vertices 3 cm from their places."""
-        return True
-
     def add_objects(self, builder: newton.ModelBuilder) -> tuple[Cloth]:
         """Add the fabric, flat in the middle of the table."""
         return (add_cloth(builder, self.fabric, cloth_sheet(self.fabric, (0.5, 0.0))),)

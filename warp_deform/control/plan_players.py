@@ -21,7 +21,7 @@ __all__ = [
     "Player",
     "PushPlayer",
     "SmoothPlayer",
-    ]
+]
 
 _FOLD_STEPS = 60
 _LET_GO = (0.0, 0.0, 0.0, -1.0)

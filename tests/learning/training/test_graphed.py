@@ -1,0 +1,89 @@
+"""A step as a CUDA graph has it: the agent's losses and gradients, and nothing asked of data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
+
+from learning.models.batch import Batch
+from learning.models.transporter import PRESETS, GoalSplit, GoalStack, Transporter
+from learning.training.graphed import can_be_graphed, inputs_of, losses_of_inputs
+from warp_deform.errors import InputError
+
+SMALL = replace(PRESETS["fast"], scale=4, width=0.125, crop=16, lifts=(0.05, 0.3))
+KINDS = (
+    (Transporter, SMALL),
+    (Transporter, replace(SMALL, n_rotations_train=24)),
+    (GoalSplit, replace(SMALL, n_rotations_train=6, lifts=(0.05,))),
+    (GoalStack, replace(SMALL, equivariant=False, mark_pick=False)),
+)
+
+
+def batch(agent: Transporter, picks: Tensor) -> Batch:
+    rng = np.random.default_rng(0)
+    images = []
+    for _ in picks:
+        pictures = [
+            (
+                rng.integers(0, 256, (320, 160, 3), dtype=np.uint8),
+                rng.uniform(0, 0.1, (320, 160)).astype(np.float32),
+            )
+            for _ in range(agent.pictures)
+        ]
+        images.append(agent.image(*pictures))
+    count = len(picks)
+    return Batch(
+        torch.stack(images), picks, picks.flip(0), torch.linspace(-2, 2, count),
+        torch.arange(count) % len(agent.config.lifts),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "config"), KINDS)
+@pytest.mark.parametrize("picks", [[[0, 39], [41, 18], [79, 2]], [[78, 37]]])
+def test_losses_and_gradients_are_the_agent_s(kind, config, picks) -> None:
+    """Picks in corners too, where crops reach beyond the picture."""
+    agent = kind(config, seed=0)
+    labelled = batch(agent, torch.tensor(picks))
+    wanted = agent(labelled)
+    got = losses_of_inputs(agent, inputs_of(agent, labelled))
+    assert wanted.transport.item() > 0.1
+    for name, value in got._asdict().items():
+        assert value.item() == pytest.approx(getattr(wanted, name).item(), rel=1e-5), name
+    parameters = list(agent.parameters())
+    flat = [
+        torch.cat([each.flatten() for each in torch.autograd.grad(losses.total(), parameters)])
+        for losses in (wanted, got)
+    ]
+    assert float((flat[1] - flat[0]).norm()) < 1e-5 * float(flat[0].norm())
+
+
+@pytest.mark.parametrize(("kind", "config"), KINDS)
+def test_nothing_that_is_done_depends_on_a_number(kind, config) -> None:
+    """A tensor without numbers refuses to be asked for one, as the recording of a graph does."""
+    agent = kind(config, seed=0)
+    inputs = inputs_of(agent, batch(agent, torch.tensor([[30, 20]])))
+    losses_of_inputs(agent, inputs)  # what is only done once, as before the recording
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        fake = inputs.mapped(mode.from_tensor)
+        losses = losses_of_inputs(agent, fake)
+        gradients = torch.autograd.grad(losses.total(), list(agent.parameters()))
+        shapes = [each.shape for each in agent.parameters()]
+        assert [each.shape for each in gradients] == shapes
+        with pytest.raises(DataDependentOutputException):
+            agent(Batch(fake.image, fake.pick, fake.pick, fake.image[:, 0, 0, 0], fake.labels.lift))
+
+
+def test_what_is_graphed_and_what_is_refused() -> None:
+    agent = Transporter(SMALL, seed=0)
+    assert can_be_graphed(agent) and not can_be_graphed(torch.nn.Linear(2, 2))
+    assert not can_be_graphed(Transporter(replace(SMALL, pad_features=False), seed=0))
+    outside = batch(agent, torch.tensor([[80, 3]]))
+    with pytest.raises(InputError, match=r"pick: pixel \[80, 3\] lies outside of 80 x 40"):
+        inputs_of(agent, outside)
+    inputs = inputs_of(agent, batch(agent, torch.tensor([[5, 3]])))
+    assert len(inputs.tensors()) == 9 and inputs.mapped(torch.clone).tensors()[1].equal(inputs.pick)
