@@ -24,8 +24,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from learning.models.batch import Batch
 from learning.models.precision import has_bfloat16_units
-from learning.models.transporter import PRESETS, Batch, GoalSplit, GoalStack, Transporter
+from learning.models.transporter import PRESETS, GoalSplit, GoalStack, Transporter
 from learning.runs.folder import RunFolder
 from learning.training.schedules import SCHEDULES
 from learning.training.state import Trained

@@ -12,8 +12,9 @@ from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE
 from warp_deform.tasks.task import Task
 
+from ..models.batch import Batch
 from ..models.gt_state import encode_action
-from ..models.transporter import Batch, Transporter
+from ..models.transporter import Transporter
 from .augmentation import draw_transform, draw_transforms, move_actions, move_picture, move_states
 from .dataset import Demonstrations
 

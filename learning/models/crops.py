@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Sampling", "crop_reach", "crop_sampling", "rotated_crops", "sampled_crops"]
+__all__ = ["CropPixels", "crop_pixels", "crop_reach", "crops_at", "rotated_crops"]
 
 
-class Sampling(NamedTuple):
+class CropPixels(NamedTuple):
     """Which pixels of maps crops are made of.
 
     Attributes:
@@ -59,7 +59,7 @@ def rotated_crops(
             for map_, (row, column) in zip(features, corners, strict=True)
         ]
         return torch.stack(pieces)[:, None]
-    sampling = crop_sampling(
+    pixels = crop_pixels(
         centres,
         size=size,
         n_rotations=n_rotations,
@@ -67,11 +67,11 @@ def rotated_crops(
         origin=origin,
         columns=features.shape[3],
     )
-    there = Sampling(*(each.to(features.device) for each in sampling))
-    return sampled_crops(features, there, size=size)
+    there = CropPixels(*(each.to(features.device) for each in pixels))
+    return crops_at(features, there, size=size)
 
 
-def crop_sampling(
+def crop_pixels(
     centres: Tensor,
     *,
     size: int,
@@ -79,7 +79,7 @@ def crop_sampling(
     shape: tuple[int, int],
     origin: tuple[int, int] = (0, 0),
     columns: int | None = None,
-) -> Sampling:
+) -> CropPixels:
     """The pixels, on the CPU, that `rotated_crops` reads; its arguments are that function's.
 
     Args:
@@ -89,16 +89,16 @@ def crop_sampling(
     inside = (u >= 0) & (u < shape[0]) & (v >= 0) & (v < shape[1])
     u, v = np.where(inside, u - origin[0], 0), np.where(inside, v - origin[1], 0)
     where = u * (columns or shape[1]) + v
-    return Sampling(
+    return CropPixels(
         torch.from_numpy(where.reshape(len(where), -1)),
         torch.from_numpy(inside.reshape(len(inside), -1)),
     )
 
 
-def sampled_crops(features: Tensor, sampling: Sampling, *, size: int) -> Tensor:
+def crops_at(features: Tensor, pixels: CropPixels, *, size: int) -> Tensor:
     """Crops (B, R, C, size, size) of maps (B, C, H, W) on the same device."""
     batch, channels = features.shape[:2]
-    where, inside = (each[:, None] for each in sampling)
+    where, inside = (each[:, None] for each in pixels)
     sampled = features.flatten(2).gather(2, where.expand(-1, channels, -1))
     sampled = torch.where(inside, sampled, torch.zeros((), device=features.device))
     return sampled.reshape(batch, channels, -1, size, size).transpose(1, 2)

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from warp_deform.errors import InputError
 
-from .crops import Sampling, crop_sampling, rotated_crops, sampled_crops
+from .crops import CropPixels, crop_pixels, crops_at, rotated_crops
 from .images import CHANNELS, NETWORK_CHANNELS, normalise
 
 __all__ = ["LiftHead"]
@@ -68,15 +68,15 @@ class LiftHead(nn.Module):
         x, half = self._framed(image), self.crop // 2
         return self._chosen(rotated_crops(x, pick.cpu() + half, size=self.crop, n_rotations=1))
 
-    def sampled(self, image: Tensor, crops: Sampling) -> Tensor:
-        """As `forward`, with the pixels of the crops, on the same device; see `sampling`."""
-        return self._chosen(sampled_crops(self._framed(image), crops, size=self.crop))
+    def at(self, image: Tensor, pixels: CropPixels) -> Tensor:
+        """As `forward`, given the `crop_pixels` of the picks, on the image's device."""
+        return self._chosen(crops_at(self._framed(image), pixels, size=self.crop))
 
-    def sampling(self, pick: Tensor, shape: tuple[int, int]) -> Sampling:
-        """What `sampled` cuts out of images of a shape (H, W) for picks (B, 2), on the CPU."""
+    def crop_pixels(self, pick: Tensor, shape: tuple[int, int]) -> CropPixels:
+        """What `at` cuts out of images of a shape (H, W) for picks (B, 2), on the CPU."""
         framed = shape[0] + self.crop, shape[1] + self.crop
         centres = pick + self.crop // 2
-        return crop_sampling(centres, size=self.crop, n_rotations=1, shape=framed)
+        return crop_pixels(centres, size=self.crop, n_rotations=1, shape=framed)
 
     def _framed(self, image: Tensor) -> Tensor:
         half = self.crop // 2

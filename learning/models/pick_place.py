@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .attention import Attention
-from .crops import Sampling, crop_reach, crop_sampling, rotated_crops, sampled_crops
+from .crops import CropPixels, crop_pixels, crop_reach, crops_at, rotated_crops
 from .grouped import Body, GroupedNetworks, Member, Window
 from .images import normalise
 from .transport import Transport, frame, pick_mark
@@ -56,11 +56,11 @@ class PickPlace:
         place = self._place(maps, body, pick, n_rotations)
         return maps["attention"][:, 0], place
 
-    def sampled(self, image: Tensor, pick: Tensor, crops: Sampling) -> tuple[Tensor, Tensor]:
-        """As `both`, with the pixels of the crops, all on one device; see `sampling`.
+    def both_at(self, image: Tensor, pick: Tensor, pixels: CropPixels) -> tuple[Tensor, Tensor]:
+        """As `both`, given the `crop_pixels` of the picks, all on one device.
 
-        The query is computed everywhere, not around the picks alone. So what is done depends on no
-        number, and a CUDA graph can do it again for other ones.
+        The query is computed everywhere, not around the picks alone: no launch depends on where
+        they are, so a CUDA graph can be replayed for others.
         """
         seen, transport = normalise(image), self._transport
         names = ["attention", *self._placing, "query"]
@@ -69,15 +69,15 @@ class PickPlace:
         if "goal" in maps:
             factor = maps["goal"] + transport.goal_bias
             key, query = key * factor, query * factor
-        kernels = sampled_crops(frame(query, transport.crop), crops, size=transport.crop)
+        kernels = crops_at(frame(query, transport.crop), pixels, size=transport.crop)
         place = transport.correlated(frame(key, transport.crop), kernels)
         return maps["attention"][:, 0], place
 
-    def sampling(self, pick: Tensor, shape: tuple[int, int], *, n_rotations: int) -> Sampling:
-        """What `sampled` cuts out of maps of a shape (H, W) for picks (B, 2) int64, on the CPU."""
+    def crop_pixels(self, pick: Tensor, shape: tuple[int, int], *, n_rotations: int) -> CropPixels:
+        """What `both_at` cuts out of maps of a shape (H, W) for picks (B, 2) int64, on the CPU."""
         crop = self._transport.crop
         framed = shape[0] + crop, shape[1] + crop
-        return crop_sampling(pick + crop // 2, size=crop, n_rotations=n_rotations, shape=framed)
+        return crop_pixels(pick + crop // 2, size=crop, n_rotations=n_rotations, shape=framed)
 
     def each(self, image: Tensor, *, n_rotations: int) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Pick logits (B, H, W), and what says place logits (B, R, H, W) for picks (B, 2) int64."""

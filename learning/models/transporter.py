@@ -38,10 +38,8 @@ from .transport import Transport
 
 __all__ = [
     "PRESETS",
-    "Batch",
     "GoalSplit",
     "GoalStack",
-    "Losses",
     "Picture",
     "PixelActions",
     "Transporter",

@@ -63,11 +63,12 @@ class Trained:
     def gradient(self, loss: Tensor) -> Tensor:
         """Of a loss, by all weights, one after another."""
         parameters = self._parameters.values()
-        for each in parameters:
-            each.grad = None
         loss.backward()
         parts = (torch.zeros_like(each) if each.grad is None else each.grad for each in parameters)
-        return torch.cat([each.flatten() for each in parts])
+        flat = torch.cat([each.flatten() for each in parts])
+        for each in parameters:
+            each.grad = None
+        return flat
 
     @torch.no_grad()
     def step(self, number: int, gradient: Tensor) -> None:

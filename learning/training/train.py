@@ -5,7 +5,8 @@ interrupted goes on exactly as it would have, from the last stored state. Bits a
 CPU only: on CUDA, the gradients of bilinear interpolation and of gathering pixels are sums in no
 fixed order.
 
-On a GPU a step of agents whose networks are computed together is one CUDA graph (graphed.py).
+In one process on a GPU, a step of agents whose networks are computed together is one CUDA graph
+(graphed.py).
 
 Several processes, one a GPU or a core, train together under `torchrun`: each draws its own batch,
 and gradients are averaged (torch's DistributedDataParallel).
@@ -52,7 +53,6 @@ __all__ = ["TrainReport", "train"]
 
 _STREAM = 7
 """Keeps the generators of training apart from those of episodes."""
-_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,9 @@ def train(config: TrainConfig) -> TrainReport:
         first = trained.restore()
         half = description.config.get("bfloat16", False)
         stopped = validation.evaluate([k for k in run.steps() if 0 < k <= first])
-        network: nn.Module = DistributedDataParallel(agent) if world > 1 else agent
+        network: nn.Module = agent
+        if world > 1:  # buffers are constants
+            network = DistributedDataParallel(agent, broadcast_buffers=False)
         due_steps, store = set(plan.snapshot_steps()), state_steps(plan)
 
         # A step's losses and gradient, of a batch that depends on nothing but seed, step and rank
@@ -159,9 +161,10 @@ def train(config: TrainConfig) -> TrainReport:
             losses = network(*batch(step, device))
             return losses, trained.gradient(losses.total())
 
-        at_once: Any = contextlib.nullcontext(one_by_one)
+        stepper: Any = contextlib.nullcontext(one_by_one)
         if device.type == "cuda" and world == 1 and can_be_graphed(agent):
-            at_once = GraphedLosses(agent, lambda k: batch(k, _CPU)[0], steps=plan.steps)
+            here = torch.device("cpu")
+            stepper = GraphedLosses(agent, lambda k: batch(k, here)[0], last=plan.steps)
 
         bar = progress_bar(
             f"train {config.task}",
@@ -177,7 +180,7 @@ def train(config: TrainConfig) -> TrainReport:
             tensorboard=config.tensorboard,
             enabled=rank == 0,
         )
-        with log, bar as advance, at_once as losses_at:
+        with log, bar as advance, stepper as losses_at:
             for step in range(first + 1, plan.steps + 1):
                 if stopped:
                     break

@@ -41,13 +41,14 @@ __all__ = [
     "attempt_control_chunk",
     "check_control",
     "describe_control",
+    "has_horizon",
     "replay_acts",
 ]
 
 SEARCHED = "cem"
 """Who demonstrates what is held from the start: the search of `warp_deform.control.optimize`."""
 _SPREAD = 0.5
-"""Of the numbers that carries of corners are drawn by, whose unit is 5 mm."""
+"""Of how far from its point a corner is laid, whose unit is 5 mm."""
 _WORLDS = 32
 """Plans that are simulated side by side in a search; their number changes no bit."""
 
@@ -72,6 +73,11 @@ def check_control(settings: CollectSettings) -> None:
                 raise InputError(f"{who} {task.name}; there is no choice of --{flag}")
         if settings.demonstrator != "scripted":
             raise InputError(f"{who} {task.name}, and nobody else")
+
+
+def has_horizon(task: str) -> bool:
+    """Whether demonstrations of a task may be given more control steps."""
+    return _demonstrates(control_task(task)) is None
 
 
 def describe_control(settings: CollectSettings) -> dict[str, Any]:
@@ -132,7 +138,8 @@ def _demonstrates(task: Task) -> str | None:
     """Who demonstrates a task by itself, as messages say it; None: a demonstrator by its name."""
     if _is_searched(task):
         return "a search demonstrates"
-    return "carries of corners demonstrate" if isinstance(task, FoldFabric1) else None
+    carried = isinstance(task, FoldFabric1) and task.carries
+    return "carries of corners demonstrate" if carried else None
 
 
 def _demonstrator(
@@ -142,7 +149,7 @@ def _demonstrator(
     if _is_searched(control.task):
         plans = _Plans(settings)
         return plans.start, plans.act, SEARCHED
-    if isinstance(control.task, FoldFabric1):
+    if isinstance(control.task, FoldFabric1) and control.task.carries:
         carries = _Carries(control, control.task)
         return carries.start, carries.act, settings.demonstrator
     tips = TipDemonstrator(control, settings.demonstrator)
@@ -166,10 +173,12 @@ class _Carries:
     def start(self, runs: Mapping[int, ControlRun]) -> None:
         task = self._task
         for slot, run in runs.items():
-            player = CornerPlayer(task.control, task.fabric.columns, task.horizon // 60)
+            player = CornerPlayer(task.control, task.fabric.columns, task.carries)
             rng = episode_rng(run.seed, DEMONSTRATOR_STREAM)
             layout = self._control.worlds.episodes[slot].layout
-            player.begin(rng.normal(0.0, _SPREAD, (1, *player.shape)), [layout])
+            numbers = rng.normal(0.0, _SPREAD, (1, *player.shape))
+            numbers[..., 0] = 0.0  # always the corner that is farthest from its place
+            player.begin(numbers, [layout])
             self._players[slot] = player
 
     def act(self, runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:

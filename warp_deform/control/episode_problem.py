@@ -12,7 +12,7 @@ from ..tasks.task import Layout
 from ..worlds.state import WorldState
 from .control_task import ControlTask
 from .control_worlds import ControlWorlds
-from .fold_fabric import FoldFabric1
+from .fold_fabric import CARRY_STEPS, FoldFabric1
 from .fold_fabric_3 import FoldFabric3
 from .led_cable import LedCable
 from .plan_players import (
@@ -222,7 +222,7 @@ def _player(task: ControlTask) -> Player:
     if isinstance(task, Wire):
         return PathPlayer(task.control, task.held_particle, task.horizon)
     if isinstance(task, UnfoldFabric1 | FoldFabric3):
-        return CornerPlayer(task.control, task.fabric.columns, task.horizon // 60)
+        return CornerPlayer(task.control, task.fabric.columns, task.horizon // CARRY_STEPS)
     if isinstance(task, FoldFabric1):
-        return FoldPlayer(task.control, task.fabric.columns, task.horizon // 60)
+        return FoldPlayer(task.control, task.fabric.columns, task.horizon // CARRY_STEPS)
     return SmoothPlayer(task.horizon)

@@ -41,10 +41,12 @@ if TYPE_CHECKING:
     import newton
     from torch import Tensor
 
-__all__ = ["FoldFabric1"]
+__all__ = ["CARRY_STEPS", "FoldFabric1"]
 
 _SHIFT = 0.05
 """Spread of the start along x and y [m], as DaXBench's."""
+CARRY_STEPS = 60
+"""Control steps of a pick of a vertex, its way, and the way up again."""
 _CORNER = 0
 """The vertex that is to lie on the opposite one."""
 _FOLD_HEIGHT = 0.03
@@ -107,14 +109,19 @@ class FoldFabric1(ControlTask):
 
     def solved(self, layout: Layout, snapshot: Snapshot) -> bool:
         """Whether the fabric lies, its vertices within 15 mm of their places on average."""
-        return self.away(layout, snapshot) < self.tolerance and self.lies(snapshot)
+        return self.away(layout, snapshot) < self.tolerance and self.rests(snapshot)
 
     @property
     def greatest_height(self) -> float:
-        """Of a fabric that lies as it is to lie [m]."""
+        """Greatest height of a vertex with which the task is solved [m]."""
         return _FOLD_HEIGHT
 
-    def lies(self, snapshot: Snapshot) -> bool:
+    @property
+    def carries(self) -> int:
+        """How many carries of corners demonstrate it; 0: `demonstrate` does, as of other tasks."""
+        return self.horizon // CARRY_STEPS
+
+    def rests(self, snapshot: Snapshot) -> bool:
         """Whether no part of the fabric is held up."""
         return bool(snapshot.particle_q[:, 2].max() < self.greatest_height)
 

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from ..tasks.task import Layout
+from .fold_fabric import CARRY_STEPS
 from .modes import ControlConfig
 from .push_cable import push_actions
 from .smooth_plans import actions_of
@@ -23,8 +24,8 @@ __all__ = [
     "SmoothPlayer",
 ]
 
-_FOLD_STEPS = 60
 _LET_GO = (0.0, 0.0, 0.0, -1.0)
+"""Action of a tip that holds nothing and stays."""
 _OVER, _DOWN, _CARRY, _WAIT, _GO = 12, 16, 48, 53, 60
 """Step at which the tip is over a vertex, on it, at the end of a carry, calm, and up again."""
 _HOVER = 0.06
@@ -163,7 +164,7 @@ class FoldPlayer:
 
     def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
         """See `Player`."""
-        k, t = divmod(step, _FOLD_STEPS)
+        k, t = divmod(step, CARRY_STEPS)
         if k >= self._places.shape[1]:
             return np.tile(_LET_GO, (len(tips), 1))
         if t == 0:
@@ -176,8 +177,9 @@ class CornerPlayer:
 
     Numbers are three a carry. The first one's size says which corner: below 2 the one that is
     farthest from its place, below 4 the next one, and so on. The others say how much farther than
-    5 mm outwards, and how far sideways, from its place it is laid [5 mm]: a corner that is drawn
-    beyond its place smooths creases.
+    5 mm outwards, and how far sideways, from its place it is laid [5 mm]. Outwards is away from the
+    middle of the places of all corners: a corner of a flat fabric that is drawn so far smooths
+    creases.
 
     Args:
         columns: of the fabric, whose vertices have their places in the layout's `targets`
@@ -202,8 +204,8 @@ class CornerPlayer:
 
     def rows(self, step: int, tips: np.ndarray, particle_q: np.ndarray) -> np.ndarray:
         """See `Player`."""
-        k, t = divmod(step, _FOLD_STEPS)
-        if k >= len(self._ranks[0]):
+        k, t = divmod(step, CARRY_STEPS)
+        if k >= self._ranks.shape[1]:
             return np.tile(_LET_GO, (len(tips), 1))
         if t == 0:
             each, corners = np.arange(len(tips)), particle_q[:, self._corners].astype(float)

@@ -45,7 +45,7 @@ _PIXELS = 100
 _FOLDED = 0.85
 """Greatest coverage of a start."""
 _FLAT_HEIGHT = 0.010
-"""Of a fabric that lies flat, in one layer of 4 mm [m]."""
+"""Of a fabric that lies flat, whose vertices are at 4 mm [m]."""
 
 
 class UnfoldFabric1(FoldFabric1):
@@ -92,11 +92,11 @@ class UnfoldFabric1(FoldFabric1):
 
     def solved(self, layout: Layout, snapshot: Snapshot) -> bool:
         """Whether the fabric lies, and covers 95 % of the square that it lay on."""
-        return self.coverage(layout, snapshot) >= self.covered and self.lies(snapshot)
+        return self.coverage(layout, snapshot) >= self.covered and self.rests(snapshot)
 
     @property
     def greatest_height(self) -> float:
-        """Of a flat fabric [m]."""
+        """Greatest height of a vertex with which the task is solved [m]."""
         return _FLAT_HEIGHT
 
     def coverage(self, layout: Layout, snapshot: Snapshot) -> float:

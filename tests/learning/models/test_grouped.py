@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from learning.models.adam import KerasAdam
+from learning.models.batch import Batch
 from learning.models.grouped import GroupedNetworks, Window
 from learning.models.precision import has_bfloat16_units
-from learning.models.transporter import PRESETS, Batch, GoalSplit, GoalStack, Transporter
+from learning.models.transporter import PRESETS, GoalSplit, GoalStack, Transporter
 from learning.training.config import TrainConfig
 from learning.training.train import _bfloat16
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,13 @@ from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTens
 
 from learning.models.batch import Batch
 from learning.models.transporter import PRESETS, GoalSplit, GoalStack, Transporter
-from learning.training.graphed import can_be_graphed, inputs_of, losses_of_inputs
+from learning.training.graphed import (
+    GraphedLosses,
+    MadeAhead,
+    can_be_graphed,
+    inputs_of,
+    losses_of_inputs,
+)
 from warp_deform.errors import InputError
 
 SMALL = replace(PRESETS["fast"], scale=4, width=0.125, crop=16, lifts=(0.05, 0.3))
@@ -87,3 +94,53 @@ def test_what_is_graphed_and_what_is_refused() -> None:
         inputs_of(agent, outside)
     inputs = inputs_of(agent, batch(agent, torch.tensor([[5, 3]])))
     assert len(inputs.tensors()) == 9 and inputs.mapped(torch.clone).tensors()[1].equal(inputs.pick)
+
+
+def test_batches_are_made_ahead_once_each_and_what_goes_wrong_is_told_at_its_step() -> None:
+    made = []
+
+    def make(step: int) -> int:
+        made.append(step)
+        if step == 7:
+            raise InputError("no batch 7")
+        return 10 * step
+
+    with MadeAhead(make, last=9) as ahead:
+        assert [ahead.take(step) for step in range(3, 7)] == [30, 40, 50, 60]
+        with pytest.raises(InputError, match="no batch 7"):
+            ahead.take(7)
+        assert [ahead.take(step) for step in (8, 9)] == [80, 90]
+    assert sorted(made) == list(range(3, 10)), "each once, and none beyond the last"
+
+
+def test_who_stops_early_waits_for_nothing_more() -> None:
+    begun, go_on = [], threading.Event()
+
+    def make(step: int) -> int:
+        begun.append(step)
+        assert step == 1 or go_on.wait(60)
+        return step
+
+    with MadeAhead(make, last=1000) as ahead:
+        assert ahead.take(1) == 1
+        go_on.set()
+    assert len(begun) < 12
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_a_graph_is_replayed_with_new_weights_and_batches() -> None:
+    """On a GPU: steps by the graph, and by the agent alone, in turns with a change of weights."""
+    agent = Transporter(SMALL, seed=0).cuda()
+    batches = [batch(agent, torch.tensor([[7 * k, 3 * k]])) for k in range(1, 5)]
+    with GraphedLosses(agent, lambda step: batches[step - 1], last=4) as graphed:
+        for step, labelled in enumerate(batches, 1):
+            losses, gradient = graphed(step)
+            wanted = agent(labelled._replace(image=labelled.image.cuda()))
+            parts = torch.autograd.grad(wanted.total(), list(agent.parameters()))
+            expected = torch.cat([part.flatten() for part in parts])
+            assert losses.total().item() == pytest.approx(wanted.total().item(), rel=1e-2)
+            assert (gradient - expected).norm() < 0.02 * expected.norm()
+            with torch.no_grad():
+                for each in agent.parameters():
+                    each.add_(torch.randn_like(each), alpha=1e-3)
