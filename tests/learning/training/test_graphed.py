@@ -51,11 +51,10 @@ def batch(agent: Transporter, picks: Tensor) -> Batch:
 
 
 @pytest.mark.parametrize(("kind", "config"), KINDS)
-@pytest.mark.parametrize("picks", [[[0, 39], [41, 18], [79, 2]], [[78, 37]]])
-def test_losses_and_gradients_are_the_agent_s(kind, config, picks) -> None:
+def test_losses_and_gradients_are_the_agent_s(kind, config) -> None:
     """Picks in corners too, where crops reach beyond the picture."""
     agent = kind(config, seed=0)
-    labelled = batch(agent, torch.tensor(picks))
+    labelled = batch(agent, torch.tensor([[0, 39], [41, 18], [79, 2]]))
     wanted = agent(labelled)
     got = losses_of_inputs(agent, inputs_of(agent, labelled))
     assert wanted.transport.item() > 0.1
