@@ -152,7 +152,8 @@ def test_a_descent_stops_at_the_table(emulator: EmulatorProcess, robot: PandaRob
 def test_state_can_be_read_while_the_arm_moves(
     emulator: EmulatorProcess, robot: PandaRobot
 ) -> None:
-    motion = Background(lambda: robot.move_joints(OFF_HOME, speed=0.05))
+    # longer than the time in which a motion that begins gives the last reading, on a fast host too
+    motion = Background(lambda: robot.move_joints(OFF_HOME, speed=0.01))
     wait_for_motion(emulator)
     readings = []
     while motion.running():
