@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fixtures.labelled_images import labelled_images
 from torch import Tensor
 
 from learning.models.adam import KerasAdam
@@ -28,25 +29,7 @@ PICKS = torch.tensor([[0, 39], [41, 18], [79, 2]])
 
 
 def batch(agent: Transporter) -> Batch:
-    rng = np.random.default_rng(0)
-    images = []
-    for _ in PICKS:
-        pictures = [
-            (
-                rng.integers(0, 256, (320, 160, 3), dtype=np.uint8),
-                rng.uniform(0, 0.1, (320, 160)).astype(np.float32),
-            )
-            for _ in range(agent.pictures)
-        ]
-        images.append(agent.image(*pictures))
-    count = len(PICKS)
-    return Batch(
-        image=torch.stack(images),
-        pick=PICKS,
-        place=PICKS.flip(0),
-        theta=torch.linspace(-2, 2, count),
-        lift=torch.zeros(count, dtype=torch.int64),
-    )
+    return labelled_images(agent, PICKS)
 
 
 def plainly(agent: Transporter) -> Transporter:

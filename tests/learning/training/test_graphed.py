@@ -5,10 +5,9 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from fixtures.labelled_images import labelled_images
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 
 from learning.models.batch import Batch
@@ -31,30 +30,11 @@ KINDS = (
 )
 
 
-def batch(agent: Transporter, picks: Tensor) -> Batch:
-    rng = np.random.default_rng(0)
-    images = []
-    for _ in picks:
-        pictures = [
-            (
-                rng.integers(0, 256, (320, 160, 3), dtype=np.uint8),
-                rng.uniform(0, 0.1, (320, 160)).astype(np.float32),
-            )
-            for _ in range(agent.pictures)
-        ]
-        images.append(agent.image(*pictures))
-    count = len(picks)
-    return Batch(
-        torch.stack(images), picks, picks.flip(0), torch.linspace(-2, 2, count),
-        torch.arange(count) % len(agent.config.lifts),
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(("kind", "config"), KINDS)
 def test_losses_and_gradients_are_the_agent_s(kind, config) -> None:
     """Picks in corners too, where crops reach beyond the picture."""
     agent = kind(config, seed=0)
-    labelled = batch(agent, torch.tensor([[0, 39], [41, 18], [79, 2]]))
+    labelled = labelled_images(agent, torch.tensor([[0, 39], [41, 18], [79, 2]]))
     wanted = agent(labelled)
     got = losses_of_inputs(agent, inputs_of(agent, labelled))
     assert wanted.transport.item() > 0.1
@@ -72,7 +52,7 @@ def test_losses_and_gradients_are_the_agent_s(kind, config) -> None:
 def test_nothing_that_is_done_depends_on_a_number(kind, config) -> None:
     """A tensor without numbers refuses to be asked for one, as the recording of a graph does."""
     agent = kind(config, seed=0)
-    inputs = inputs_of(agent, batch(agent, torch.tensor([[30, 20]])))
+    inputs = inputs_of(agent, labelled_images(agent, torch.tensor([[30, 20]])))
     losses_of_inputs(agent, inputs)  # what is only done once, as before the recording
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         fake = inputs.mapped(mode.from_tensor)
@@ -88,10 +68,10 @@ def test_what_is_graphed_and_what_is_refused() -> None:
     agent = Transporter(SMALL, seed=0)
     assert can_be_graphed(agent) and not can_be_graphed(torch.nn.Linear(2, 2))
     assert not can_be_graphed(Transporter(replace(SMALL, pad_features=False), seed=0))
-    outside = batch(agent, torch.tensor([[80, 3]]))
+    outside = labelled_images(agent, torch.tensor([[80, 3]]))
     with pytest.raises(InputError, match=r"pick: pixel \[80, 3\] lies outside of 80 x 40"):
         inputs_of(agent, outside)
-    inputs = inputs_of(agent, batch(agent, torch.tensor([[5, 3]])))
+    inputs = inputs_of(agent, labelled_images(agent, torch.tensor([[5, 3]])))
     assert len(inputs.tensors()) == 9 and inputs.mapped(torch.clone).tensors()[1].equal(inputs.pick)
 
 
@@ -131,7 +111,7 @@ def test_who_stops_early_waits_for_nothing_more() -> None:
 def test_a_graph_is_replayed_with_new_weights_and_batches() -> None:
     """On a GPU: steps by the graph, and by the agent alone, in turns with a change of weights."""
     agent = Transporter(SMALL, seed=0).cuda()
-    batches = [batch(agent, torch.tensor([[7 * k, 3 * k]])) for k in range(1, 5)]
+    batches = [labelled_images(agent, torch.tensor([[7 * k, 3 * k]])) for k in range(1, 5)]
     with GraphedLosses(agent, lambda step: batches[step - 1], last=4) as graphed:
         for step, labelled in enumerate(batches, 1):
             losses, gradient = graphed(step)
