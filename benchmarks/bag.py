@@ -94,7 +94,9 @@ def drops(count: int, config: BagConfig, *, pulls: int) -> tuple[Table, float]:
         worlds = range(min(LANES, count - first))
         pushes = {w: (throw(solver, w, FIRST_SEED + first + w),) for w in worlds}
         begin = time.process_time()
-        result = rollout(solver, worlds, pushes=pushes, least=PUSHED, most=MOST, record=DT)
+        result = rollout(
+            solver, worlds, pushes=pushes, min_seconds=PUSHED, max_seconds=MOST, record=DT
+        )
         cpu += time.process_time() - begin
         for w in worlds:
             r = result[w]
@@ -113,7 +115,7 @@ def drops(count: int, config: BagConfig, *, pulls: int) -> tuple[Table, float]:
             state(table, solver.particle_q(w), bag, "drop")
         for _ in range(pulls):
             paths = {w: pull(solver.particle_q(w), bag.ring, config.opening_radius) for w in worlds}
-            result = rollout(solver, worlds, paths=paths, least=0.1, most=9.0)
+            result = rollout(solver, worlds, paths=paths, min_seconds=0.1, max_seconds=9.0)
             for w in worlds:
                 rest = result[w].seconds - paths[w].times[-1] if result[w].at_rest else np.inf
                 table["pull seconds to rest"].append(rest)
@@ -145,14 +147,16 @@ def items(count: int, config: BagConfig, sizes: str) -> Table:
         worlds = range(min(LANES, count - first))
         solver, (bag,) = bag_solver(len(worlds), boxes=(box,), config=config, lanes=LANES)
         insert = {w: insertion(box, rng) for w in worlds}
-        one = rollout(solver, worlds, paths=insert, least=0.2, most=9.0, record=1 / 240)
+        one = rollout(
+            solver, worlds, paths=insert, min_seconds=0.2, max_seconds=9.0, record=1 / 240
+        )
         lift = {}
         for w in worlds:
             bead = bag.ring[rng.integers(len(bag.ring))]
             angle = rng.uniform(0, 2 * np.pi)
             way = 0.5 * np.array([np.cos(angle), np.sin(angle)])
             lift[w] = carry(solver.particle_q(w)[bead], bead, way)
-        two = rollout(solver, worlds, paths=lift, least=0.2, most=13.0, record=1 / 240)
+        two = rollout(solver, worlds, paths=lift, min_seconds=0.2, max_seconds=13.0, record=1 / 240)
         for w in worlds:
             held, gone = one[w].frames, two[w].frames
             assert held is not None and gone is not None

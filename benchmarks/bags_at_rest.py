@@ -46,7 +46,7 @@ def main() -> None:
     for first in range(FIRST, FIRST + options.bags, LANES):
         solver, _ = bag_solver(LANES, lanes=LANES)
         pushes = {w: (throw(solver, w, first + w),) for w in range(LANES)}
-        ends = rollout(solver, range(LANES), pushes=pushes, least=0.2, most=6.2)
+        ends = rollout(solver, range(LANES), pushes=pushes, min_seconds=0.2, max_seconds=6.2)
         assert all(end.at_rest for end in ends.values()), "a bag did not come to rest"
         places = positions(solver)
         moved.setdefault("asleep", []).extend(wait(solver))
@@ -56,7 +56,7 @@ def main() -> None:
         gone = 0.0
         for settled in SETTLED:
             if settled > gone:
-                rollout(awake, range(LANES), least=settled - gone, most=settled - gone)
+                rollout(awake, range(LANES), min_seconds=settled - gone, max_seconds=settled - gone)
             moved.setdefault(f"without sleep, after {settled:g} s", []).extend(wait(awake))
             gone = settled + SECONDS
     rows = [
@@ -78,7 +78,7 @@ def positions(solver: SolverFusedXPBD) -> list[np.ndarray]:
 def wait(solver: SolverFusedXPBD) -> list[float]:
     """Movement [mm] of the worst vertex of every world in `SECONDS`."""
     before = positions(solver)
-    rollout(solver, range(LANES), least=SECONDS, most=SECONDS)
+    rollout(solver, range(LANES), min_seconds=SECONDS, max_seconds=SECONDS)
     pairs = zip(positions(solver), before, strict=True)
     return [1e3 * float(np.linalg.norm(now - then, axis=1).max()) for now, then in pairs]
 

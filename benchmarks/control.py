@@ -146,7 +146,7 @@ class Scene:
             at = self.starts[:, 0]
             for target in self.targets:
                 paths = {w: self.path(w, at[w], target[w]) for w in self.worlds}
-                rollout(self.solver, self.worlds, paths=paths, least=1.0, most=SECONDS)
+                rollout(self.solver, self.worlds, paths=paths, min_seconds=1.0, max_seconds=SECONDS)
                 positions = np.stack([self.solver.particle_q(w) for w in self.worlds])
                 at = target
             return positions
@@ -174,7 +174,7 @@ class Scene:
                 paths = {w: self.path(w, *knots[w].detach().double().numpy()) for w in self.worlds}
                 points = {w: knots[w] for w in self.worlds}
                 out = rollout_tensors(
-                    self.solver, self.worlds, [SECONDS], paths=paths, way_points=points, **state
+                    self.solver, self.worlds, [SECONDS], paths=paths, waypoints=points, **state
                 )
                 state = {n: out.end[n] for n in ("positions", "velocities")}
                 at = target

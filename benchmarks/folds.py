@@ -108,7 +108,7 @@ def _folded(
     rim = np.flatnonzero((np.abs(flat[:, :2] - [0.5, 0.0]).max(axis=1)) > 0.099)
     measured, rng = [], np.random.default_rng(0)
     # compiled, and the kernels' caches filled, before anything is timed
-    rollout(solver, range(sheets), most=0.05)
+    rollout(solver, range(sheets), max_seconds=0.05)
     for fold in range(1, folds + 1):
         choices = rim if fold == 1 else np.arange(len(flat))
         paths = {}
@@ -118,7 +118,7 @@ def _folded(
             inwards = rng.normal(0, 0.04, 2) + 1.2 * (np.array([0.5, 0.0]) - at[:2])
             paths[w] = fold_path(at, tuple(inwards), particle=particle)
         began = time.process_time()
-        results = rollout(solver, range(sheets), paths=paths, least=1.2, most=2.5)
+        results = rollout(solver, range(sheets), paths=paths, min_seconds=1.2, max_seconds=2.5)
         cpu = time.process_time() - began
         ends = [_positions(solver, w) for w in range(sheets)]
         pierced = [piercing(x, cloth.faces) for x in ends]

@@ -30,7 +30,7 @@ from warp_deform.quiet import quiet_warp
 GENERATION, ELITES = 20, 5
 """Draws of the cross-entropy method a generation, and how many of them the next is drawn around."""
 SPREAD = 0.02
-"""Its first standard deviation of a way-point [m]."""
+"""Its first standard deviation of a waypoint [m]."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def straighten(seeds: int, cost: float, *, quick: bool) -> list[Straightened]:
 
 
 def _drawn(pull: straighten_cable.Pull, budget: int, rng: np.random.Generator) -> np.ndarray:
-    """The best way-points that the cross-entropy method comes by."""
+    """The best waypoints that the cross-entropy method comes by."""
     s = straighten_cable
 
     def loss(knots: np.ndarray) -> float:  # as the example's

@@ -202,7 +202,9 @@ def measure(name: str, repeats: int) -> list[Cost]:
         if repeat == 1:
             spent.clear()
         _start(solver, scene)
-        timed("", "plain", lambda: rollout(solver, worlds, least=1e3, most=scene.seconds))
+        timed(
+            "", "plain", lambda: rollout(solver, worlds, min_seconds=1e3, max_seconds=scene.seconds)
+        )
         for storage, run in runs.items():
             _start(solver, scene)
             ends = timed(storage, "taped", lambda run=run: run.forward(worlds, [scene.seconds]))

@@ -125,8 +125,8 @@ def _play(
             solver,
             worlds,
             paths=paths,
-            least=0.0 if held else LONG,
-            most=seconds,
+            min_seconds=0.0 if held else LONG,
+            max_seconds=seconds,
             record=1 / FRAME_RATE if record else 0.0,
         )
         spent += time.process_time() - begin

@@ -122,7 +122,7 @@ KINDS = (
 def _on_object(rng: np.random.Generator, worlds: Worlds, slot: int) -> np.ndarray:
     """A point (2,) on or near a random particle or body."""
     state = worlds.episodes[slot].snapshot
-    points = np.concatenate([state.particle_q[:, :2], state.body_q[:, :2]])
+    points = state.points
     return points[rng.integers(len(points))] + rng.normal(0.0, 0.003, 2)
 
 

@@ -38,7 +38,9 @@ def main(out: Path | None = None) -> float:
     shell = add_bag(builder, bag, pose)
     item = add_box(builder, cube, (0.5, -WAY / 2, 0.03 - cube.lowest))
     solver = SolverFusedXPBD(builder.finalize(device="cpu"), BAG_SOLVER)
-    rollout(solver, [0], least=1.0, most=3.0)  # the bag sinks a little, the cube drops into it
+    rollout(
+        solver, [0], min_seconds=1.0, max_seconds=3.0
+    )  # the bag sinks a little, the cube drops into it
 
     bead = shell.ring[0]
     start = solver.particle_q(0)[bead].astype(float)
@@ -51,7 +53,13 @@ def main(out: Path | None = None) -> float:
     # the descent ends where what is held touches something
     path = GripPath(times, knots, particle=bead, lower=(times[-2], times[-1]))
     result = rollout(
-        solver, [0], paths={0: path}, least=0.3, most=times[-1] + 4.0, calm_after=0.2, record=0.1
+        solver,
+        [0],
+        paths={0: path},
+        min_seconds=0.3,
+        max_seconds=times[-1] + 4.0,
+        calm_after=0.2,
+        record=0.1,
     )[0]
 
     assert not result.watch.problems(0, solver.config.limits) and result.frames is not None

@@ -38,7 +38,7 @@ def main(out: Path | None = None) -> float:
     SolverFusedXPBD.register_custom_attributes(builder)
     handle = add_cable(builder, cable, zigzag(cable, 0.28))
     solver = SolverFusedXPBD(builder.finalize(device="cpu"))
-    rollout(solver, [0], least=0.5, most=3.0)
+    rollout(solver, [0], min_seconds=0.5, max_seconds=3.0)
 
     start = solver.particle_q(0)[-1].astype(float)
     goal = np.array([0.72, 0.0, start[2]])
@@ -49,7 +49,7 @@ def main(out: Path | None = None) -> float:
     # a short rest on the table before the release lets the links settle
     times = np.concatenate([[0.0], np.cumsum(lengths / SPEED)])
     path = GripPath(np.append(times, times[-1] + 0.2), knots, particle=cable.beads - 1)
-    result = rollout(solver, [0], paths={0: path}, least=0.3, most=times[-1] + 5.0)[0]
+    result = rollout(solver, [0], paths={0: path}, min_seconds=0.3, max_seconds=times[-1] + 5.0)[0]
 
     beads = solver.particle_q(0)
     assert not result.watch.problems(0, solver.config.limits)

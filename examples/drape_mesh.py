@@ -51,7 +51,7 @@ def main(path: Path | None = None, out: Path | None = None) -> np.ndarray:
     cloth = add_cloth_mesh(builder, ClothConfig(), mesh, pose)
     objects = [cloth, add_box(builder, block, (0.5, 0.0, 0.03))]
     solver = SolverFusedXPBD(builder.finalize(device="cpu"), CLOTH_SOLVER)
-    result = rollout(solver, [0], least=1.0, most=6.0)[0]
+    result = rollout(solver, [0], min_seconds=1.0, max_seconds=6.0)[0]
 
     x, box = solver.particle_q(0), solver.body_q(0)
     assert not result.watch.problems(0, solver.config.limits)

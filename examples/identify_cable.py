@@ -35,7 +35,7 @@ class Pull:
         self.cord = add_cable(builder, CORD, start)
         air, model = SolverConfig(damping=1.0), builder.finalize(device="cpu")
         solver = SolverFusedXPBD(model, air, precision="float64")
-        rollout(solver, [0], least=1.0, most=1.0)
+        rollout(solver, [0], min_seconds=1.0, max_seconds=1.0)
         self.start, self.calls = solver.particle_q(0), 0
         self.path = GripPath(np.array([0, 0.5, 0.8, 1.2, 1.5]), self.start[-1] + LEAD, particle=23)
         self.run = DifferentiableRollout(solver, storage="full")

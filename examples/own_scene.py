@@ -33,7 +33,7 @@ def main(out: Path | None = None) -> np.ndarray:
     SolverFusedXPBD.register_custom_attributes(builder)
     objects = [add_box(builder, block, (0.5, 0.0, 0.03)), add_cable(builder, cable, above)]
     solver = SolverFusedXPBD(builder.finalize(device="cpu"))
-    result = rollout(solver, [0], least=1.0, most=5.0)[0]
+    result = rollout(solver, [0], min_seconds=1.0, max_seconds=5.0)[0]
 
     beads, box = solver.particle_q(0), solver.body_q(0)
     assert not result.watch.problems(0, solver.config.limits)

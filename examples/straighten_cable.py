@@ -57,7 +57,7 @@ def descend(pull: Pull, guess: np.ndarray) -> np.ndarray:
         haste = 0.01 * torch.relu(speed / FASTEST - 1).square().mean()  # [m^2], as the loss
         best = min(best, (off(pull.simulate(now)) ** 2 + haste.item(), now), key=lambda b: b[0])
         error = (pull.simulate(now, DAMPING) - LINE) * [1, 1, 0]
-        by = pull.run.backward(2 / 24 * error[None, None]).way_points[0][:, :2]
+        by = pull.run.backward(2 / 24 * error[None, None]).waypoints[0][:, :2]
         knots.grad = torch.autograd.grad(haste, knots)[0] + torch.tensor(by)
         knots.grad[[0, -1]] = 0  # where the pull starts and ends is given
         torch.nn.utils.clip_grad_norm_([knots], 0.02)

@@ -37,7 +37,7 @@ class RefineOptions(RefineSettings, CommandOptions):
     """Simulated actions that the search for one action may spend."""
     lifts: bool = False
     """Let the search move the lift of an action too; policies lift as the task does."""
-    way_points: bool = False
+    waypoints: bool = False
     """Bend the paths of the recorded actions instead, by the gradient. No policy can follow such
     paths, so the folder then holds paths and no demonstrations."""
     trajectories: bool = False
@@ -65,7 +65,7 @@ def refine(options: RefineOptions) -> Outcome:
     _refuse(options, ("evaluations", "horizon", "video"), "goes with --trajectories")
     if options.method not in get_args(_OfActions):
         raise InputError(f"--method {options.method} goes with --trajectories")
-    if options.way_points:
+    if options.waypoints:
         return _bend(options)
     config = options.configure(RefineConfig, search=options.configure(SearchConfig))
     report = refine_folder(config)
@@ -93,7 +93,7 @@ def _trajectories(options: RefineOptions) -> Outcome:
     from ..refinement.film import check_filmed, film_refined
     from ..refinement.trajectories import TrajectoryConfig, refine_trajectories
 
-    others = ("accept", "depth", "budget", "lifts", "way_points")
+    others = ("accept", "depth", "budget", "lifts", "waypoints")
     _refuse(options, others, "does not go with --trajectories")
     if options.method in ("enumerate", "gradient"):
         raise InputError(f"--method {options.method} does not go with --trajectories")
@@ -120,21 +120,21 @@ def _trajectories(options: RefineOptions) -> Outcome:
 def _bend(options: RefineOptions) -> Outcome:
     """Bend the paths of a folder's actions."""
     from warp_deform.planning.action_search import GRADIENT_COST
-    from warp_deform.planning.waypoints import WayPointConfig
+    from warp_deform.planning.waypoints import WaypointConfig
 
     from ..refinement.waypoints import BendConfig, bend
 
     applies = {field.name for kind in (FolderSettings, CommandOptions) for field in fields(kind)}
-    given = {name: getattr(options, name) for name in (*applies, "budget", "way_points")}
+    given = {name: getattr(options, name) for name in (*applies, "budget", "waypoints")}
     if options != RefineOptions(**given):
-        raise InputError("of the search's flags --way-points takes only --budget and --workers")
+        raise InputError("of the search's flags --waypoints takes only --budget and --workers")
     steps = options.budget // (GRADIENT_COST + 1)
     if steps < 1:
         raise InputError(
             f"a step of waypoints costs {GRADIENT_COST + 1} simulated actions; "
             "give --budget that or more"
         )
-    config = options.configure(BendConfig, bending=WayPointConfig(steps=steps))
+    config = options.configure(BendConfig, bending=WaypointConfig(steps=steps))
     report = bend(config)
     text = (
         f"{options.out}: {report.bent} of {report.actions} paths bent (no demonstrations), in "

@@ -5,8 +5,8 @@ along its straight path and along paths whose waypoints descend the gradient of 
 best one is written, with what both lead to. That is no demonstration: an action's seven numbers,
 which are all that a policy has, cannot say such a path. So the folder holds no episodes.
 
-way_points.json             the label: what the paths are of, and how they were found
-way_points_000000300.json   the actions of the episode of seed 300
+waypoints.json             the label: what the paths are of, and how they were found
+waypoints_000000300.json   the actions of the episode of seed 300
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from warp_deform.collecting.replay import Recording
 from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import EpisodeReader, combine_hashes
 from warp_deform.errors import InputError
-from warp_deform.planning.waypoints import BentPath, WayPointConfig, WayPoints
+from warp_deform.planning.waypoints import BentPath, WaypointConfig, Waypoints
 from warp_deform.rollout.rollouts import GripPath
 from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
@@ -38,11 +38,11 @@ from warp_deform.worlds.worlds import Worlds
 from .refine import seeds_by_task
 from .settings import FolderSettings
 
-__all__ = ["WAY_POINTS", "BendConfig", "BendReport", "bend", "read_path"]
+__all__ = ["WAYPOINTS", "BendConfig", "BendReport", "bend", "read_path"]
 
-WAY_POINTS = "way-points"
+WAYPOINTS = "waypoints"
 """What the label calls the folder's contents, where other folders name a demonstrator."""
-_LABEL = "way_points.json"
+_LABEL = "waypoints.json"
 _FORMAT = 1
 _CHUNK = 8
 _COLLECTED = 32
@@ -53,7 +53,7 @@ _COLLECTED = 32
 class BendConfig(FolderSettings):
     """The paths of which folder are bent, and how; `out` is then a folder for paths."""
 
-    bending: WayPointConfig = field(default_factory=WayPointConfig)
+    bending: WaypointConfig = field(default_factory=WaypointConfig)
     """How waypoints are moved."""
 
 
@@ -123,7 +123,7 @@ def bend(config: BendConfig) -> BendReport:
         return math.fsum(a[when][what] for a in ran) / len(ran) if ran else None
 
     return BendReport(
-        demonstrator=WAY_POINTS,
+        demonstrator=WAYPOINTS,
         episodes=len(infos),
         actions=len(ran),
         bent=sum(a["path"] is not None for a in ran),
@@ -136,7 +136,7 @@ def bend(config: BendConfig) -> BendReport:
 
 
 def read_path(written: Mapping[str, Any]) -> GripPath:
-    """A path as it was written, bit for bit, for `WayPoints.run`.
+    """A path as it was written, bit for bit, for `Waypoints.run`.
 
     Raises:
         InputError: it is not one.
@@ -167,14 +167,14 @@ class _Chunk:
 def _bend_chunk(chunk: _Chunk) -> Iterator[int]:
     config, worlds = chunk.config, worlds_for(chunk.task, chunk.robot)
     recording = Recording(EpisodeReader(config.source))
-    bending = WayPoints(worlds.task, robot=chunk.robot, precision=worlds.precision)
+    bending = Waypoints(worlds.task, robot=chunk.robot, precision=worlds.precision)
     for seed in chunk.seeds:
         jobs = _recorded(worlds, recording, seed)
         steps = recording.episodes.pop(seed).steps
         bent = bending.bend(jobs, config.bending)
         story = {
             "format": _FORMAT,
-            "demonstrator": WAY_POINTS,
+            "demonstrator": WAYPOINTS,
             "task": chunk.task,
             "robot": chunk.robot,
             "seed": seed,
@@ -237,7 +237,7 @@ def _label(config: BendConfig, recorded: str) -> None:
     """Label the folder, or make sure that it has this label."""
     label = {
         "format": _FORMAT,
-        "demonstrator": WAY_POINTS,
+        "demonstrator": WAYPOINTS,
         "recorded": recorded,
         "bending": asdict(config.bending),
     }
@@ -256,7 +256,7 @@ def _label(config: BendConfig, recorded: str) -> None:
 
 
 def _file(folder: Path, seed: int) -> Path:
-    return folder / f"way_points_{seed:09d}.json"
+    return folder / f"waypoints_{seed:09d}.json"
 
 
 def _write(path: Path, values: Mapping[str, Any]) -> None:

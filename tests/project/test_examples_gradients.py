@@ -71,7 +71,7 @@ def test_a_pull_straightens_and_needs_the_slopes(monkeypatch: pytest.MonkeyPatch
 
     def reversed_path(self: DifferentiableRollout, *of: Any) -> Gradients:
         out = right(self, *of)
-        return replace(out, way_points={0: -out.way_points[0]})
+        return replace(out, waypoints={0: -out.waypoints[0]})
 
     monkeypatch.setattr(DifferentiableRollout, "backward", reversed_path)
     lost = straighten_cable.off(pull.simulate(straighten_cable.descend(pull, guess)))

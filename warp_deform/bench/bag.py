@@ -71,9 +71,9 @@ def _play(scene: str, solver: SolverFusedXPBD, seeds: list[int]) -> Played:
             data.set_bodies(world, np.array([[*start.cube, 0.0, 0.0, 0.0, 1.0]]))
     worlds, fall, lie = range(len(seeds)), starts[0].before, starts[0].after
     begin = time.process_time()
-    done = [rollout(solver, worlds, least=1e3, most=fall)]
+    done = [rollout(solver, worlds, min_seconds=1e3, max_seconds=fall)]
     middle = time.process_time()
-    done.append(rollout(solver, worlds, least=1e3, most=lie))
+    done.append(rollout(solver, worlds, min_seconds=1e3, max_seconds=lie))
     end = time.process_time()
     return Played(
         cpu=middle - begin,

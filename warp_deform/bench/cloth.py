@@ -74,16 +74,16 @@ def _play(solver: SolverFusedXPBD, seeds: list[int]) -> Played:
     data.reset()
     worlds = range(len(seeds))
     begin = time.process_time()
-    done = [rollout(solver, worlds, least=_SETTLE, most=_SETTLE)]
+    done = [rollout(solver, worlds, min_seconds=_SETTLE, max_seconds=_SETTLE)]
     paths = {}
     for w, seed in enumerate(seeds):
         way = np.random.default_rng(seed).uniform(0.08, 0.16, 2)
         start = data.lane("particles.x", w)[0].astype(float)
         knots = start + np.array([[0, 0, 0], [0, 0, 0.08], [*way, 0.08], [*way, 0.01]])
         paths[w] = GripPath(np.array([0, 0.3, 1.0, _FOLD]), knots, particle=0)
-    done.append(rollout(solver, worlds, paths=paths, most=_FOLD))
+    done.append(rollout(solver, worlds, paths=paths, max_seconds=_FOLD))
     middle = time.process_time()
-    done.append(rollout(solver, worlds, least=_LIE, most=_LIE))
+    done.append(rollout(solver, worlds, min_seconds=_LIE, max_seconds=_LIE))
     end = time.process_time()
     return Played(
         cpu=end - begin,

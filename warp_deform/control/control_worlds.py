@@ -244,11 +244,11 @@ class ControlWorlds:
                 slot: task.plan_for(self.worlds.episodes[slot].layout, rngs[slot])
                 for slot in waiting
             }
-            led = {slot: plan for slot, plan in plans.items() if plan is not None}
-            if not led:
+            drawn = {slot: plan for slot, plan in plans.items() if plan is not None}
+            if not drawn:
                 return
-            ends = self._led(led)
-            for slot in led:
+            ends = self._ends_of(drawn)
+            for slot in drawn:
                 self.worlds.restore(slot, before[slot])
                 episode = self.worlds.episodes[slot]
                 if slot in ends and task.is_goal(ends[slot]):
@@ -259,7 +259,7 @@ class ControlWorlds:
         seeds = ", ".join(str(self.worlds.episodes[slot].seed) for slot in waiting)
         raise WarpDeformError(f"{task.name}: no goal in {_DRAWS} draws for seed {seeds}")
 
-    def _led(self, plans: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+    def _ends_of(self, plans: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
         """Particles (P, 3) [m] at the ends of plans, of those that no guard has ended."""
         slots = list(plans)
         self._begin(slots, {})

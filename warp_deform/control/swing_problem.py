@@ -164,7 +164,7 @@ class SwingProblem:
         self._put(of)
         seconds = self.steps * self._control.control.loop.seconds
         paths = self._paths(of, steps)
-        runs = rollout(solver, worlds, paths=paths, least=2 * seconds, most=seconds)
+        runs = rollout(solver, worlds, paths=paths, min_seconds=2 * seconds, max_seconds=seconds)
         ends = np.stack([solver.particle_q(w).astype(float) for w in worlds])
         limits = solver.config.limits
         wrong = [bool(runs[w].watch.problems(w, limits)) for w in worlds]
@@ -238,7 +238,7 @@ class SwingProblem:
         with torch.enable_grad():
             losses = self._losses_of(of, places)
             (by_places,) = torch.autograd.grad(losses.sum(), places)
-        ways = run.backward(by_places[:, None].numpy(), parts=False).way_points
+        ways = run.backward(by_places[:, None].numpy(), parts=False).waypoints
         by_ways = np.stack([ways[w] for w in worlds], axis=1)
         by_ways[-2] += by_ways[-1]  # the last target stands there twice
         free = torch.tensor(numbers, dtype=torch.float64, requires_grad=True)

@@ -48,7 +48,7 @@ class _Target:
 
 
 @dataclass(eq=False)
-class _Led:
+class _Guidance:
     """One episode: whose turn it is, and what the tip still has to do."""
 
     run: EpisodeRun[Any]
@@ -83,7 +83,7 @@ class TipDemonstrator:
     def __init__(self, control: ControlWorlds, name: str | Act[Any] = "scripted") -> None:
         if control.targets.mode not in LED_MODES:
             raise InputError(
-                f"demonstrations are led in {' or '.join(LED_MODES)}, not {control.targets.mode!r}"
+                f"demonstrations are made in {' or '.join(LED_MODES)}, not {control.targets.mode!r}"
             )
         self._control = control
         self._act = demonstrator(name) if isinstance(name, str) else name
@@ -95,7 +95,7 @@ class TipDemonstrator:
             turn_speed=min(primitive.turn_speed, turn) if self._turns else 1e6,
             dwell=_DWELL,
         )
-        self._led: dict[int, _Led] = {}
+        self._guidance: dict[int, _Guidance] = {}
 
     @property
     def _turns(self) -> bool:
@@ -105,57 +105,61 @@ class TipDemonstrator:
         """Begin with slots that were just reset."""
         for slot in slots:
             seed = self._control.worlds.episodes[slot].seed
-            self._led[slot] = _Led(EpisodeRun(seed, episode_rng(seed, DEMONSTRATOR_STREAM)))
+            self._guidance[slot] = _Guidance(
+                EpisodeRun(seed, episode_rng(seed, DEMONSTRATOR_STREAM))
+            )
 
     def act(self, slots: Sequence[int]) -> dict[int, np.ndarray | None]:
         """Next actions (A,) float32 by slot; None where the demonstrator sees nothing to do."""
         return {slot: self._next(slot) for slot in slots}
 
     def _next(self, slot: int) -> np.ndarray | None:
-        led = self._led[slot]
+        guidance = self._guidance[slot]
         holds = self._control.holding(slot)
-        if holds and not led.loaded:
-            self._carry(slot, led)
-        elif led.loaded and not holds and led.targets and led.targets[0].hold:
-            led.targets, led.loaded = [], False  # it lost what it had
-        if not led.targets and not self._approach(slot, led):
+        if holds and not guidance.loaded:
+            self._carry(slot, guidance)
+        elif guidance.loaded and not holds and guidance.targets and guidance.targets[0].hold:
+            guidance.targets, guidance.loaded = [], False  # it lost what it had
+        if not guidance.targets and not self._approach(slot, guidance):
             return None
-        target = led.targets.pop(0)
-        if led.loaded and not target.hold:
-            led.loaded = False
+        target = guidance.targets.pop(0)
+        if guidance.loaded and not target.hold:
+            guidance.loaded = False
         return self._towards(slot, target)
 
-    def _approach(self, slot: int, led: _Led) -> bool:
+    def _approach(self, slot: int, guidance: _Guidance) -> bool:
         """Plan the way to the next pick; False: there is none."""
         worlds = self._control.worlds
-        chosen = self._act(worlds, {slot: led.run})[slot]
+        chosen = self._act(worlds, {slot: guidance.run})[slot]
         if chosen is None:
             return False
         episode = worlds.episodes[slot]
         action = snapped(chosen, self._control.task, episode.snapshot, np.inf)
-        led.action, led.loaded = action, False
+        guidance.action, guidance.loaded = action, False
         tip = self._asked(slot)
         q, bodies = episode.snapshot.particle_q, episode.snapshot.body_q
         grasp = find_grasp(action[:3], episode.objects, q, bodies, self._primitive)
         if grasp is None:
             return False
         motion = approach(tip, action[:3], _TRAVEL, grasp.height, self._primitive)
-        led.targets = self._steps(motion, hold=False)
+        guidance.targets = self._steps(motion, hold=False)
         # it takes at the beginning of a step, so with the take it already rises
         up = min(self._stage(action).speed, self._control.config.max_speed)
         rise = up * self._control.config.seconds
-        led.targets.append(_Target(led.targets[-1].pose + np.array([0, 0, rise, 0]), hold=True))
+        guidance.targets.append(
+            _Target(guidance.targets[-1].pose + np.array([0, 0, rise, 0]), hold=True)
+        )
         return True
 
-    def _carry(self, slot: int, led: _Led) -> None:
+    def _carry(self, slot: int, guidance: _Guidance) -> None:
         """Plan how what was just taken is carried, lowered and let go."""
         asked = self._asked(slot)
-        if led.action is None:  # it was held from the start
-            chosen = self._act(self._control.worlds, {slot: led.run})[slot]
+        if guidance.action is None:  # it was held from the start
+            chosen = self._act(self._control.worlds, {slot: guidance.run})[slot]
             if chosen is None:
                 return
-            led.action = chosen
-        action = np.concatenate([asked[[0, 1, 3]], led.action[3:]])
+            guidance.action = chosen
+        action = np.concatenate([asked[[0, 1, 3]], guidance.action[3:]])
         stage, floor = self._stage(action), float(self._control.targets.floors[slot])
         particle, body = self._control.grips[slot]
         objects = self._control.worlds.episodes[slot].objects
@@ -164,13 +168,13 @@ class TipDemonstrator:
             sheet=any(isinstance(o, Cloth | Bag) and particle in o.particles for o in objects),
         )  # fmt: skip
         motion, _ = carry(action, grasp, stage, floor, _TRAVEL, self._primitive)
-        loaded = Motion(motion.times[:-1], motion.way_points[:-1])
-        led.targets = self._steps(loaded, hold=True)
-        bottom = loaded.way_points[-1]
+        loaded = Motion(motion.times[:-1], motion.waypoints[:-1])
+        guidance.targets = self._steps(loaded, hold=True)
+        bottom = loaded.waypoints[-1]
         above = bottom + np.array([0, 0, _TRAVEL, 0])
         way = Motion(np.array([0.0, _TRAVEL / _RISE]), np.stack([bottom, above]))
-        led.targets += self._steps(way, hold=False)
-        led.loaded = True
+        guidance.targets += self._steps(way, hold=False)
+        guidance.loaded = True
 
     def _stage(self, action: np.ndarray) -> Stage:
         stage = self._control.task.stage_of(float(action[6]))
@@ -188,7 +192,7 @@ class TipDemonstrator:
         for k in range(len(motion.times) - 1):
             seconds = float(motion.times[k + 1] - motion.times[k])
             count = int(np.ceil(seconds / self._control.config.seconds - _STEP))
-            a, b = motion.way_points[k], motion.way_points[k + 1]
+            a, b = motion.waypoints[k], motion.waypoints[k + 1]
             targets += [_Target(a + (b - a) * (i / count), hold) for i in range(1, count + 1)]
         return targets
 

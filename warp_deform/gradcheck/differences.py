@@ -31,7 +31,7 @@ STEPS = {
     "body_poses": 1e-7,
     "body_velocities": 2.5e-4,
     "body_inverse_masses": 3e-2,
-    "way_points": 1e-7,
+    "waypoints": 1e-7,
     "knot_times": 1e-6,
     "knot_rotations": 1e-6,
     "damping": 10.0,
@@ -251,7 +251,7 @@ def _base(worlds: Worlds, path: GripPath | None) -> dict[str, np.ndarray]:
         "body_inverse_masses": data.arrays["bodies.w0"].view[data.body_rows(0)].copy(),
     }
     if path is not None:
-        values["way_points"] = np.asarray(path.positions, dtype=float)
+        values["waypoints"] = np.asarray(path.positions, dtype=float)
         values["knot_times"] = np.asarray(path.times, dtype=float)
         if path.rotations is not None:
             values["knot_rotations"] = np.asarray(path.rotations, dtype=float)

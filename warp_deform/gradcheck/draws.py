@@ -93,8 +93,8 @@ def draw_states(
             worlds.solver,
             range(each),
             paths=dict.fromkeys(range(each), start.path),
-            least=1e3,
-            most=dict(enumerate(times)),
+            min_seconds=1e3,
+            max_seconds=dict(enumerate(times)),
         )
         states = [worlds.state(slot) for slot in range(each)]
         met = [touching_of(worlds, slot).copy() for slot in range(each)]

@@ -17,7 +17,7 @@ __all__ = ["ARM", "Loss", "put_back", "roll"]
 
 ARM = 0.05
 """A turn moves a point so far from the centre by as much as a unit of position does [m]."""
-_OF_PATH = ("way_points", "knot_times", "knot_rotations")
+_OF_PATH = ("waypoints", "knot_times", "knot_rotations")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def _together(
         for w in range(count):
             paths[w] = replace(
                 path,
-                positions=moved["way_points"][w],
+                positions=moved["waypoints"][w],
                 times=moved["knot_times"][w],
                 rotations=moved["knot_rotations"][w] if "knot_rotations" in moved else None,
             )

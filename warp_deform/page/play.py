@@ -234,7 +234,7 @@ class PlaySession:
                 told = {"seed": self.run.seed, "actions": len(self.run.actions) + 1}
                 post(pack("lead", approach[0], end=approach[1], **told))
 
-        report = worlds.step({0: action}, record=1.0 / FRAMES_A_SECOND, led=lead)[0]
+        report = worlds.step({0: action}, record=1.0 / FRAMES_A_SECOND, on_carry=lead)[0]
         if report.outcome is Outcome.UNREACHABLE and who == HUMAN:
             worlds.restore(0, before)
             raise InputError("the arm cannot reach there with its tip down; nothing has moved")

@@ -69,10 +69,10 @@ def move_both(
             moving[i] = moved, replace(follow, like=like), pair
             tries.append(moving[i][:2])
     firsts = lookahead.try_each([(state, action) for action, _ in tries], keep=True)
-    led = [(f, o) for (_, f), o in zip(tries, firsts, strict=True) if o.after and o.goes_on]
-    jobs = [(o.after, f.action(o.after.episode.snapshot)) for f, o in led if o.after]
+    followed = [(f, o) for (_, f), o in zip(tries, firsts, strict=True) if o.after and o.goes_on]
+    jobs = [(o.after, f.action(o.after.episode.snapshot)) for f, o in followed if o.after]
     seconds = lookahead.try_each(jobs)
     return [
         (replace(o, origin="gradient"), replace(second, origin="gradient"))
-        for (_, o), second in zip(led, seconds, strict=True)
+        for (_, o), second in zip(followed, seconds, strict=True)
     ]

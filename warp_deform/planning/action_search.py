@@ -113,22 +113,24 @@ def search(
         return tried
     rest = config.budget - first
     jointly = rest // 2 if config.joint and config.method == "gradient" else 0
-    led: list[Pair] = []
+    followed: list[Pair] = []
     for outlook in beam:
         assert outlook.after is not None
         from_there = _Around(lookahead, task, outlook.after, rng, config, keep=False)
         seconds = from_there.tried((rest - jointly) // len(beam))
-        led.append((outlook, max([outlook, *seconds], key=lambda o: o.rank)))
-    led += [(o, o) for o in tried if o.solved]  # but with an item that is not enclosed
-    led.sort(key=lambda pair: pair[1].rank, reverse=True)
+        followed.append((outlook, max([outlook, *seconds], key=lambda o: o.rank)))
+    followed += [(o, o) for o in tried if o.solved]  # but with an item that is not enclosed
+    followed.sort(key=lambda pair: pair[1].rank, reverse=True)
     if jointly >= JOINT_COST:
         steps = min(JOINT_STEPS, jointly // JOINT_COST)
-        pairs = [pair for pair in led if pair[0] is not pair[1]][: jointly // (steps * JOINT_COST)]
-        led += move_both(
+        pairs = [pair for pair in followed if pair[0] is not pair[1]][
+            : jointly // (steps * JOINT_COST)
+        ]
+        followed += move_both(
             lookahead, task, state, pairs, around.places, steps=steps, scale=_scale(config)
         )
-        led.sort(key=lambda pair: pair[1].rank, reverse=True)
-    chosen = [outlook for outlook, _ in led]
+        followed.sort(key=lambda pair: pair[1].rank, reverse=True)
+    chosen = [outlook for outlook, _ in followed]
     return chosen + [o for o in tried if o not in chosen]
 
 

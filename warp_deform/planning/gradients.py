@@ -145,7 +145,7 @@ class ActionGradients:
         growth = _growth(gradients, ends)
         of_slots = {}
         for k, slot in enumerate(leg.slots):
-            by = gradients.way_points[slot], gradients.knot_times[slot]
+            by = gradients.waypoints[slot], gradients.knot_times[slot]
             usable = bool(np.isfinite(losses[k]) and all(np.isfinite(part).all() for part in by))
             of_slots[slot] = KnotGradient(losses[k], *by, float(growth[k]), usable)
         return of_slots
@@ -289,7 +289,7 @@ def _most(particles: np.ndarray, bodies: np.ndarray) -> np.ndarray:
 def _chained(leg: _Leg, slot: int, gradients: Gradients, numbers: Sequence[int]) -> np.ndarray:
     """Chain derivatives by the knots of a slot's path back to some numbers of its action."""
     carried, action, out = leg.carries[slot], leg.actions[slot], []
-    by_points, by_times = gradients.way_points[slot], gradients.knot_times[slot]
+    by_points, by_times = gradients.waypoints[slot], gradients.knot_times[slot]
     for at in numbers:
         ends = []
         for sign in (1, -1):

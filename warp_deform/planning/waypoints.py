@@ -31,13 +31,13 @@ from .places import MOST_GROWTH
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["BentPath", "PathResult", "WayPointConfig", "WayPoints"]
+__all__ = ["BentPath", "PathResult", "WaypointConfig", "Waypoints"]
 
 _LOW, _HIGH = np.array(BOUNDS[:2]).T
 
 
 @dataclass(frozen=True, kw_only=True)
-class WayPointConfig:
+class WaypointConfig:
     """How waypoints are moved."""
 
     points: int = 6
@@ -81,7 +81,7 @@ class BentPath:
     growth: float
 
 
-class WayPoints:
+class Waypoints:
     """Worlds in which the paths of up to `LANES` actions are bent at once.
 
     rest_limit: see `Worlds`
@@ -92,7 +92,7 @@ class WayPoints:
         self._gradients = gradients_for(task, robot, precision)
 
     def bend(
-        self, jobs: Sequence[tuple[WorldState, Action]], config: WayPointConfig
+        self, jobs: Sequence[tuple[WorldState, Action]], config: WaypointConfig
     ) -> list[BentPath]:
         """The best path found for each action from its state, in the order given.
 
@@ -134,18 +134,18 @@ class WayPoints:
         return ran
 
     def _bend_lanes(
-        self, jobs: Sequence[tuple[WorldState, Action]], config: WayPointConfig
+        self, jobs: Sequence[tuple[WorldState, Action]], config: WaypointConfig
     ) -> list[BentPath]:
-        led = dict(enumerate(jobs))
-        carries = self._lead(led)
-        straight = {slot: carried(led[slot][1])[1] for slot, carried in carries.items()}
+        by_slot = dict(enumerate(jobs))
+        carries = self._lead(by_slot)
+        straight = {slot: carried(by_slot[slot][1])[1] for slot, carried in carries.items()}
         bends = {
             slot: bend
             for slot, path in straight.items()
-            if (bend := _Bend.of(path, float(led[slot][1][6]), config.points)) is not None
+            if (bend := _Bend.of(path, float(by_slot[slot][1][6]), config.points)) is not None
         }
-        led = {slot: led[slot] for slot in bends}
-        before = self.run(led, {slot: straight[slot] for slot in led})
+        by_slot = {slot: by_slot[slot] for slot in bends}
+        before = self.run(by_slot, {slot: straight[slot] for slot in by_slot})
         best: dict[int, tuple[PathResult, GripPath | None]] = {
             s: (ran, None) for s, ran in before.items()
         }
@@ -157,7 +157,7 @@ class WayPoints:
         used, growth = dict.fromkeys(slots, 0), dict.fromkeys(slots, 0.0)
         for _ in range(config.steps if slots else 0):
             paths = {slot: bends[slot].path(values[k]) for k, slot in enumerate(slots)}
-            of_slots = self._gradients.by_knots({slot: led[slot] for slot in slots}, paths)
+            of_slots = self._gradients.by_knots({slot: by_slot[slot] for slot in slots}, paths)
             by_value, drawn = np.zeros_like(values), set[int]()
             for k, slot in enumerate(slots):
                 gradient = of_slots.get(slot)
@@ -172,7 +172,7 @@ class WayPoints:
                 near = best_values[k] + rngs[k].normal(0.0, config.rate, values.shape[1])
                 values[k] = bends[slot].limited(near if k in drawn else values[k] + change[k])
             tries = {slot: bends[slot].path(values[k]) for k, slot in enumerate(slots)}
-            for slot, ran in self.run({slot: led[slot] for slot in slots}, tries).items():
+            for slot, ran in self.run({slot: by_slot[slot] for slot in slots}, tries).items():
                 if ran.loss < best[slot][0].loss:
                     best[slot] = ran, tries[slot]
                     best_values[slots.index(slot)] = values[slots.index(slot)]

@@ -159,12 +159,12 @@ class Robot:
         Raises:
             InputError: wrong shape, or a value that is not finite
         """
-        way_points = _batch(xyz_yaw, (4,), "xyz_yaw")
-        return self._follow(way_points, np.arange(len(way_points)), seed)
+        waypoints = _batch(xyz_yaw, (4,), "xyz_yaw")
+        return self._follow(waypoints, np.arange(len(waypoints)), seed)
 
     def trajectory(
         self,
-        way_points: np.ndarray,
+        waypoints: np.ndarray,
         *,
         seed: np.ndarray | None = None,
         lengths: Sequence[int] | None = None,
@@ -181,15 +181,15 @@ class Robot:
         Raises:
             InputError: wrong shape, a value that is not finite, or lengths that do not add up
         """
-        way_points = _batch(way_points, (4,), "way_points")
-        counts = np.array([len(way_points)] if lengths is None else lengths, dtype=np.int64)
-        if not len(way_points) and not counts.any():
+        waypoints = _batch(waypoints, (4,), "waypoints")
+        counts = np.array([len(waypoints)] if lengths is None else lengths, dtype=np.int64)
+        if not len(waypoints) and not counts.any():
             return self._nothing()
-        if counts.ndim != 1 or counts.sum() != len(way_points) or counts.min() < 1:
+        if counts.ndim != 1 or counts.sum() != len(waypoints) or counts.min() < 1:
             raise InputError(
-                f"lengths: positive numbers that add up to {len(way_points)}, not {counts.tolist()}"
+                f"lengths: positive numbers that add up to {len(waypoints)}, not {counts.tolist()}"
             )
-        return self._follow(way_points, np.cumsum(counts) - counts, seed)
+        return self._follow(waypoints, np.cumsum(counts) - counts, seed)
 
     @property
     def reach_by_height(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -260,24 +260,24 @@ class Robot:
         return tuple(drawn)
 
     def _follow(
-        self, way_points: np.ndarray, starts: np.ndarray, seed: np.ndarray | None
+        self, waypoints: np.ndarray, starts: np.ndarray, seed: np.ndarray | None
     ) -> IKResult:
         """Solve paths of tip-down waypoints that set out at the rows `starts`."""
-        if not len(way_points):
+        if not len(waypoints):
             return self._nothing()
         reference = self._seeds(self.home_q if seed is None else seed, len(starts))[:, -1]
-        start = self._posture(way_points, starts, reference)
-        return self._arm.solve(self.top_down(way_points), start, iterations=TOP_DOWN_ITERATIONS)
+        start = self._posture(waypoints, starts, reference)
+        return self._arm.solve(self.top_down(waypoints), start, iterations=TOP_DOWN_ITERATIONS)
 
     def _nothing(self) -> IKResult:
         """Return the answer to no poses."""
         return IKResult(np.zeros((0, self.dof)), np.zeros(0, bool), np.zeros(0), np.zeros(0))
 
     def _posture(
-        self, way_points: np.ndarray, starts: np.ndarray, reference: np.ndarray
+        self, waypoints: np.ndarray, starts: np.ndarray, reference: np.ndarray
     ) -> np.ndarray:
         """Return the closed-form postures of paths, the last joint unwrapped from `reference`."""
-        posture = self._config.posture(way_points)
+        posture = self._config.posture(waypoints)
         low, high = self._arm.low[-1], self._arm.high[-1]
         posture[:, -1] = unwrap(posture[:, -1], starts, reference, low, high)
         return posture

@@ -126,7 +126,7 @@ class Motion:
     """A stretch of the tip's motion: waypoints (K, 4) x, y, z [m], yaw [rad] at times (K,) [s]."""
 
     times: np.ndarray
-    way_points: np.ndarray
+    waypoints: np.ndarray
 
     @property
     def seconds(self) -> float:
@@ -242,11 +242,11 @@ def carry(
     lowered = loaded.seconds
     lower = lowered - down.seconds, lowered
     times = np.append(loaded.times, lowered + config.dwell)
-    way_points = np.vstack([loaded.way_points, loaded.way_points[-1]])
+    waypoints = np.vstack([loaded.waypoints, loaded.waypoints[-1]])
     path = GripPath(
         times=times,
-        positions=way_points[:, :3],
-        rotations=np.array([quat_from_yaw(w[3]) for w in way_points]),
+        positions=waypoints[:, :3],
+        rotations=np.array([quat_from_yaw(w[3]) for w in waypoints]),
         particle=grasp.particle,
         body=grasp.body,
         offset=grasp.offset,
@@ -255,7 +255,7 @@ def carry(
     )
     above = np.array([place[0], place[1], hover, yaw])
     retreat = abs(hover - bottom) / config.unloaded_speed
-    motion = Motion(np.append(times, times[-1] + retreat), np.vstack([way_points, above]))
+    motion = Motion(np.append(times, times[-1] + retreat), np.vstack([waypoints, above]))
     return motion, path
 
 
@@ -269,8 +269,8 @@ def solve_joints(
     """
     if not motions:
         return []
-    lengths = [len(m.way_points) for m in motions]
-    points = np.concatenate([m.way_points for m in motions])
+    lengths = [len(m.waypoints) for m in motions]
+    points = np.concatenate([m.waypoints for m in motions])
     result = robot.trajectory(points, lengths=lengths, seed=np.array(postures))
     starts = np.concatenate([[0], np.cumsum(lengths)])
     return [result.q[a:b] if result.reached[a:b].all() else None for a, b in pairwise(starts)]
@@ -278,7 +278,7 @@ def solve_joints(
 
 def _straight(points: Sequence[np.ndarray], speed: float, config: PrimitiveConfig) -> Motion:
     """Waypoints along straight lines at `speed` [m/s], or slower where the turn takes longer."""
-    times, way_points = [0.0], [points[0]]
+    times, waypoints = [0.0], [points[0]]
     for a, b in pairwise(points):
         distance = float(np.linalg.norm(b[:3] - a[:3]))
         turn = abs(float(b[3] - a[3]))
@@ -286,28 +286,28 @@ def _straight(points: Sequence[np.ndarray], speed: float, config: PrimitiveConfi
         pieces = math.ceil(max(1.0, distance / config.spacing, turn / config.turn_spacing))
         for k in range(1, pieces + 1):
             times.append(times[-1] + seconds / pieces)
-            way_points.append(a + (b - a) * (k / pieces))
-    return Motion(np.array(times), np.array(way_points))
+            waypoints.append(a + (b - a) * (k / pieces))
+    return Motion(np.array(times), np.array(waypoints))
 
 
 def _gentle(motion: Motion) -> Motion:
     """The same straight line in the same time, begun and ended at rest (smoothstep)."""
     u = np.linspace(0.0, 1.0, max(_GENTLE_PIECES, len(motion.times)))
     way = u * u * (3 - 2 * u)
-    a, b = motion.way_points[0], motion.way_points[-1]
+    a, b = motion.waypoints[0], motion.waypoints[-1]
     return Motion(motion.seconds * u, a + (b - a) * way[:, None])
 
 
 def _joined(motions: Sequence[Motion], pause: float) -> Motion:
     """One after the other, at rest for `pause` [s] between them."""
-    times, way_points = motions[0].times, motions[0].way_points
+    times, waypoints = motions[0].times, motions[0].waypoints
     for motion in motions[1:]:
         if pause > 0:
             times = np.append(times, times[-1] + pause)
-            way_points = np.vstack([way_points, way_points[-1]])
+            waypoints = np.vstack([waypoints, waypoints[-1]])
         times = np.append(times, times[-1] + motion.times[1:])
-        way_points = np.vstack([way_points, motion.way_points[1:]])
-    return Motion(times, way_points)
+        waypoints = np.vstack([waypoints, motion.waypoints[1:]])
+    return Motion(times, waypoints)
 
 
 def _half_turn(angle: float) -> float:

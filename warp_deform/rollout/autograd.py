@@ -23,7 +23,7 @@ __all__: list[str] = []  # `warp_deform.rollout` is the import path of what is h
 
 _STATE = ("positions", "velocities", "body_poses", "body_velocities")
 _PARAMETERS = (*WORLD_PARAMETERS, "inverse_masses", *PARTS)
-_KNOTS = {"way_points": "positions", "knot_times": "times", "knot_rotations": "rotations"}
+_KNOTS = {"waypoints": "positions", "knot_times": "times", "knot_rotations": "rotations"}
 """Tensors by the fields of `GripPath` that they stand for."""
 
 
@@ -69,7 +69,7 @@ def rollout_tensors(
     contact_friction: torch.Tensor | None = None,
     stiffness: torch.Tensor | None = None,
     paths: Mapping[int, GripPath] | None = None,
-    way_points: Mapping[int, torch.Tensor] | None = None,
+    waypoints: Mapping[int, torch.Tensor] | None = None,
     knot_times: Mapping[int, torch.Tensor] | None = None,
     knot_rotations: Mapping[int, torch.Tensor] | None = None,
     pushes: Mapping[int, Sequence[Push]] | None = None,
@@ -82,7 +82,7 @@ def rollout_tensors(
 ) -> TensorRollout:
     """Run `worlds` and give their states at `times` [s] from the start, ascending.
 
-        first = rollout_tensors(solver, [0], [1.0], positions=x, paths=paths, way_points={0: knots})
+        first = rollout_tensors(solver, [0], [1.0], positions=x, paths=paths, waypoints={0: knots})
         second = rollout_tensors(solver, [0], [1.0], **first.end)
         loss(second.positions[:, -1]).backward()  # fills x.grad and knots.grad
 
@@ -111,7 +111,7 @@ def rollout_tensors(
         rest_lengths: of each spring (S,) [m]; strain limits and floors are shares of it
         radii: of the particles (P,) [m]
         paths: by world
-        way_points: by world (K, 3) [m], in place of the positions of its path
+        waypoints: by world (K, 3) [m], in place of the positions of its path
         knot_times: by world (K,) [s], in place of its times
         knot_rotations: by world (K, 4) quat_xyzw, in place of its rotations
         storage: see `Recorder`
@@ -148,7 +148,7 @@ def rollout_tensors(
     }
     paths = dict(paths or {})
     for name, tensors, width in (
-        ("way_points", way_points, (3,)), ("knot_times", knot_times, ()),
+        ("waypoints", waypoints, (3,)), ("knot_times", knot_times, ()),
         ("knot_rotations", knot_rotations, (4,)),
     ):  # fmt: skip
         for w, tensor in (tensors or {}).items():

@@ -43,7 +43,7 @@ class Gradients:
             quat_xyzw; the last four along the sphere of unit quaternions
         body_velocities: (W, B, 6), by the twists there
         body_inverse_masses: (W, B), by those of free bodies at the same inertia
-        way_points: by world number, by the positions of the knots of its path (K, 3)
+        waypoints: by world number, by the positions of the knots of its path (K, 3)
         knot_times: by world number, by their times (K,)
         knot_rotations: by world number, by their rotations (K, 4)
         fired: (W, kinds), how often constraints of each `Kind` acted, and contacts in which branch
@@ -62,7 +62,7 @@ class Gradients:
     body_poses: np.ndarray
     body_velocities: np.ndarray
     body_inverse_masses: np.ndarray
-    way_points: dict[int, np.ndarray]
+    waypoints: dict[int, np.ndarray]
     knot_times: dict[int, np.ndarray]
     knot_rotations: dict[int, np.ndarray]
     fired: np.ndarray
@@ -180,8 +180,8 @@ class DifferentiableRollout:
             self._worlds,
             paths=paths,
             pushes=pushes,
-            most=2 * end,
-            least=0.0 if until_rest else 2 * end,
+            max_seconds=2 * end,
+            min_seconds=0.0 if until_rest else 2 * end,
             calm=calm,
             calm_after=calm_after,
             dt=dt,
@@ -275,7 +275,7 @@ class DifferentiableRollout:
                 [rows.of_bodies(out["body.v"]), rows.of_bodies(out["body.omega"])], axis=-1
             ),
             body_inverse_masses=rows.of_bodies(out["body.w"]),
-            way_points=knots["position"],
+            waypoints=knots["position"],
             knot_times=knots["time"],
             knot_rotations={w: g * self._flips[w] for w, g in knots["rotation"].items()},
             fired=rows.of_groups(out["fired"]),

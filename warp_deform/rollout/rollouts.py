@@ -96,8 +96,8 @@ def rollout(
     *,
     paths: Mapping[int, GripPath] | None = None,
     pushes: Mapping[int, Sequence[Push]] | None = None,
-    least: float | Mapping[int, float] = 0.0,
-    most: float | Mapping[int, float] = 10.0,
+    min_seconds: float | Mapping[int, float] = 0.0,
+    max_seconds: float | Mapping[int, float] = 10.0,
     calm: float | Mapping[int, float] = 0.0,
     calm_after: float = 0.0,
     record: float = 0.0,
@@ -112,8 +112,8 @@ def rollout(
     Args:
         paths: by world, what is held there and where it is led; nothing in the others
         pushes: by world, accelerations from the start on
-        least: a world runs at least so long after its path [s]
-        most: and at most so long in all [s]
+        min_seconds: a world runs at least so long after its path [s]
+        max_seconds: and at most so long in all [s]
         calm: speeds are clamped to `calm_speed` for so long from the start [s]
         calm_after: and for so long after a release [s]
         record: interval of recorded frames [s]; 0 records nothing
@@ -124,8 +124,8 @@ def rollout(
         worlds,
         paths=paths,
         pushes=pushes,
-        least=least,
-        most=most,
+        min_seconds=min_seconds,
+        max_seconds=max_seconds,
         calm=calm,
         calm_after=calm_after,
     )
@@ -135,7 +135,7 @@ def rollout(
         w: Rollout(
             seconds=watch[w].steps * dt,
             watch=watch[w],
-            at_rest=watch[w].steps < _substeps(most, w, "most", dt),
+            at_rest=watch[w].steps < _substeps(max_seconds, w, "max_seconds", dt),
             frames=_frames(solver, w, watch[w].steps, every),
         )
         for w in worlds
@@ -148,8 +148,8 @@ def prepare(
     *,
     paths: Mapping[int, GripPath] | None = None,
     pushes: Mapping[int, Sequence[Push]] | None = None,
-    least: float | Mapping[int, float] = 0.0,
-    most: float | Mapping[int, float] = 10.0,
+    min_seconds: float | Mapping[int, float] = 0.0,
+    max_seconds: float | Mapping[int, float] = 10.0,
     calm: float | Mapping[int, float] = 0.0,
     calm_after: float = 0.0,
     dt: float | None = None,
@@ -171,9 +171,9 @@ def prepare(
     solver.activate(np.asarray(worlds, dtype=int))
     longest = 1
     for w in worlds:
-        limit = _substeps(most, w, "most", dt)
+        limit = _substeps(max_seconds, w, "max_seconds", dt)
         longest = max(longest, limit)
-        data.per_world("group.least_steps", w)[:] = _substeps(least, w, "least", dt)
+        data.per_world("group.least_steps", w)[:] = _substeps(min_seconds, w, "min_seconds", dt)
         data.per_world("group.most_steps", w)[:] = limit
         data.per_world("group.calm_steps", w)[:] = _substeps(calm, w, "calm", dt)
         data.per_world("group.calm_after", w)[:] = _substeps(calm_after, w, "calm_after", dt)

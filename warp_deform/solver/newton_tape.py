@@ -186,7 +186,7 @@ class TapedStep:
         }
         targets = np.zeros((data.world_count, 3))
         for w, path in held.items():
-            start, end = by.way_points[w]
+            start, end = by.waypoints[w]
             # the second knot lies as far beyond the target as the first lies before it
             before["particle_q"][worlds.index(w), path.particle] += start - end
             targets[w] = 2 * end

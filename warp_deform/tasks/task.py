@@ -114,6 +114,11 @@ class Snapshot:
         return np.array([past.action for past in self.history]).reshape(-1, 7)
 
     @cached_property
+    def points(self) -> np.ndarray:
+        """Where particles and bodies are, seen from above (P + B, 2) [m]."""
+        return np.concatenate([self.particle_q[:, :2], self.body_q[:, :2]])
+
+    @cached_property
     def images(self) -> Images:
         """The three top-down views."""
         return self.render()

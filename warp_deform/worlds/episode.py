@@ -24,7 +24,7 @@ __all__ = [
     "LAYOUT_STREAM",
     "Carry",
     "Execution",
-    "Led",
+    "OnCarry",
     "RunningEpisode",
     "StepReport",
     "aloft",
@@ -109,7 +109,7 @@ class StepReport:
     frames: Frames | None
 
 
-Led = Callable[[Mapping[int, StepReport]], None]
+OnCarry = Callable[[Mapping[int, StepReport]], None]
 """Is told how tips came down to what they take, by slot; the carry is not computed yet."""
 
 

@@ -53,8 +53,10 @@ def jaw_step(worlds: JawWorlds, executions: Mapping[int, Execution], record: flo
         executions[slot].runs.append(run)
     if not moving:
         return
-    runs = rollout(solver, moving, least=_REST, most=_REST + worlds.rest_limit, record=record)
+    runs = rollout(
+        solver, moving, min_seconds=_REST, max_seconds=_REST + worlds.rest_limit, record=record
+    )
     for slot in moving:
         executions[slot].runs.append(runs[slot])
         episodes[slot].at_rest = runs[slot].at_rest
-        episodes[slot].tip = np.array(motions[slot].way_points[-1])
+        episodes[slot].tip = np.array(motions[slot].waypoints[-1])

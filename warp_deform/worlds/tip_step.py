@@ -10,7 +10,7 @@ from ..robots.primitive import Motion, Outcome, approach
 from ..rollout.rollouts import GripPath, Rollout, rollout
 from ..tasks.task import Task
 from ..xpbd.fused_xpbd import FusedXPBD
-from .episode import ALOFT_EVERY, Carry, Execution, Led, RunningEpisode
+from .episode import ALOFT_EVERY, Carry, Execution, OnCarry, RunningEpisode
 
 __all__ = ["ActingWorlds", "carry_and_release", "lead_down", "tip_step"]
 
@@ -46,12 +46,12 @@ def tip_step(
     worlds: ActingWorlds,
     executions: Mapping[int, Execution],
     record: float,
-    led: Led | None = None,
+    on_carry: OnCarry | None = None,
 ) -> None:
     """Carry out actions; notes outcomes, rollouts and motions in their executions.
 
     Args:
-        led: see `Worlds.step`
+        on_carry: see `Worlds.step`
     """
     carries = lead_down(worlds, executions, record)
     motions, paths = {}, {}
@@ -60,13 +60,13 @@ def tip_step(
     moving = worlds.reachable(executions, motions)
     if not moving:
         return
-    if led is not None:
-        led({slot: executions[slot].report_of_approach() for slot in moving})
+    if on_carry is not None:
+        on_carry({slot: executions[slot].report_of_approach() for slot in moving})
     runs = carry_and_release(worlds, {slot: paths[slot] for slot in moving}, record)
     for slot in moving:
         executions[slot].placed(runs[slot], carries[slot], paths[slot])
         worlds.episodes[slot].at_rest = runs[slot].at_rest
-        worlds.episodes[slot].tip = motions[slot].way_points[-1]
+        worlds.episodes[slot].tip = motions[slot].waypoints[-1]
 
 
 def carry_and_release(
@@ -77,8 +77,10 @@ def carry_and_release(
         worlds.solver,
         list(paths),
         paths=paths,
-        least=_RETREAT_LEAST,
-        most={slot: float(path.times[-1]) + worlds.rest_limit for slot, path in paths.items()},
+        min_seconds=_RETREAT_LEAST,
+        max_seconds={
+            slot: float(path.times[-1]) + worlds.rest_limit for slot, path in paths.items()
+        },
         calm_after=_CALM,
         record=record or (ALOFT_EVERY if worlds.task.looks_aloft else 0.0),
     )
@@ -101,11 +103,11 @@ def lead_down(
         motions[slot] = approach(episodes[slot].tip, pick, hover, height, config)
     moving = worlds.reachable(executions, motions)
     waits = {slot: motions[slot].seconds for slot in moving}
-    runs = rollout(worlds.solver, moving, least=1e3, most=waits, record=record)
+    runs = rollout(worlds.solver, moving, min_seconds=1e3, max_seconds=waits, record=record)
     for slot in moving:
         executions[slot].runs.append(runs[slot])
         executions[slot].outcome = Outcome.MISSED
-        episodes[slot].tip = motions[slot].way_points[-2]
+        episodes[slot].tip = motions[slot].waypoints[-2]
         worlds.look(slot)
     radii, carries = worlds.solver.data.topologies[0].particle_radius, {}
     for slot in moving:

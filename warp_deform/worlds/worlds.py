@@ -34,7 +34,7 @@ from .episode import (
     LAYOUT_STREAM,
     Carry,
     Execution,
-    Led,
+    OnCarry,
     RunningEpisode,
     StepReport,
     episode_rng,
@@ -185,8 +185,8 @@ class Worlds:
             self.solver,
             list(layouts),
             pushes={s: l.pushes for s, l in layouts.items()},
-            least=least,
-            most={s: seconds + self.rest_limit for s, seconds in least.items()},
+            min_seconds=least,
+            max_seconds={s: seconds + self.rest_limit for s, seconds in least.items()},
             calm={s: l.settle_seconds if l.calm else 0.0 for s, l in layouts.items()},
         )
         for slot, layout in layouts.items():
@@ -241,25 +241,27 @@ class Worlds:
         """Whether a start is valid: trusted physics, everything on the table, not solved yet."""
         if not episode.physics_ok:
             return False
-        snapshot = episode.snapshot
-        points = np.concatenate([snapshot.particle_q[:, :2], snapshot.body_q[:, :2]])
-        (x0, x1), (y0, y1) = BOUNDS[:2]
+        points, ((x0, x1), (y0, y1)) = episode.snapshot.points, BOUNDS[:2]
         inside = (points >= (x0, y0)).all() and (points <= (x1, y1)).all()
-        return bool(inside) and self.task.acceptable(episode.layout, snapshot)
+        return bool(inside) and self.task.acceptable(episode.layout, episode.snapshot)
 
     def step(
-        self, actions: Mapping[int, np.ndarray], *, record: float = 0.0, led: Led | None = None
+        self,
+        actions: Mapping[int, np.ndarray],
+        *,
+        record: float = 0.0,
+        on_carry: OnCarry | None = None,
     ) -> dict[int, StepReport]:
         """Run one pick-and-place in every named slot and let the worlds come to rest.
 
         Args:
             actions: (7,) each, pick x, y [m], yaw [rad], place x, y, yaw, lift [m]; finite
             record: interval of recorded frames [s]; 0 records nothing.
-            led: is called before tips carry, with reports of how they came there; jaws do not
+            on_carry: called before tips carry, with reports of how they came; not for jaws
         """
         executions = {slot: self._checked(slot, action) for slot, action in actions.items()}
         if self.task.jaw is None:
-            tip_step(self, executions, record, led)
+            tip_step(self, executions, record, on_carry)
         else:
             jaw_step(self, executions, record)
         limits = self.solver.config.limits
@@ -300,14 +302,13 @@ class Worlds:
                 another one.
         """
         if self._loop is None or self._loop.rate != rate:
-            if self._loop is not None and len(self._loop.worlds):
+            if self._loop and len(self._loop.worlds):
                 raise InputError(f"slots are under control at {self._loop.rate:g} Hz: end it first")
             self._loop = ControlLoop(self.solver, rate=rate)
         return self._loop
 
     def _end_control(self, slots: Iterable[int]) -> None:
-        busy = [slot for slot in slots if self.solver.continued[slot]]
-        if self._loop is not None and busy:
+        if self._loop and (busy := [slot for slot in slots if self.solver.continued[slot]]):
             self._loop.end(busy)
 
     def reachable(
@@ -345,8 +346,7 @@ class Worlds:
 
     def state(self, slot: int) -> WorldState:
         """All that the slot's episode goes on from; the slot must have been reset."""
-        led = self._loop is not None and self.solver.continued[slot]
-        run = self._loop.save(slot) if self._loop is not None and led else None
+        run = self._loop.save(slot) if self._loop and self.solver.continued[slot] else None
         return WorldState.of(self.solver.data, slot, self.episodes[slot], run)
 
     def restore(self, slot: int, state: WorldState) -> None:

@@ -121,8 +121,8 @@ class FusedXPBD:
 
     def set_duration(
         self,
-        least: float | np.ndarray,
-        most: float | np.ndarray,
+        min_steps: float | np.ndarray,
+        max_steps: float | np.ndarray,
         *,
         calm: float = 0.0,
         calm_after: float = 0.0,
@@ -132,7 +132,7 @@ class FusedXPBD:
         `calm`, `calm_after`: substeps clamped to `calm_speed` from the start and after a release.
         """
         for w in range(self.data.world_count):
-            for name, value in (("least_steps", least), ("most_steps", most)):
+            for name, value in (("least_steps", min_steps), ("most_steps", max_steps)):
                 self.data.per_world(f"group.{name}", w)[:] = np.broadcast_to(
                     value, self.data.world_count
                 )[w]

@@ -14,16 +14,16 @@ import pytest
 from fixtures.episode_samples import make_episode
 
 from learning.refinement import refine as refinement
-from learning.refinement import waypoints as way_points
+from learning.refinement import waypoints
 from learning.refinement.refine import REFINED, REFINEMENT, RefineConfig, RefineReport, refine
-from learning.refinement.waypoints import WAY_POINTS, BendConfig, bend, read_path
+from learning.refinement.waypoints import WAYPOINTS, BendConfig, bend, read_path
 from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.collecting.replay import Recording, verify
 from warp_deform.command.main import main
 from warp_deform.episodes import Episode, EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
 from warp_deform.planning import SearchConfig
-from warp_deform.planning.waypoints import WayPointConfig, WayPoints
+from warp_deform.planning.waypoints import WaypointConfig, Waypoints
 from warp_deform.tasks.registry import TASKS
 from warp_deform.worlds.loop import SOLVED, EpisodeRun, worlds_for
 
@@ -277,7 +277,7 @@ def test_every_task_with_a_loss_can_be_searched_by_gradient() -> None:
         refinement._check_search(name, "ur5", SearchConfig(method="gradient"))
 
 
-# -- way-points
+# -- waypoints
 
 
 @pytest.fixture(scope="module")
@@ -285,18 +285,18 @@ def bent(demos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, P
     """One demonstration, and the folder of its bent paths."""
     folder = tmp_path_factory.mktemp("bent")
     EpisodeWriter(folder / "one").write(next(iter(EpisodeReader(demos))))
-    arguments = [str(folder / "one"), "--out", str(folder / "out"), "--way-points"]
+    arguments = [str(folder / "one"), "--out", str(folder / "out"), "--waypoints"]
     assert main(["refine", *arguments, "--budget", "15", "--workers", "1", "--json"]) == 0
     return folder / "one", folder / "out"
 
 
 def test_bent_paths_are_labelled_and_run_again_to_what_is_written(bent: tuple[Path, Path]) -> None:
     demo, out = bent
-    label = json.loads((out / "way_points.json").read_text())
-    assert label["demonstrator"] == WAY_POINTS and label["bending"]["steps"] == 3
-    story = json.loads((out / "way_points_000000300.json").read_text())
+    label = json.loads((out / "waypoints.json").read_text())
+    assert label["demonstrator"] == WAYPOINTS and label["bending"]["steps"] == 3
+    story = json.loads((out / "waypoints_000000300.json").read_text())
     episode = next(iter(EpisodeReader(demo)))
-    assert story["demonstrator"] == WAY_POINTS and story["task"] == episode.info.task
+    assert story["demonstrator"] == WAYPOINTS and story["task"] == episode.info.task
     assert len(story["actions"]) == episode.info.actions
     ran = [a for a in story["actions"] if a["before"] is not None]
     assert all(a["after"]["loss"] <= a["before"]["loss"] for a in ran)
@@ -307,8 +307,8 @@ def test_bent_paths_are_labelled_and_run_again_to_what_is_written(bent: tuple[Pa
     written = story["actions"][number]
     recording = Recording(EpisodeReader(demo))
     worlds = worlds_for(story["task"], story["robot"])
-    job = way_points._recorded(worlds, recording, 300)[number]
-    again = WayPoints(worlds.task, robot="ur5").run({0: job}, {0: read_path(written["path"])})
+    job = waypoints._recorded(worlds, recording, 300)[number]
+    again = Waypoints(worlds.task, robot="ur5").run({0: job}, {0: read_path(written["path"])})
     assert asdict(again[0]) == written["after"]
     with pytest.raises(InputError, match="no path of waypoints"):
         read_path({"times": [0]})
@@ -318,14 +318,14 @@ def test_bending_goes_on_and_says_the_same(
     bent: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     demo, out = bent
-    config = BendConfig(source=demo, out=out, bending=WayPointConfig(steps=3), workers=1)
-    monkeypatch.setattr(way_points, "_bend_chunk", lambda chunk: pytest.fail("all is there"))
+    config = BendConfig(source=demo, out=out, bending=WaypointConfig(steps=3), workers=1)
+    monkeypatch.setattr(waypoints, "_bend_chunk", lambda chunk: pytest.fail("all is there"))
     report = bend(config)
-    assert report.episodes == 1 and report.bent >= 1 and report.demonstrator == WAY_POINTS
+    assert report.episodes == 1 and report.bent >= 1 and report.demonstrator == WAYPOINTS
     assert report.loss_before is not None and report.loss_after is not None
     assert report.loss_after < report.loss_before
     with pytest.raises(InputError, match="other demonstrations or settings"):
-        bend(replace(config, bending=WayPointConfig(steps=4)))
+        bend(replace(config, bending=WaypointConfig(steps=4)))
 
 
 def test_nobody_takes_bent_paths_for_demonstrations(
@@ -347,7 +347,7 @@ def test_nobody_takes_bent_paths_for_demonstrations(
         (["--out", str(tmp_path / "new"), "--depth", "1"], "only --budget and --workers"),
         (["--out", str(tmp_path / "new"), "--budget", "4"], "costs 5"),
     ):
-        assert main(["refine", str(demo), "--way-points", *given]) == 2
+        assert main(["refine", str(demo), "--waypoints", *given]) == 2
         said = capsys.readouterr()
         assert expected in said.err and said.err.count("\n") == 1
     assert not (tmp_path / "new").exists()

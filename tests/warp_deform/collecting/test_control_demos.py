@@ -207,7 +207,7 @@ def test_a_swing_has_no_choices_and_no_other_task_is_led_by_its_velocity(tmp_pat
         config(tmp_path, task="whip", demonstrator="visible")
     with pytest.raises(InputError, match="played with a jaw"):
         config(tmp_path, task="cable-mask-goal")
-    with pytest.raises(InputError, match="demonstrations are led in"):
+    with pytest.raises(InputError, match="demonstrations are made in"):
         TipDemonstrator(ControlWorlds("whip", 8, mode="tip_velocity", lanes=8))
 
 

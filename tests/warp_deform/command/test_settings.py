@@ -211,7 +211,7 @@ def test_paths_are_bent_with_the_flags_of_every_verb_and_folder(
 
     monkeypatch.setattr(waypoints, "bend", record)
     options = refine.RefineOptions(
-        source=Path("a"), out=Path("b"), budget=20, way_points=True, **further
+        source=Path("a"), out=Path("b"), budget=20, waypoints=True, **further
     )
     with pytest.raises(raised):
         refine.refine(options)

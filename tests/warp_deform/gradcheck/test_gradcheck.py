@@ -29,7 +29,7 @@ FEW = GradcheckConfig(levels=("substep",), states=4)
 MORE = replace(FEW, states=16)
 """Stiffness moves a sheet so little in a substep that single differences are wrong by 2e-6."""
 OF_WORLD = {"damping", "table_friction", "contact_friction", "stiffness"}
-OF_PATH = {"way_points", "knot_times", "knot_rotations"}
+OF_PATH = {"waypoints", "knot_times", "knot_rotations"}
 OF_PARTICLES = {"positions", "velocities", "inverse_masses", "spring_stiffness", "rest_lengths"}
 OF_PARTICLES |= {"radii"}
 OF_BODIES = {"body_poses", "body_velocities", "body_inverse_masses"}
@@ -196,7 +196,7 @@ def test_drawn_states_go_on_as_the_action_does(task: str) -> None:
         worlds.restore(0, draw.state)
         start = places(worlds)
         paths = {} if draw.path is None else {0: draw.path}
-        rollout(worlds.solver, [0], paths=paths, least=1e3, most=dt)
+        rollout(worlds.solver, [0], paths=paths, min_seconds=1e3, max_seconds=dt)
         moved = np.linalg.norm(places(worlds) - start, axis=1).max()
         assert moved < 1.1 * dt, "nothing is faster than an unloaded tip, 1 m/s"
         held += draw.path is not None
@@ -230,7 +230,7 @@ def test_the_example_of_the_docs_runs(tmp_path: Path) -> None:
     program = tmp_path / "example.py"
     program.write_text(code)
     names = runpy.run_path(str(program))
-    slope = names["gradients"].way_points[0]
+    slope = names["gradients"].waypoints[0]
     assert np.isfinite(slope).all() and slope[3, 1] < 0
 
     knots = names["knots"] - 2e-3 * slope / np.abs(slope).max() * [[0], [1], [1], [1]]

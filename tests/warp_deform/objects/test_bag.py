@@ -152,7 +152,7 @@ def test_a_container_of_the_user_s_rests_on_the_table(shape):
     top = mesh.vertices[:, 2].max()
     assert {round(float(z), 6) for z in mesh.vertices[list(bag.ring), 2]} == {round(top, 6)}
     solver = finalize(builder, BAG_SOLVER, precision="float32")
-    result = rollout(solver, [0], least=0.1, most=4.0)[0]
+    result = rollout(solver, [0], min_seconds=0.1, max_seconds=4.0)[0]
     x = solver.particle_q(0)
     assert result.at_rest and not result.watch.problems(0, BAG_SOLVER.limits)
     assert x[:, 2].min() >= BAG.shell_radius - 5e-4
@@ -190,7 +190,11 @@ def test_surfaces_that_are_no_container_are_refused_by_name():
 def thrown() -> tuple[SolverFusedXPBD, Bag, dict[int, Rollout]]:
     solver, (bag,) = bag_solver(DROPS, lanes=8)
     pushes = {w: (throw(solver, w, 5000 + w),) for w in range(DROPS)}
-    return solver, bag, rollout(solver, range(DROPS), pushes=pushes, least=0.2, most=3.2, record=DT)
+    return (
+        solver,
+        bag,
+        rollout(solver, range(DROPS), pushes=pushes, min_seconds=0.2, max_seconds=3.2, record=DT),
+    )
 
 
 def test_a_thrown_bag_comes_to_rest_on_the_table(thrown):
@@ -242,11 +246,11 @@ def test_pulls_at_the_ring_open_a_bag():
     solver, (bag,) = bag_solver(2, lanes=8)
     for w in range(2):
         push = {w: (throw(solver, w, 5000 + w),) for w in range(2)}
-    rollout(solver, range(2), pushes=push, least=0.2, most=4.2)
+    rollout(solver, range(2), pushes=push, min_seconds=0.2, max_seconds=4.2)
     before = [hull_area(solver.particle_q(w)[list(bag.ring), :2]) for w in range(2)]
     for _ in range(3):
         paths = {w: pull(solver.particle_q(w), bag.ring, BAG.opening_radius) for w in range(2)}
-        result = rollout(solver, range(2), paths=paths, least=0.1, most=5.0)
+        result = rollout(solver, range(2), paths=paths, min_seconds=0.1, max_seconds=5.0)
         for w, r in result.items():
             assert r.at_rest and r.seconds - paths[w].times[-1] < 3.0
             assert not r.watch.problems(w, BAG_SOLVER.limits)
@@ -274,7 +278,9 @@ def test_a_box_is_lowered_into_a_bag_and_carried_in_it(box):
     size = box.parts[0].size
     solver, (bag,) = bag_solver(2, boxes=(box,), lanes=8)
     paths = {w: put_in(box, (0.01 * w, -0.01), 0.4 + w) for w in range(2)}
-    inserted = rollout(solver, range(2), paths=paths, least=0.2, most=5.0, record=1 / 240)
+    inserted = rollout(
+        solver, range(2), paths=paths, min_seconds=0.2, max_seconds=5.0, record=1 / 240
+    )
     for r in inserted.values():
         assert r.at_rest
         # it stands on the fabric, which lies on the table
@@ -284,7 +290,9 @@ def test_a_box_is_lowered_into_a_bag_and_carried_in_it(box):
         w: carry(solver.particle_q(w)[bag.ring[5 + 9 * w]], bag.ring[5 + 9 * w], (0.2, 0.1))
         for w in range(2)
     }
-    carried = rollout(solver, range(2), paths=lift, least=0.2, most=9.0, record=1 / 240)
+    carried = rollout(
+        solver, range(2), paths=lift, min_seconds=0.2, max_seconds=9.0, record=1 / 240
+    )
     for w, r in carried.items():
         assert r.at_rest
         aloft = np.searchsorted(r.frames.times, lift[w].times[1])
@@ -307,7 +315,7 @@ def test_a_bead_lowered_onto_the_heap_pierces_less_than_one_pressed_to_the_table
         solver.data.reset()
         if not meets:
             paths = {w: replace(path, lower=None) for w, path in paths.items()}
-        results = rollout(solver, range(8), paths=paths, least=0.2, most=9.0)
+        results = rollout(solver, range(8), paths=paths, min_seconds=0.2, max_seconds=9.0)
         assert all(r.at_rest for r in results.values())
         counts[meets] = [pierced(solver.particle_q(w), bag.faces) for w in range(8)]
     assert np.mean(counts[True]) < 0.02 * len(edges_of(bag.faces))
@@ -319,7 +327,7 @@ def test_a_box_pushed_against_a_bag_from_outside_stays_outside():
     knots = [[0.5, 0.35, 0.018], [0.5, 0.35, 0.03], [0.5, 0.05, 0.03]]
     times, knots = timed(knots, 0.25)
     path = GripPath(times, knots, body=0)
-    r = rollout(solver, [0], paths={0: path}, least=0.2, most=5.0, record=1 / 240)[0]
+    r = rollout(solver, [0], paths={0: path}, min_seconds=0.2, max_seconds=5.0, record=1 / 240)[0]
     x, q = r.frames.particle_q, r.frames.body_q[:, 0]
     assert leaks(q[::4, :3], x[::4], bag.faces) == 0
     size = CUBE.parts[0].size
@@ -330,7 +338,9 @@ def test_a_box_pushed_against_a_bag_from_outside_stays_outside():
 
 def test_a_lowered_box_stops_at_the_bottom_of_a_bag():
     solver, _ = bag_solver(1, boxes=(CUBE,))
-    result = rollout(solver, [0], paths={0: put_in(CUBE, (0.0, 0.0), 0.0)}, most=2.6, record=DT)
+    result = rollout(
+        solver, [0], paths={0: put_in(CUBE, (0.0, 0.0), 0.0)}, max_seconds=2.6, record=DT
+    )
     z = result[0].frames.body_q[:, 0, 2]
     assert 0.018 + BAG.shell_radius < z[-1] < 0.018 + 3 * BAG.shell_radius
 
@@ -346,7 +356,7 @@ def test_bags_beside_and_on_each_other_come_to_rest_apart():
     upper = slice(bags[2].particles.start, bags[2].particles.stop)
     for w, shift in enumerate(shifts):
         solver.data.lane("particles.x", w)[upper, 0] += shift
-    results = rollout(solver, range(len(shifts)), least=0.5, most=4.0)
+    results = rollout(solver, range(len(shifts)), min_seconds=0.5, max_seconds=4.0)
     for w, result in results.items():
         x = solver.particle_q(w)
         assert result.at_rest and not result.watch.problems(w, BAG_SOLVER.limits)
@@ -362,6 +372,6 @@ def test_a_bag_is_simulated_in_reasonable_time():
     push = throw(solver, 0, 5000)
     solver.run(1)
     begin = time.process_time()
-    result = rollout(solver, [0], pushes={0: (push,)}, least=0.2, most=1.0)[0]
+    result = rollout(solver, [0], pushes={0: (push,)}, min_seconds=0.2, max_seconds=1.0)[0]
     # a quarter of a second a simulated second on a laptop's core, and some for a busy machine
     assert (time.process_time() - begin) / result.seconds < 0.6

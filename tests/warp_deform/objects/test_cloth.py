@@ -146,7 +146,7 @@ def test_a_mesh_becomes_a_fabric_that_drops_and_rests():
     inner = len(mesh.face_adjacency)
     assert len(cloth.springs) == len(edges_of(cloth.faces)) + inner
     assert (1 / solver.data.lane("particles.w0", 0)).sum() == pytest.approx(0.2, rel=1e-5)
-    result = rollout(solver, [0], most=4.0)[0]
+    result = rollout(solver, [0], max_seconds=4.0)[0]
     assert result.seconds < 3.0 and result.watch.problems(0, solver.config.limits) == ()
     x = positions(solver)
     np.testing.assert_allclose(x[:, 2], 0.004, atol=2e-4)
@@ -160,7 +160,7 @@ def test_a_dome_crumples_without_piercing_or_collapse():
     builder = new_builder()
     cloth = add_cloth_mesh(builder, ClothConfig(), mesh, lying(0.05))
     solver = finalize(builder, CLOTH_SOLVER, precision="float32")
-    result = rollout(solver, [0], most=2.0)[0]
+    result = rollout(solver, [0], max_seconds=2.0)[0]
     assert result.watch.problems(0, solver.config.limits) == ()
     x = positions(solver)
     ratio = edge_ratios(x, mesh.vertices, cloth.faces)
@@ -278,7 +278,7 @@ def test_a_sheet_that_is_dropped_comes_to_rest_on_the_table(config):
     solver, _ = cloth_solver(config, height=0.03)
     x = solver.data.lane("particles.x", 0)
     x[:, 2] += np.random.default_rng(0).uniform(0, 2e-3, len(x))
-    result = rollout(solver, [0], most=4.0)[0]
+    result = rollout(solver, [0], max_seconds=4.0)[0]
     assert result.seconds < 2.0 and result.watch.problems(0, solver.config.limits) == ()
     np.testing.assert_allclose(positions(solver)[:, 2], config.radius, atol=1e-3)
     assert np.abs(velocities(solver)).max() < solver.config.rest_speed
@@ -298,7 +298,7 @@ def test_a_fold_holds_and_neither_pierces_nor_collapses(config, corner, way):
     ways = np.array(way) + np.random.default_rng(0).normal(0, 0.005, (count, 2))
     ways[0] = way
     paths = {w: fold_path(before[corner], tuple(ways[w]), particle=corner) for w in range(count)}
-    results = rollout(solver, range(count), paths=paths, least=1.2, most=2.5)
+    results = rollout(solver, range(count), paths=paths, min_seconds=1.2, max_seconds=2.5)
     pierced, speeds = 0, []
     for w in range(count):
         assert results[w].watch.problems(w, solver.config.limits) == ()
@@ -328,7 +328,7 @@ def test_edges_keep_a_second_fold_from_piercing():
                 corner = int(rng.choice([0, 9, 90, 99]))
                 way = 1.5 * (x.mean(axis=0) - x[corner])[:2] + rng.normal(0, 0.02, 2)
                 paths[w] = fold_path(x[corner], tuple(way), particle=corner)
-            rollout(solver, range(4), paths=paths, least=0.3, most=4.0)
+            rollout(solver, range(4), paths=paths, min_seconds=0.3, max_seconds=4.0)
         counts[share] = sum(piercing(positions(solver, w), cloth.faces) for w in range(4))
     assert counts[0.2] <= 0.5 * counts[0.0]
     assert counts[0.2] <= 0.001 * 4 * len(edges_of(cloth.faces))
@@ -344,7 +344,7 @@ def test_a_held_corner_stops_where_it_meets_the_layer_below():
         solver.data.reset()
         shared = {"times": path.times, "positions": path.positions, "particle": 0, "lower": lower}
         steps = round(1.3 / solver.config.dt) - 1
-        rollout(solver, [0], paths={0: type(path)(**shared)}, most=steps * solver.config.dt)
+        rollout(solver, [0], paths={0: type(path)(**shared)}, max_seconds=steps * solver.config.dt)
         low[lower] = positions(solver)[0, 2]
     assert low[None] < 0.001
     assert 0.006 < low[1.0, 1.3] < 0.06, "the layer below bulges"

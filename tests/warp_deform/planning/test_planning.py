@@ -16,7 +16,7 @@ from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.planning.follow import Follow
 from warp_deform.planning.gradients import ActionGradients, loss_and_gradients
 from warp_deform.planning.places import Places
-from warp_deform.planning.waypoints import WayPointConfig, WayPoints, _Bend
+from warp_deform.planning.waypoints import WaypointConfig, Waypoints, _Bend
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.registry import task
 from warp_deform.worlds import Worlds
@@ -281,7 +281,7 @@ def test_moved_lifts_stay_within_their_stage():
         assert fixed[6] == stage.lift
 
 
-# -- two actions together, and way-points
+# -- two actions together, and waypoints
 
 
 def test_two_actions_moved_together_are_tried_as_they_would_run(started):
@@ -309,8 +309,8 @@ def test_two_actions_moved_together_are_tried_as_they_would_run(started):
 def test_a_bent_path_is_no_worse_and_runs_again_to_the_same_state(started):
     worlds, _ = started
     jobs = [(worlds.state(s), _moves(worlds, s, 1)[0]) for s in (0, 1)]
-    bending = WayPoints(worlds.task, robot="ur5")
-    bent = bending.bend(jobs, WayPointConfig(points=4, steps=4))
+    bending = Waypoints(worlds.task, robot="ur5")
+    bent = bending.bend(jobs, WaypointConfig(points=4, steps=4))
     assert all(b.after.loss <= b.before.loss for b in bent) and any(b.path for b in bent)
     for slot, one in enumerate(bent):
         state, action = jobs[slot]
@@ -324,10 +324,10 @@ def test_a_bent_path_is_no_worse_and_runs_again_to_the_same_state(started):
         worlds.restore(slot, state)
 
 
-def test_way_points_chain_through_positions_and_times(started):
+def test_waypoints_chain_through_positions_and_times(started):
     worlds, _ = started
     state, action = worlds.state(0), _moves(worlds, 0, 1)[0]
-    base = WayPoints(worlds.task, robot="ur5")._lead({0: (state, action)})[0](action)[1]
+    base = Waypoints(worlds.task, robot="ur5")._lead({0: (state, action)})[0](action)[1]
     bend = _Bend.of(base, float(action[6]), 3)
     assert bend is not None and len(bend.start) == 11
     rng = np.random.default_rng(0)

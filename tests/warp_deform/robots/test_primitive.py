@@ -102,7 +102,7 @@ def test_a_grasp_holds_things_where_they_are(pick_yaw: float, body_yaw: float) -
 def test_motions_take_the_time_that_their_speed_says() -> None:
     motion = approach(np.array([0.5, 0.0, 0.3, 0.0]), pick(0.5, 0.4), 0.3, 0.01, CONFIG)
     assert motion.seconds == pytest.approx((0.4 + 0.29) / CONFIG.unloaded_speed)
-    steps = np.linalg.norm(np.diff(motion.way_points[:, :3], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(motion.waypoints[:, :3], axis=0), axis=1)
     assert steps.max() <= CONFIG.spacing + 1e-12
     motion, path = carry_to(0.0)
     loaded = (0.028 + 0.2 + 0.028) / 0.15
@@ -118,14 +118,14 @@ def test_the_tip_turns_the_short_way_and_never_too_fast(
     start: float, goal: float, place: float, far: bool
 ) -> None:
     approached = approach(np.array([0.5, 0.0, 0.3, start]), pick(0.5, 0.1, goal), 0.3, 0.0, CONFIG)
-    assert approached.way_points[-1, 3] == goal
-    assert np.cos(approached.way_points[0, 3] - start) == pytest.approx(1.0)
+    assert approached.waypoints[-1, 3] == goal
+    assert np.cos(approached.waypoints[0, 3] - start) == pytest.approx(1.0)
     _, path = carry_to(place, start_yaw=goal, place=(0.5, 0.2) if far else (0.5, 0.0))
     assert path.rotations is not None
     turns = Rotation.from_quat(path.rotations)
     assert (turns[-1] * Rotation.from_rotvec([0, 0, -place])).magnitude() < 1e-6
     for times, yaw in (
-        (approached.times, approached.way_points[:, 3]),
+        (approached.times, approached.waypoints[:, 3]),
         (path.times, np.unwrap(turns.as_euler("xyz")[:, 2])),
     ):
         assert abs(yaw[-1] - yaw[0]) <= np.pi + 1e-9
@@ -185,5 +185,5 @@ def test_the_arm_goes_on_from_where_it_is_unless_its_wrist_is_wound_up() -> None
                 last = q[:, 5] - jump[5]
                 assert last.min() < arm.q_min[5] or last.max() > arm.q_max[5]
             posture = q[-1]
-        tip = onwards.way_points[-1]
+        tip = onwards.waypoints[-1]
     assert unwound < 10

@@ -49,7 +49,7 @@ def heap(seed: int) -> np.ndarray:
 def settled() -> SolverFusedXPBD:
     solver = cable_solver()
     set_state(solver, heap(0), np.zeros((SHORT.beads, 3)))
-    rollout(solver, [0], least=0.4, most=0.4)
+    rollout(solver, [0], min_seconds=0.4, max_seconds=0.4)
     return solver
 
 
@@ -61,7 +61,7 @@ def test_a_substep_of_a_settled_heap(settled: SolverFusedXPBD) -> None:
 
 
 @pytest.mark.parametrize("steps", [3, 9])
-def test_way_points_of_a_grip_and_its_release(settled: SolverFusedXPBD, steps: int) -> None:
+def test_waypoints_of_a_grip_and_its_release(settled: SolverFusedXPBD, steps: int) -> None:
     x, v = state(settled)
     counts = Check(settled, steps, lift(x, 3)).assert_right(rounding=30.0)
     assert counts["grip"] == min(steps, 6)
@@ -88,7 +88,7 @@ def test_a_substep_of_two_crumpled_sheets_and_a_cable(seed: int) -> None:
     if seed == 5:
         x[:, 2] = 0.4 * x[:, 2] - 0.012
     set_state(solver, x, rng.normal(size=x.shape) * 0.05)
-    rollout(solver, [0], least=5 * DT, most=5 * DT)
+    rollout(solver, [0], min_seconds=5 * DT, max_seconds=5 * DT)
     x, v = state(solver)
     acted = Check(solver).assert_right(rounding=30.0, draws=2)
     assert {"triangle_rim", "strain_limit", "viscosity"} <= set(acted)
@@ -168,7 +168,7 @@ def play(
         out[seed] += [getattr(g, name)[k] for name in PARAMETERS]
         assert np.array_equal(again.positions[k], g.positions[k])
         if slot in paths:
-            out[seed] += [g.way_points[slot], g.knot_times[slot], g.knot_rotations[slot]]
+            out[seed] += [g.waypoints[slot], g.knot_times[slot], g.knot_rotations[slot]]
     return out
 
 
@@ -186,7 +186,7 @@ def test_bits_depend_neither_on_storage_nor_on_lanes() -> None:
     plain = cable_solver(5, 8, "float32")
     for slot in slots:
         set_state(plain, heap(slot), 0 * heap(slot), slot)
-    rollout(plain, [2, 4], least=0.1, most=0.1)
+    rollout(plain, [2, 4], min_seconds=0.1, max_seconds=0.1)
     for slot in (2, 4):
         set_state(together, heap(slot), 0 * heap(slot), slot)
     DifferentiableRollout(together).forward([2, 4], [0.1])
@@ -230,7 +230,7 @@ def test_what_sleeps_on_passes_its_pose_through() -> None:
     solver = box_solver(
         (BoxConfig(mass=0.05), (0, 0, 0.02)), config=SolverConfig(damping=1.0, limits=LOOSE)
     )
-    rollout(solver, [0], least=0.5, most=0.5)
+    rollout(solver, [0], min_seconds=0.5, max_seconds=0.5)
     run = DifferentiableRollout(solver)
     run.forward([0], [0.1])
     slope = np.array([[[[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0]]]])

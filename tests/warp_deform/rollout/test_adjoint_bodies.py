@@ -77,7 +77,7 @@ class Check:
             parameters["inverse_masses"] = at["inverse_masses"][None]
         path = self.path
         if path is not None:
-            path = replace(path, positions=at.get("way_points", path.positions))
+            path = replace(path, positions=at.get("waypoints", path.positions))
             path = replace(path, rotations=at.get("knot_rotations", path.rotations))
         run.forward(
             [0],
@@ -116,15 +116,15 @@ class Check:
             "inverse_masses": 1e-6 * np.max(self.start.get("inverse_masses", 1.0)),
             "body_inverse_masses": 1e-6 * self.start["body_inverse_masses"].max(),
             "damping": 1e-3, "table_friction": 1e-6, "contact_friction": 1e-6,
-            "way_points": 1e-9, "knot_rotations": 1e-9,
+            "waypoints": 1e-9, "knot_rotations": 1e-9,
         }  # fmt: skip
         ours = self.run().backward(**{k: v[None, None] for k, v in self.g.items()})
         self.counts = ours.counts()
         self.knots = {}
         values = {k: getattr(ours, k)[0] for k in steps if k in self.start}
         if self.path is not None:
-            self.knots["way_points"] = self.path.positions
-            values["way_points"] = ours.way_points[0]
+            self.knots["waypoints"] = self.path.positions
+            values["waypoints"] = ours.waypoints[0]
             if self.path.rotations is not None:
                 self.knots["knot_rotations"] = self.path.rotations
                 values["knot_rotations"] = ours.knot_rotations[0]

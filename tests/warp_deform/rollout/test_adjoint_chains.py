@@ -58,7 +58,7 @@ def test_a_substep_and_a_grip(bend: float, closed: bool) -> None:
 
 def test_a_beam_at_rest_on_the_table() -> None:
     solver = solver_of(bend=5.0)
-    rollout(solver, [0], least=0.3, most=0.3)
+    rollout(solver, [0], min_seconds=0.3, max_seconds=0.3)
     assert Check(solver).assert_right(rounding=3.0)["table"] == BEADS
 
 

@@ -249,7 +249,7 @@ def test_pushed_box() -> None:
     assert end == pytest.approx(np.real(shoved(PUSH, LONG, DT, seconds)), rel=1e-5)
     by_way = slope(lambda push: shoved(push, LONG, DT, seconds), PUSH)
     by_time = slope(lambda long: shoved(PUSH, long, DT, seconds), LONG)
-    ways = gradients.way_points[0][:, 0]
+    ways = gradients.waypoints[0][:, 0]
     assert ways[1] + ways[2] == pytest.approx(by_way, rel=1e-5)
     assert gradients.knot_times[0][1] == pytest.approx(by_time, rel=1e-5)
 
@@ -266,7 +266,7 @@ def test_pushed_box_is_of_first_order() -> None:
     of_steps = []
     for count in (90, 180):
         stop, gradients = pushed(SLIDE / (count + 0.25), 0.33)
-        ways = gradients.way_points[0][:, 0]
+        ways = gradients.waypoints[0][:, 0]
         of_steps.append(np.array([stop, ways[1] + ways[2], gradients.knot_times[0][1]]))
     assert_first_order(*of_steps, held)
     assert of_steps[1][1] == pytest.approx(1 + PUSHED / (drop * LONG), rel=0.01)

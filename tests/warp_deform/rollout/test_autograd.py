@@ -76,7 +76,7 @@ def test_torch_agrees_on_a_cable_that_is_led_through_the_air() -> None:
             damping=damping,
             stiffness=stiffness,
             paths={0: path},
-            way_points={0: knots},
+            waypoints={0: knots},
             knot_times={0: times / 100 * torch.tensor([0.0, 1.0, 1.0])},
         )
         return 100 * out.positions, out.velocities
@@ -225,7 +225,7 @@ def test_what_happens_to_the_worlds_in_between_does_not_matter(storage: str) -> 
             positions=x,
             velocities=torch.zeros_like(x),
             paths={1: led(lines()[0, 1])},
-            way_points={1: knots},
+            waypoints={1: knots},
             table_friction=mu,
             storage=storage,
         )
@@ -239,7 +239,7 @@ def test_what_happens_to_the_worlds_in_between_does_not_matter(storage: str) -> 
     solver.set_world(1, damping=50.0, table_friction=0.9, stiffness=0.5)
     solver.data.lane("particles.w0", 1)[:] *= 2
     solver.data.lane("particles.w", 1)[:] *= 2
-    rollout(solver, [0, 1], paths={0: away, 1: away}, least=0.2, most=0.2)
+    rollout(solver, [0, 1], paths={0: away, 1: away}, min_seconds=0.2, max_seconds=0.2)
     before = {name: view.copy() for name, view in solver.data.views.items()}
     (disturbed[-1].positions ** 2).sum().backward()
     for name in ("particles.x", "particles.v", "group.damping", "grips.position", "particles.w0"):
@@ -298,10 +298,10 @@ def test_what_has_no_derivative_is_refused_in_one_line() -> None:
         ("damping must be a tensor of floating-point", {"damping": 5.0}),
         ("damping must be a tensor of floating-point", {"damping": torch.tensor([5])}),
         ("velocities holds numbers that are not finite", {"velocities": x * np.inf}),
-        ("way_points of world 0, which has no path", {"way_points": {0: x[0]}}),
+        ("waypoints of world 0, which has no path", {"waypoints": {0: x[0]}}),
         (
-            r"way_points of world 0 must have the shape \(3, 3\)",
-            {"paths": {0: path}, "way_points": {0: x[0]}},
+            r"waypoints of world 0 must have the shape \(3, 3\)",
+            {"paths": {0: path}, "waypoints": {0: x[0]}},
         ),
         ("storage must be auto, full or replay", {"storage": "disk"}),
         ("allow more memory", {"storage": "full", "memory": 10_000}),

@@ -97,7 +97,7 @@ def test_control_steps_have_the_bits_of_one_launch(make: Callable[..., SolverFus
         place = solver.particle_q(0)[0].astype(float)
         path = whole_path(solver, np.vstack([place, targets(place, seed)]), particle=0)
         paths = {0: path} if seed == 0 else {}
-        rollout(solver, [0], paths=paths, least=2 * seconds, most=seconds)
+        rollout(solver, [0], paths=paths, min_seconds=2 * seconds, max_seconds=seconds)
         expected.append(bits(solver, 0))
     led = make(4)
     for world, seed in enumerate((0, 1, 1, 2)):
@@ -109,7 +109,7 @@ def test_control_steps_have_the_bits_of_one_launch(make: Callable[..., SolverFus
     ways = targets(led.particle_q(0)[0].astype(float), 0)
     for step in range(STEPS):
         if step == 1:
-            rollout(led, [3], least=0.1, most=0.1)
+            rollout(led, [3], min_seconds=0.1, max_seconds=0.1)
             loop.begin([2])
         taking_part = [0, 1, 2][: 2 if step in (0, 3) else 3]
         rows = np.zeros((len(taking_part), 3))
@@ -142,7 +142,7 @@ def test_a_block_that_is_held_aside_turns_as_along_one_path() -> None:
         whole, knots, body=0, rotations=np.vstack([turns, turns[-1:]]), offset=offset,
         turn=quat_multiply(back, pose),
     )  # fmt: skip
-    rollout(whole, [0], paths={0: path}, least=1.0, most=STEPS * STEP / 1200)
+    rollout(whole, [0], paths={0: path}, min_seconds=1.0, max_seconds=STEPS * STEP / 1200)
     held_at = solver.data.views["bodies.x"][0].copy()
     assert held_at == pytest.approx(knots[-1] + quat_rotate(turns[-1], offset), abs=1e-6)
     loop.end()
@@ -275,7 +275,7 @@ def test_what_control_refuses() -> None:
     refused("another scene", second.restore, 2, second_scene())
     assert [bits(solver, world) for world in range(WORLDS)] == before
     assert second.worlds.tolist() == []
-    rollout(solver, [2], least=0.01, most=0.01)
+    rollout(solver, [2], min_seconds=0.01, max_seconds=0.01)
 
 
 def second_scene() -> object:

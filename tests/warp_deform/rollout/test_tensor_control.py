@@ -48,7 +48,7 @@ def cables(worlds: int = 2, **options: object) -> SolverFusedXPBD:
         solver.data.lane("particles.x", world)[:] = np.column_stack(
             [rng.normal(0, 4e-3, (CABLE.beads, 2)), z]
         )
-    rollout(solver, list(range(worlds)), least=0.3, most=0.3)
+    rollout(solver, list(range(worlds)), min_seconds=0.3, max_seconds=0.3)
     return solver
 
 
@@ -123,12 +123,12 @@ def test_derivatives_are_those_of_one_rollout(
     loop.end()
     for w in worlds:  # what the solver is used for between does not matter
         solver.data.lane("particles.x", w)[:] += 0.3
-    rollout(solver, worlds, least=0.01, most=0.01)
+    rollout(solver, worlds, min_seconds=0.01, max_seconds=0.01)
     left = [solver.particle_q(w) for w in worlds]
     total.backward(retain_graph=True)
     assert all(np.array_equal(solver.particle_q(w), left[w]) for w in worlds)
     by_start = expected.positions.copy()
-    for w, path in expected.way_points.items():
+    for w, path in expected.waypoints.items():
         assert targets.grad[w].numpy() == pytest.approx(path[1:-1], rel=1e-6, abs=1e-9)
         # the path begins where the particle was
         by_start[w, held] += path[0]
@@ -149,7 +149,7 @@ def settled() -> tuple[SolverFusedXPBD, np.ndarray]:
 def test_derivatives_agree_with_finite_differences_over_control_steps(
     settled: tuple[SolverFusedXPBD, np.ndarray],
 ) -> None:
-    """Held, thrown, caught again; with a way point in the middle of every step."""
+    """Held, thrown, caught again; with a waypoint in the middle of every step."""
     solver, start = settled
     knots = np.random.default_rng(0).uniform((0, 0, 0), (1e-3, 1e-3, 2e-3), (4, 1, 2, 3))
 

@@ -182,7 +182,7 @@ def test_a_held_box_that_is_led_into_something_is_named_later(end, names, precis
         solver.data.views[f"bodies.{name}"][1] = 0.0
     start = solver.data.views["bodies.x"][0].copy()
     path = GripPath(np.array([0.0, 0.4]), np.array([start, end]), body=0)
-    result = rollout(solver, [0], paths={0: path}, most=0.42)[0]
+    result = rollout(solver, [0], paths={0: path}, max_seconds=0.42)[0]
     assert {p.kind for p in result.watch.problems(0, solver.config.limits)} == names
 
 

@@ -146,7 +146,7 @@ def test_the_solver_may_be_used_between_tape_and_backward():
     tape.backward(value)
     first = gradients(state)
     tape.zero()
-    rollout(solver, [0], most=0.2)
+    rollout(solver, [0], max_seconds=0.2)
     solver.set_world(0, damping=0.0)
     tape.backward(value)
     np.testing.assert_array_equal(gradients(state)["particle_q"], first["particle_q"])
@@ -201,7 +201,7 @@ def test_what_would_lose_derivatives_is_refused_by_name():
         solver.step(state, after, None, None, FRAME)
         with pytest.raises(InputError, match="a state of its own"):
             solver.step(after, state, None, None, FRAME)
-        rollout(solver, [0], most=0.01)
+        rollout(solver, [0], max_seconds=0.01)
         with pytest.raises(InputError, match="write_state leaves no derivatives"):
             solver.write_state(after)
 

@@ -34,9 +34,11 @@ def test_what_presses_a_layer_onto_the_one_below_does_not_go_through_it(accelera
     solver, h = two_layers()
     count = SMALL.rows * SMALL.columns
     middle = count + count // 2 + SMALL.columns // 2
-    rollout(solver, [0], least=0.2, most=0.2)
+    rollout(solver, [0], min_seconds=0.2, max_seconds=0.2)
     push = Push(middle, np.array([0.0, 0.0, -acceleration]), 0.2)
-    frames = rollout(solver, [0], pushes={0: (push,)}, least=0.2, most=0.2, record=0.01)[0].frames
+    frames = rollout(
+        solver, [0], pushes={0: (push,)}, min_seconds=0.2, max_seconds=0.2, record=0.01
+    )[0].frames
     lowest = frames.particle_q[:, middle, 2].min() - SMALL.radius
     assert lowest > 0.9 * h
 
@@ -52,7 +54,9 @@ def folded(worlds: int, folds: int, seed: int) -> list[int]:
             particle = int(rng.integers(len(x)))
             way = rng.normal(0, 0.04, 2) + 1.2 * (x.mean(axis=0) - x[particle])[:2]
             paths[w] = fold_path(x[particle], tuple(way), particle=particle)
-        rollout(solver, range(worlds), paths=paths, least=0.3, most=4.0, calm_after=0.2)
+        rollout(
+            solver, range(worlds), paths=paths, min_seconds=0.3, max_seconds=4.0, calm_after=0.2
+        )
         counts += [pierced(solver.particle_q(w), cloth.faces) for w in range(worlds)]
     return counts
 
@@ -66,9 +70,9 @@ def test_thrown_and_pulled_bags_hardly_pierce_themselves():
     solver, (bag,) = bag_solver(8, lanes=8)
     edges, counts = len(edges_of(bag.faces)), []
     pushes = {w: (throw(solver, w, 5000 + w),) for w in range(8)}
-    rollout(solver, range(8), pushes=pushes, least=0.2, most=4.2)
+    rollout(solver, range(8), pushes=pushes, min_seconds=0.2, max_seconds=4.2)
     for _ in range(3):
         paths = {w: pull(solver.particle_q(w), bag.ring, BAG.opening_radius) for w in range(8)}
-        rollout(solver, range(8), paths=paths, least=0.1, most=5.0)
+        rollout(solver, range(8), paths=paths, min_seconds=0.1, max_seconds=5.0)
         counts += [pierced(solver.particle_q(w), bag.faces) / edges for w in range(8)]
     assert np.mean(counts) <= 0.001 and np.max(counts) <= 0.02

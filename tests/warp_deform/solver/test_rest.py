@@ -231,7 +231,7 @@ def test_a_curtain_let_go_askew_hangs_straight_and_still(cloth, config, degrees)
 def settled_sheet(**options: object) -> SolverFusedXPBD:
     """A fabric asleep on the table, or on a box that stands there."""
     solver, _ = cloth_solver(SMALL, config=FABRIC_SOLVER, **options)
-    rollout(solver, [0], least=1.5, most=1.5)
+    rollout(solver, [0], min_seconds=1.5, max_seconds=1.5)
     assert (solver.data.lane("particles.still", 0) > FABRIC_SOLVER.sleep_seconds).all()
     return solver
 
@@ -239,10 +239,10 @@ def settled_sheet(**options: object) -> SolverFusedXPBD:
 def test_bags_at_rest_stay_where_they_are() -> None:
     solver, _ = bag_solver(8, lanes=8)
     pushes = {w: (throw(solver, w, 5000 + w),) for w in range(8)}
-    result = rollout(solver, range(8), pushes=pushes, least=0.2, most=4.2)
+    result = rollout(solver, range(8), pushes=pushes, min_seconds=0.2, max_seconds=4.2)
     assert all(r.at_rest for r in result.values())
     before = [solver.particle_q(w) for w in range(8)]
-    rollout(solver, range(8), least=1.5, most=1.5)
+    rollout(solver, range(8), min_seconds=1.5, max_seconds=1.5)
     for w in range(8):
         moved = np.linalg.norm(solver.particle_q(w) - before[w], axis=1)
         assert moved.max() < 3e-3
@@ -266,7 +266,7 @@ def test_a_sleeper_wakes_when_it_is_gripped_and_when_it_is_struck() -> None:
     solver = settled_sheet()
     start = positions(solver)[0].astype(float)
     path = GripPath(np.array([0, 0.5]), start + np.array([[0, 0, 0], [0, 0, 0.02]]), particle=0)
-    rollout(solver, [0], paths={0: path}, most=0.1)
+    rollout(solver, [0], paths={0: path}, max_seconds=0.1)
     assert not solver.data.lane("particles.still", 0).any()
     solver = settled_sheet(box=(0.53, 0.0, 0.1))
     struck = solver.data.lane("particles.still", 0)
@@ -300,7 +300,9 @@ def test_a_slow_grip_drags_a_whole_sleeping_fabric() -> None:
     solver = settled_sheet()
     start = positions(solver).astype(float)
     knots = start[0] + np.array([[0, 0, 0], [-0.02, 0, 0.0]])
-    rollout(solver, [0], paths={0: GripPath(np.array([0, 5.0]), knots, particle=0)}, most=5.0)
+    rollout(
+        solver, [0], paths={0: GripPath(np.array([0, 5.0]), knots, particle=0)}, max_seconds=5.0
+    )
     assert positions(solver)[0, 0] - start[0, 0] == pytest.approx(-0.02, abs=1e-3)
     assert np.median(positions(solver)[:, 0] - start[:, 0]) < -0.008
     assert solver.data.lane("particles.still", 0).max() < 2 * DT, "let go at the end"

@@ -97,7 +97,7 @@ def test_a_pushed_bead_follows_newton():
     add_particles(builder, [(0, 0, RADIUS)])
     solver = finalize(builder, ideal(table_friction=0.0, rest_seconds=100.0))
     push = Push(0, np.array([3.0, -1.0, 0.0]), 0.2)
-    rollout(solver, [0], pushes={0: (push,)}, most=0.3)
+    rollout(solver, [0], pushes={0: (push,)}, max_seconds=0.3)
     np.testing.assert_allclose(velocities(solver)[0], [0.6, -0.2, 0], atol=1e-6)
     expected = 3.0 * 0.2 * (0.2 + DT) / 2 + 0.6 * 0.1
     assert positions(solver)[0, 0] == pytest.approx(expected, abs=0.6 * DT)
@@ -117,7 +117,7 @@ def heap(config: CableConfig, seed: int, solver_config: SolverConfig, precision:
 def test_a_fallen_heap_comes_to_rest_on_the_table_without_overlap(seed):
     config = CableConfig()
     solver = heap(config, seed, SolverConfig())
-    watch = rollout(solver, [0], least=1.0, most=8.0)[0]
+    watch = rollout(solver, [0], min_seconds=1.0, max_seconds=8.0)[0]
     x = positions(solver)
     assert watch.seconds < 8.0, "never came to rest"
     assert not watch.watch.problems(0, solver.config.limits)
@@ -217,7 +217,7 @@ def test_a_dragged_ring_keeps_its_perimeter():
     start = positions(solver)[0]
     path = np.array([start, start + np.array([0.0, 0.3, 0.0]), start + np.array([0.0, 0.3, 0.0])])
     result = rollout(
-        solver, [0], paths={0: GripPath(times, path, particle=0)}, record=0.05, most=5.0
+        solver, [0], paths={0: GripPath(times, path, particle=0)}, record=0.05, max_seconds=5.0
     )
     x = result[0].frames.particle_q
     edges = np.linalg.norm(x - np.roll(x, -1, axis=1), axis=2)
@@ -235,7 +235,7 @@ def test_a_dragged_cable_trails_behind_the_tip():
     start = positions(solver)[-1]
     path = np.array([start, start + np.array([0.3, 0.0, 0.0])])
     result = rollout(
-        solver, [0], paths={0: GripPath(np.array([0.0, 2.0]), path, particle=23)}, most=5.0
+        solver, [0], paths={0: GripPath(np.array([0.0, 2.0]), path, particle=23)}, max_seconds=5.0
     )
     x = positions(solver)
     np.testing.assert_allclose(x[-1], np.add(start, [0.3, 0, 0]), atol=2e-3)

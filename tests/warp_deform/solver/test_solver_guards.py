@@ -133,7 +133,7 @@ def test_a_grip_that_dives_under_the_table_is_noticed():
     start = positions(solver)[0]
     knots = np.array([start, [start[0], start[1], -0.05]])
     result = rollout(
-        solver, [0], paths={0: GripPath(np.array([0, 0.5]), knots, particle=0)}, most=0.6
+        solver, [0], paths={0: GripPath(np.array([0, 0.5]), knots, particle=0)}, max_seconds=0.6
     )
     problems = result[0].watch.problems(0, solver.config.limits)
     assert ProblemKind.PENETRATION in {p.kind for p in problems}
@@ -190,7 +190,7 @@ def test_bundles_are_written_with_bodies_and_grips(tmp_path):
     solver = SolverFusedXPBD(builder.finalize(device="cpu"), precision="float64", bundles=tmp_path)
     start = positions(solver)[0]
     path = GripPath(np.array([0, 0.1]), np.array([start, start - [0, 0, 0.1]]), particle=0)
-    result = rollout(solver, [0], paths={0: path}, most=0.2)
+    result = rollout(solver, [0], paths={0: path}, max_seconds=0.2)
     with pytest.raises(PhysicsError) as caught:
         solver.check([result[0].watch])
     after = replay_bundle(caught.value.bundle)
@@ -201,9 +201,9 @@ def test_bundles_are_written_with_bodies_and_grips(tmp_path):
 def test_a_world_that_takes_no_part_leaves_no_bundle(tmp_path):
     solver = cable_solver(worlds=2, lanes=8, bundles=tmp_path)
     solver.data.lane("particles.x", 1)[3] = np.nan
-    rollout(solver, [0], most=0.1)
+    rollout(solver, [0], max_seconds=0.1)
     assert solver.bundle is None and not list(tmp_path.iterdir())
-    rollout(solver, [1], most=0.1)
+    rollout(solver, [1], max_seconds=0.1)
     assert solver.bundle is not None
 
 

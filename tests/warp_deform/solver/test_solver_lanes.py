@@ -75,7 +75,13 @@ def play(solver: SolverFusedXPBD, slots: dict[int, int], seconds: float = 0.6) -
         least[slot] = 0.02 * seed
     most = {slot: seconds * (0.5 + 0.1 * seed) for slot, seed in slots.items()}
     rollout(
-        solver, list(slots), paths=paths, pushes=pushes, least=least, most=most, calm_after=0.02
+        solver,
+        list(slots),
+        paths=paths,
+        pushes=pushes,
+        min_seconds=least,
+        max_seconds=most,
+        calm_after=0.02,
     )
     return {seed: state_bytes(solver, slot) for slot, seed in slots.items()}
 
@@ -147,7 +153,7 @@ def test_worlds_that_are_left_out_keep_their_bits():
     scatter(solver, {slot: slot for slot in range(6)})
     solver.data.views["particles.v"][:] += 0.25
     before = {w: state_bytes(solver, w) for w in range(6)}
-    rollout(solver, [1, 4], most=0.1)
+    rollout(solver, [1, 4], max_seconds=0.1)
     for w in range(6):
         assert (state_bytes(solver, w) == before[w]) == (w not in (1, 4))
 
@@ -171,7 +177,11 @@ def test_finished_worlds_cost_nothing():
     # came to rest at once end there
     solver = solver_of(cable_world(), 8, 8, "float32")
     result = rollout(
-        solver, range(8), least={0: 0.5} | dict.fromkeys(range(1, 8), 0.0), most=5.0, record=0.01
+        solver,
+        range(8),
+        min_seconds={0: 0.5} | dict.fromkeys(range(1, 8), 0.0),
+        max_seconds=5.0,
+        record=0.01,
     )
     dt = solver.config.dt
     rest = round(solver.config.rest_seconds / dt)
@@ -216,11 +226,11 @@ def test_mixed_models_equal_each_world_alone():
     for k in order:
         builder.add_world(kinds[k])
     mixed = SolverFusedXPBD(builder.finalize(device="cpu"), lanes=8)
-    rollout(mixed, range(len(order)), least=10.0, most=0.4)
+    rollout(mixed, range(len(order)), min_seconds=10.0, max_seconds=0.4)
     for w, k in enumerate(order):
         lone = solver_of(kinds[k], 1, 1, "float32")
         # the kernel without bodies has the same arithmetic for particles
-        rollout(lone, [0], least=10.0, most=0.4)
+        rollout(lone, [0], min_seconds=10.0, max_seconds=0.4)
         assert state_bytes(mixed, w) == state_bytes(lone, 0), (w, k)
 
 

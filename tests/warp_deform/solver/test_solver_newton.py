@@ -98,7 +98,7 @@ def test_a_grip_in_the_control_holds_a_particle_through_the_step():
 
 def test_a_step_after_a_rollout_moves_every_world():
     solver = SolverFusedXPBD(scene(3))
-    rollout(solver, [1], most=0.1)
+    rollout(solver, [1], max_seconds=0.1)
     state, after = solver.model.state(), solver.model.state()
     solver.step(state, after, None, None, FRAME)
     moved = np.abs(after.particle_q.numpy() - state.particle_q.numpy()).reshape(3, -1).max(1)
@@ -241,7 +241,7 @@ def test_a_grip_on_nothing_is_refused():
     solver = SolverFusedXPBD(scene())
     path = GripPath(np.array([0, 1.0]), np.zeros((2, 3)), particle=99)
     with pytest.raises(InputError, match="99"):
-        rollout(solver, [0], paths={0: path}, most=0.1)
+        rollout(solver, [0], paths={0: path}, max_seconds=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -282,7 +282,7 @@ def test_no_poke_makes_the_state_non_finite(playground, seed, spread, speed, gri
         start = positions(solver)[3].astype(float)
         knots = np.array([start, start + rng.uniform(-0.3, 0.3, 3), [0.5, 0.0, reach]])
         paths[0] = GripPath(np.array([0, 0.05, 0.2]), knots, particle=3, lower=(0.1, 0.2))
-    watch = rollout(solver, [0], paths=paths, most=0.4)[0].watch
+    watch = rollout(solver, [0], paths=paths, max_seconds=0.4)[0].watch
     assert not watch.nonfinite
     for name in ("bodies.x", "bodies.q", "bodies.v", "bodies.omega", "particles.v"):
         assert np.isfinite(views[name]).all(), name

@@ -127,7 +127,9 @@ def push_with_grip(box: BoxConfig, y: float) -> SolverFusedXPBD:
     solver = finalize(builder, SOLID)
     start = positions(solver)[0]
     path = np.array([start, start + np.array([0.12, 0, 0])])
-    rollout(solver, [0], paths={0: GripPath(np.array([0.0, 1.2]), path, particle=0)}, most=3.0)
+    rollout(
+        solver, [0], paths={0: GripPath(np.array([0.0, 1.2]), path, particle=0)}, max_seconds=3.0
+    )
     return solver
 
 
@@ -164,7 +166,7 @@ def drape(box: BoxConfig, offset: float, config: SolverConfig) -> SolverFusedXPB
 def test_a_cable_drapes_over_a_box():
     block = BoxConfig(parts=(BoxPart((0.08, 0.08, 0.06)),), mass=0.5, friction=1.0)
     solver = drape(block, 0.0, SolverConfig(limits=LOOSE))
-    rollout(solver, [0], least=1.0, most=4.0)
+    rollout(solver, [0], min_seconds=1.0, max_seconds=4.0)
     x, box = positions(solver), x_of(solver)[0]
     np.testing.assert_allclose(box, [0, 0, 0.03], atol=1e-3)
     on_top = np.abs(x[:, 0]) < 0.03
@@ -201,7 +203,7 @@ def carry(config: BoxConfig, height: float, turn: float) -> tuple[SolverFusedXPB
     zero = np.zeros(5)
     rotations = np.column_stack([zero, zero, np.sin(half), np.cos(half)])
     path = GripPath(times, knots, body=0, rotations=rotations, lower=(0.9, 1.5))
-    rollout(solver, [0], paths={0: path}, least=0.5, most=4.0)
+    rollout(solver, [0], paths={0: path}, min_seconds=0.5, max_seconds=4.0)
     return solver, end
 
 
@@ -221,7 +223,7 @@ def test_a_box_lowered_onto_another_stops_there():
     times = np.array([0, 0.4, 0.8, 1.6, 1.8])
     knots = np.array([[0.2, 0, 0.02], [0.2, 0, 0.1], [0.003, 0, 0.1], [0.003, 0, 0], [0.003, 0, 0]])
     path = GripPath(times, knots, body=1, lower=(0.8, 1.6))
-    rollout(solver, [0], paths={0: path}, least=0.5, most=4.0)
+    rollout(solver, [0], paths={0: path}, min_seconds=0.5, max_seconds=4.0)
     np.testing.assert_allclose(x_of(solver), [[0, 0, 0.02], [0.003, 0, 0.06]], atol=5e-4)
 
 
@@ -231,7 +233,7 @@ def test_a_held_box_pushes_beads_out_of_its_way():
     add_particles(builder, [(0.06, 0.002, RADIUS), (0.08, -0.003, RADIUS)], colliding=True)
     solver = finalize(builder, SOLID)
     path = np.array([[0, 0, 0.022], [0.1, 0, 0.022]])
-    rollout(solver, [0], paths={0: GripPath(np.array([0.0, 1.0]), path, body=0)}, most=2.0)
+    rollout(solver, [0], paths={0: GripPath(np.array([0.0, 1.0]), path, body=0)}, max_seconds=2.0)
     assert (positions(solver)[:, 0] > 0.1 + 0.02 + 0.9 * RADIUS).all()
 
 
@@ -242,6 +244,6 @@ def test_a_lowered_bead_stops_at_another():
     solver = finalize(builder, SOLID)
     knots = np.array([[0, 0, 0.05], [0, 0, 0.004], [0, 0, 0.004]])
     path = GripPath(np.array([0, 0.5, 0.6]), knots, particle=1, lower=(0.0, 0.5))
-    result = rollout(solver, [0], paths={0: path}, most=0.6, record=DT)
+    result = rollout(solver, [0], paths={0: path}, max_seconds=0.6, record=DT)
     z = result[0].frames.particle_q[:, 1, 2]
     assert z[-2] == pytest.approx(3 * RADIUS, abs=2 * 0.092 * DT)

@@ -160,7 +160,7 @@ def test_durations_of_a_rollout_are_checked(name, value):
 )
 def test_a_push_that_would_do_nothing_or_harm_is_refused(push):
     with pytest.raises(InputError, match="Push"):
-        rollout(falling(), [0], pushes={0: [push]}, most=0.1)
+        rollout(falling(), [0], pushes={0: [push]}, max_seconds=0.1)
 
 
 def test_a_bundle_of_a_fabric_reproduces_the_very_bits(tmp_path):

@@ -44,7 +44,7 @@ from warp_deform.tasks.cloth_physics import CLOTH_SOLVER
 
 def test_layers_and_beads_lie_on_top_of_each_other():
     solver = two_sheets_and_a_cable()
-    result = rollout(solver, [0], most=4.0)[0]
+    result = rollout(solver, [0], max_seconds=4.0)[0]
     assert result.watch.problems(0, solver.config.limits) == ()
     x = positions(solver)
     assert np.median(x[:36, 2]) == pytest.approx(0.004, abs=1e-3)
@@ -128,7 +128,7 @@ def test_a_box_rests_on_a_sheet_on_the_table():
     add_cloth(builder, FABRIC, cloth_sheet(FABRIC, (0.5, 0.0)))
     add_box(builder, BoxConfig(), (0.5, 0.0, 0.04))
     solver = finalize(builder, CLOTH_SOLVER, precision="float32")
-    result = rollout(solver, [0], most=3.0)[0]
+    result = rollout(solver, [0], max_seconds=3.0)[0]
     assert result.watch.problems(0, solver.config.limits) == ()
     pose, twist = solver.data.body_poses(0)
     # on particles of 4 mm radius that lie on the table
@@ -207,7 +207,7 @@ def folds(
         start = positions(solver, w)[0].astype(float)
         paths[w] = fold_path(start, (0.05 + 0.01 * seed, 0.09 - 0.01 * seed))
         least[w] = 0.05 * seed
-    rollout(solver, range(len(worlds)), paths=paths, least=least, most=1.6)
+    rollout(solver, range(len(worlds)), paths=paths, min_seconds=least, max_seconds=1.6)
     return {
         seed: positions(solver, w).tobytes()
         + velocities(solver, w).tobytes()

@@ -247,7 +247,11 @@ def test_a_bag_lifted_by_one_bead_stays_within_its_tether() -> None:
         lying + np.array([[0, 0, 0], [0, 0, 0.4], [0, 0, 0.4]]),
     )
     run = rollout(
-        side.solver, [0], paths={0: GripPath(times, knots, particle=bead)}, most=1.2, record=0.05
+        side.solver,
+        [0],
+        paths={0: GripPath(times, knots, particle=bead)},
+        max_seconds=1.2,
+        record=0.05,
     )[0]
     tether = side.solver.data.lane("particles.tether", 0)
     particles = np.array(run.frames.particle_q, dtype=float)

@@ -342,7 +342,7 @@ def test_any_action_in_the_space_has_a_named_outcome(
         side = started_alone(name)
     action = space.low + np.array(shares) * (space.high - space.low)
     state = side.episodes[0].snapshot
-    points = np.concatenate([state.particle_q[:, :2], state.body_q[:, :2]])
+    points = state.points
     if bead is not None:  # else a random pick mostly misses
         action[:2] = np.clip(points[bead % len(points)], space.low[:2], space.high[:2])
     report = side.step({0: action})[0]

@@ -117,7 +117,7 @@ def test_lists_that_are_kept_up_to_date_are_what_lists_made_anew_would_be(lanes)
         solver.data.reset()
         start = solver.data.lane("particles.x", world)[0].astype(float)
         path = fold_path(start, (0.11, 0.13))
-        rollout(solver, [world], paths={world: path}, most=(steps - 0.5) * solver.config.dt)
+        rollout(solver, [world], paths={world: path}, max_seconds=(steps - 0.5) * solver.config.dt)
         place = solver.data.lane("cells.xr", world)
         slack = solver.data.lane("cells.slack", world)
         assert slack.max() > 2 * slack.min(), "what is carried has more slack than what lies"

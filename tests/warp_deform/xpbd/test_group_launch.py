@@ -69,7 +69,7 @@ def played(solver: SolverFusedXPBD, seconds: float) -> list[bytes]:
     worlds = range(solver.data.world_count)
     paths = led(solver, seconds)
     most = {w: seconds * (0.5 + 0.1 * (w % 6)) for w in worlds}
-    done = rollout(solver, worlds, paths=paths, most=most, record=seconds / 4)
+    done = rollout(solver, worlds, paths=paths, max_seconds=most, record=seconds / 4)
     states = [solver.particle_q(w).tobytes() + solver.particle_qd(w).tobytes() for w in worlds]
     frames = [done[w].frames.particle_q.tobytes() for w in worlds]
     return [*states, *frames, repr([done[w].watch for w in worlds]).encode()]
@@ -122,9 +122,9 @@ def test_groups_write_nothing_that_another_one_writes() -> None:
     for make in (cables, sheets, bags):
         solver = make(3, lanes=1, precision="float64", threads=3)
         views = solver.data.views
-        prepare(solver, range(3), paths=led(solver, 0.02), most=0.02)
+        prepare(solver, range(3), paths=led(solver, 0.02), max_seconds=0.02)
         solver.run(1)
-        prepare(solver, range(3), paths=led(solver, 0.02), most=0.02)
+        prepare(solver, range(3), paths=led(solver, 0.02), max_seconds=0.02)
         before = {name: view.copy() for name, view in views.items()}
         written: dict[str, np.ndarray] = {}
         assert len(solver._launch._parts) == 3
