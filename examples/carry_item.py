@@ -38,9 +38,8 @@ def main(out: Path | None = None) -> float:
     shell = add_bag(builder, bag, pose)
     item = add_box(builder, cube, (0.5, -WAY / 2, 0.03 - cube.lowest))
     solver = SolverFusedXPBD(builder.finalize(device="cpu"), BAG_SOLVER)
-    rollout(
-        solver, [0], min_seconds=1.0, max_seconds=3.0
-    )  # the bag sinks a little, the cube drops into it
+    # the bag sinks a little, the cube drops into it
+    rollout(solver, [0], min_seconds=1.0, max_seconds=3.0)
 
     bead = shell.ring[0]
     start = solver.particle_q(0)[bead].astype(float)
@@ -52,15 +51,8 @@ def main(out: Path | None = None) -> float:
     times = np.concatenate([[0.0], np.cumsum(np.where(lengths > 0, lengths / SPEED, 0.3))])
     # the descent ends where what is held touches something
     path = GripPath(times, knots, particle=bead, lower=(times[-2], times[-1]))
-    result = rollout(
-        solver,
-        [0],
-        paths={0: path},
-        min_seconds=0.3,
-        max_seconds=times[-1] + 4.0,
-        calm_after=0.2,
-        record=0.1,
-    )[0]
+    options = {"max_seconds": times[-1] + 4.0, "calm_after": 0.2, "record": 0.1}
+    result = rollout(solver, [0], paths={0: path}, min_seconds=0.3, **options)[0]
 
     assert not result.watch.problems(0, solver.config.limits) and result.frames is not None
     highest = result.frames.body_q[:, 0, 2].max()

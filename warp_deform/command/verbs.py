@@ -281,7 +281,7 @@ def gradcheck(options: GradcheckOptions) -> Outcome:
     """Check the adjoint."""
     if options.task is not None:
         find_task(options.task)
-    from ..gradcheck.report import check
+    from ..gradcheck.report import check, wrong
     from ..gradcheck.summary import summarise
 
     quiet_warp()
@@ -295,7 +295,11 @@ def gradcheck(options: GradcheckOptions) -> Outcome:
         )
         for row in table
     ]
-    failure = None if rows else "nothing was checked, see the notes"
+    failure = None
+    if not rows:
+        failure = "no derivative was compared, the notes say why: ask for more, or other levels"
+    elif missed := [f"{r.task}, {r.level}, by {r.parameter}" for r in wrong(rows)]:
+        failure = f"derivatives miss the finite differences: {'; '.join(missed)}"
     return Outcome(
         data={"summary" if options.summary else "rows": table, "notes": notes},
         text="\n".join([*([_table([head, *cells])] if rows else []), *notes]),

@@ -13,6 +13,7 @@ _HOME = {
     "Summary": ".summary",
     "check": ".report",
     "summarise": ".summary",
+    "wrong": ".report",
 }
 
 __all__ = list(_HOME)

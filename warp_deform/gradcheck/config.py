@@ -17,7 +17,8 @@ class GradcheckConfig:
     """What is checked, and how much of it."""
 
     levels: tuple[Literal["substep", "window", "action"], ...] = ("substep", "window", "action")
-    """One substep; 0.1 s; whole actions."""
+    """Which levels to check: `substep` (one substep of the solver), `window` (0.1 s of simulation),
+    `action` (a whole pick and place). Left out, all three."""
     states: Annotated[int, arg(metavar="N"), COUNT] = 200
     """States whose next substep is differentiated; more where a constraint acts in few of them."""
     windows: Annotated[int, arg(metavar="N"), COUNT] = 30

@@ -139,7 +139,7 @@ def test_a_fall_that_the_speed_clamp_holds_up_is_an_error(dt):
     assert taken * dt == pytest.approx(3.0 / G + 0.1, abs=0.03)
 
 
-@pytest.mark.parametrize("name", ["most", "least", "calm", "calm_after", "record"])
+@pytest.mark.parametrize("name", ["max_seconds", "min_seconds", "calm", "calm_after", "record"])
 @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf, "1"], ids=repr)
 def test_durations_of_a_rollout_are_checked(name, value):
     with pytest.raises(InputError, match=name):

@@ -85,11 +85,15 @@ class PackedWorlds:
 
     @property
     def variant(self) -> tuple[Any, int, bool, bool, bool, bool]:
-        """The first arguments of `forward_kernel` and `adjoint_kernel` for these worlds."""
-        return (
-            self.scalar, self.lanes,
-            self.has_bodies, self.has_sheets, self.has_edges, self.has_lines,
-        )  # fmt: skip
+        """The first arguments of `forward_kernel` and `adjoint_kernel` for these worlds.
+
+        Double precision is for checks: one kernel serves worlds alone, as what is
+        compiled in although a scene has none of it changes no bit of what it has.
+        """
+        parts = self.has_bodies, self.has_sheets, self.has_edges, self.has_lines
+        every = (True, True, True, True)
+        checks = self.scalar == wp.float64 and self.lanes == 1
+        return (self.scalar, self.lanes, *(every if checks else parts))
 
     def add_array(
         self, name: str, count: int, dtype: Any, shape: tuple[int, ...], number: Any
