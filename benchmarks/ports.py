@@ -6,7 +6,7 @@ Goals are those of test seeds from 10,000; scores, totals and losses are means o
 does nothing, "chance" draws actions evenly, one plan a goal, "script" is one plan for all goals,
 where a task has one. "random", "cem" and "cmaes" are `optimize` over plans of `EpisodeProblem`,
 with S CPU seconds a goal. "adam" and "lbfgs", from the best of 50 draws, and "cem+adam" descend by
-the gradients of `LedProblem`, where a task holds one thing; "bundled" is adam by the mean of 8. A
+the gradients of `HeldProblem`, where a task holds one thing; "bundled" is adam by the mean of 8. A
 total is the sum of the scores of all steps, DLO-Lab's return; a score is that of the end; away is
 the task's loss at the end. `solved` and `guards` count goals. What has a row of as many goals and
 seconds is left out, so the command goes on after an interruption.
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_deform.control import EpisodeProblem, LedProblem, optimize
+from warp_deform.control import EpisodeProblem, HeldProblem, optimize
 from warp_deform.control.episode_problem import PlayedPlans
 from warp_deform.control.plan_players import Player
 from warp_deform.control.unknot import UNTIE
@@ -92,7 +92,7 @@ def played_by(
     """What a method's plans come to, and what it took: evaluations and CPU seconds a goal."""
     goals, usual = range(problem.goals), problem.player
     if method in SEARCHES:
-        if isinstance(problem, LedProblem):
+        if isinstance(problem, HeldProblem):
             problem.bundle = BUNDLE if method == "bundled" else 1
         named = "adam" if method == "bundled" else method
         found = optimize(problem, named, seconds=seconds * problem.goals)
@@ -134,7 +134,7 @@ def main() -> None:
             if key(row) in rows or not suits:
                 continue
             seeds = range(10_000, 10_000 + options.goals)
-            made = LedProblem if task in HELD else EpisodeProblem
+            made = HeldProblem if task in HELD else EpisodeProblem
             problem = problem or made(task, seeds, worlds=-(-options.goals // 8) * 8)
             played, took = played_by(problem, task, method, options.seconds)
             row |= {**told(played), **took, "revision": asdict(running_revision())}

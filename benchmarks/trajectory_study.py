@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from learning.control.play import bootstrapped
-from warp_deform.collecting.control_replay import led_task_of
-from warp_deform.collecting.control_runs import control_worlds
+from warp_deform.collecting.control_episodes import control_worlds
+from warp_deform.collecting.control_replay import setup_of
 from warp_deform.command.main import main as warp_deform
 from warp_deform.control import optimize
 from warp_deform.control.trajectory_measures import Walk
@@ -87,7 +87,7 @@ def demonstrations(task: str, options: argparse.Namespace) -> Path:
 def measured(folder: Path, method: str, seconds: float) -> dict[str, Any]:
     """What a method comes to on the episodes of a folder."""
     reader = EpisodeReader(folder, control=True)
-    control = control_worlds(led_task_of(reader.infos()[0]))
+    control = control_worlds(setup_of(reader.infos()[0]))
     losses, ratios, evaluations, cpu = [], [], 0, 0.0
     for seed in reader.seeds:
         actions = [step.action for step in reader.read(seed).steps if step.action is not None]

@@ -11,10 +11,10 @@ from warp_deform.errors import InputError
 
 from .panda import Q_MAX, Q_MIN
 
-__all__ = ["check_joints", "check_line", "check_number", "check_pose", "check_range", "shown"]
+__all__ = ["check_joints", "check_line", "check_pose", "check_range", "real_number", "shown"]
 
 
-def check_number(name: str, value: object) -> float:
+def real_number(name: str, value: object) -> float:
     """Return a real number, which may be infinite or not a number at all: ranges refuse those.
 
     Raises:
@@ -109,7 +109,7 @@ def check_range(name: str, value: float, *, low: float, high: float, unit: str) 
     Raises:
         InputError: it is no number, or not above `low` and at most `high`
     """
-    number = check_number(name, value)
+    number = real_number(name, value)
     if not low < number <= high:
         raise InputError(f"{name}: above {low} and at most {high} {unit}, not {value}")
     return number

@@ -15,7 +15,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from .arguments import check_number, shown
+from .arguments import real_number, shown
 from .panda import Q_MAX, Q_MIN
 from .table_plane import TablePlane
 
@@ -118,7 +118,7 @@ class SafetyLimits:
             "max_recoveries": (0, 10),
         }
         for name, (low, high) in ranges.items():
-            value = check_number(f"safety limit {name}", getattr(self, name))
+            value = real_number(f"safety limit {name}", getattr(self, name))
             if not low <= value <= high:  # also when it is not a number
                 raise InputError(f"safety limit {name} is {value}; allowed: {low} to {high}")
         for name in ("x", "y"):
@@ -167,7 +167,7 @@ def _interval(name: str, value: object) -> tuple[float, float]:
     """Return two numbers in their order, as a tuple that nobody can write into."""
     if not isinstance(value, (tuple, list, np.ndarray)) or len(value) != 2:
         raise InputError(f"safety limit {name} is {shown(value)}; give (low, high) [m]")
-    low, high = (check_number(f"safety limit {name}", end) for end in value)
+    low, high = (real_number(f"safety limit {name}", end) for end in value)
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise InputError(f"safety limit {name} is ({low}, {high}); give (low, high) [m]")
     return low, high

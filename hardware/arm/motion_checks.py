@@ -17,7 +17,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from .arguments import check_number, check_pose
+from .arguments import check_pose, real_number
 from .joint_path import corner_cuts, path_pieces
 from .limits import LIMIT_NAMES, PATH_TOLERANCE, SafetyLimits, dense_path
 from .panda import PandaKinematics
@@ -305,7 +305,7 @@ class MotionChecks:
 
 def _within(limit: str, name: str, value: float, low: float, high: float, unit: str = "") -> float:
     """Return the argument `name` as a number; refuse one that is not from `low` to `high`."""
-    number = check_number(name, value)
+    number = real_number(name, value)
     if not low <= number <= high or number <= 0.0:  # also when it is not a number
         raise SafetyViolation(
             f"{limit}: {number:g}{unit} is commanded, {low:g} to {high:g}{unit} allowed"

@@ -20,7 +20,7 @@ import numpy as np
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.tasks.strand_grasp import wrap_half_turn
 
-from .arguments import check_number
+from .arguments import real_number
 from .robot import MotionError, SafetyViolation, UnreachablePose
 from .safe_robot import SafeRobot
 from .table_plane import TablePlane
@@ -79,7 +79,7 @@ class PickPlaceConfig:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = check_number(f"pick_place: {field.name}", getattr(self, field.name))
+            value = real_number(f"pick_place: {field.name}", getattr(self, field.name))
             if not 0.0 <= value < math.inf:
                 raise InputError(f"pick_place: {field.name} is {value}, needed is 0 or more")
         if not self.grasp_m < self.hover_m or not self.place_m < self.short_lift_m <= self.lift_m:
@@ -109,7 +109,7 @@ class PickPlaceAction:
     def __post_init__(self) -> None:
         values = (*self.pick_xy, self.pick_yaw, *self.place_xy, self.place_yaw)
         for value in values:
-            check_number("an action's number", value)
+            real_number("an action's number", value)
         if not all(math.isfinite(value) for value in values):
             raise InputError(f"an action's numbers must be finite, not {values}")
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from .arguments import check_number
+from .arguments import real_number
 
 __all__ = ["MAX_SLOPE", "TablePlane", "fit_table_plane"]
 
@@ -36,7 +36,7 @@ class TablePlane:
 
     def __post_init__(self) -> None:
         for name in ("height_m", "slope_x", "slope_y"):
-            check_number(f"the table's {name}", getattr(self, name))
+            real_number(f"the table's {name}", getattr(self, name))
         values = (self.height_m, self.slope_x, self.slope_y)
         if not all(math.isfinite(value) for value in values):
             raise InputError(f"the table's plane {values} is not finite; touch it off again")

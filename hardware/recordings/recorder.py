@@ -222,15 +222,6 @@ class EpisodeRecorder(Closing):
         if self._observations != self._actions + 1:
             raise InputError(f"{what} follows an observation; record the observation first")
 
-    def log_robot(self, state: RobotState) -> None:
-        """Record a reading of the robot; from any thread.
-
-        Raises:
-            ValueError: a number that is none
-            InputError: the file cannot be written
-        """
-        self._append(self._robot, _reading(state), sync=False)
-
     @contextlib.contextmanager
     def following(self, robot: Robot | SafeRobot, *, rate_hz: float = 10.0) -> Iterator[None]:
         """Record the robot's readings `rate_hz` times a second from another thread while inside.

@@ -27,7 +27,7 @@ from warp_deform.solver.solver import SolverFusedXPBD
 from warp_deform.support.flag_range import check_seed
 from warp_deform.tasks.chain_physics import BEAD_CHAIN, CHAIN_SOLVER
 from warp_deform.tasks.chain_shapes import straight_chain, tossed_chain
-from warp_deform.xpbd.config import SolverConfig
+from warp_deform.xpbd.config import FOREVER, SolverConfig
 from warp_deform.xpbd.guards import PhysicsError
 
 from ..arm.panda import HOME_Q, PandaKinematics
@@ -37,7 +37,6 @@ from ..vision.top_down_view import TopDownView
 
 __all__ = ["CableTwin", "TwinConfig", "TwinLook"]
 
-_FOREVER = 1e7
 _REST_SPEED = 5e-3  # [m/s]
 _REST_SECONDS = 0.1
 
@@ -108,7 +107,7 @@ class CableTwin:
         self._chain = add_cable(builder, chain, straight_chain(chain, middle, np.pi / 2))
         model = builder.finalize(device="cpu")
         self._solver = SolverFusedXPBD(model, self.config.physics, lanes=1)
-        self._solver.set_duration(_FOREVER, _FOREVER)
+        self._solver.set_duration(FOREVER, FOREVER)
         rng = np.random.default_rng(self.config.seed)
         self._jaw = Jaw(self._solver, 0, self._chain, self.config.jaw, rng=rng)
         self._left = 0.0
@@ -161,11 +160,11 @@ class CableTwin:
         dt = self._solver.config.dt
         steps = round(seconds / dt)
         for _ in range(10):
-            self._solver.set_duration(_FOREVER, _FOREVER, calm=steps if calm else 0.0)
+            self._solver.set_duration(FOREVER, FOREVER, calm=steps if calm else 0.0)
             self._solver.check(self._solver.run(steps))
             if self._speed() < _REST_SPEED:
                 break
-        self._solver.set_duration(_FOREVER, _FOREVER)
+        self._solver.set_duration(FOREVER, FOREVER)
         self._still = _REST_SECONDS
 
     def _speed(self) -> float:

@@ -27,8 +27,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from warp_deform.collecting.control_replay import led_task_of
-from warp_deform.collecting.control_runs import ControlRun, LedTask, control_worlds, led, observed
+from warp_deform.collecting.control_episodes import (
+    ControlEpisode,
+    ControlSetup,
+    control_worlds,
+    observed,
+    play_control,
+)
+from warp_deform.collecting.control_replay import setup_of
 from warp_deform.control.numbers import recorded_numbers
 from warp_deform.episodes import Episode, EpisodeReader
 from warp_deform.errors import InputError
@@ -100,7 +106,7 @@ class Chunks:
     seen: Tensor
     actions: Tensor
     sizes: StateSizes
-    how: LedTask
+    how: ControlSetup
 
 
 def read_chunks(folder: Path, chunk: int) -> Chunks:
@@ -111,7 +117,7 @@ def read_chunks(folder: Path, chunk: int) -> Chunks:
     """
     seen, following, ways, sizes = [], [], set(), set()
     for episode in EpisodeReader(folder, control=True):
-        ways.add(led_task_of(episode.info))
+        ways.add(setup_of(episode.info))
         numbers = recorded_numbers(episode)
         sizes.add(_sizes(episode))
         actions = np.array([s.action for s in episode.steps if s.action is not None], np.float32)
@@ -251,12 +257,16 @@ class PlayedClone:
 
 
 def play_clone(
-    how: LedTask, policy: ChunkPolicy, seeds: Sequence[int], *, decay: float = CloningConfig.decay
+    how: ControlSetup,
+    policy: ChunkPolicy,
+    seeds: Sequence[int],
+    *,
+    decay: float = CloningConfig.decay,
 ) -> dict[int, PlayedClone]:
     """Let a policy play the episodes of seeds; what came of them, by seed."""
     control, said = control_worlds(how), dict[int, list[np.ndarray]]()
 
-    def act(runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+    def act(runs: Mapping[int, ControlEpisode]) -> dict[int, np.ndarray | None]:
         seen = np.stack([observed(control, slot, run) for slot, run in runs.items()])
         with torch.no_grad():
             chunks = policy(torch.from_numpy(seen)).numpy()
@@ -274,5 +284,5 @@ def play_clone(
             len(run.actions),
             run.ended or "",
         )
-        for _, run in led(control, seeds, start=lambda runs: None, act=act)
+        for _, run in play_control(control, seeds, start=lambda runs: None, act=act)
     }

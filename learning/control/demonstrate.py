@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warp_deform.collecting.control_runs import (
-    ControlRun,
-    LedTask,
+from warp_deform.collecting.control_episodes import (
+    ControlEpisode,
+    ControlSetup,
     control_worlds,
-    led,
     observed,
+    play_control,
     record_control,
     without_idle_end,
 )
@@ -35,7 +35,7 @@ from warp_deform.worlds.loop import SOLVED
 from ..evaluation.protocol import FIRST_SEED
 from ..runs.folder import read_record
 from .actor import Actor, PlanActor
-from .run import ControlRun as RunFolder
+from .run import ControlRun
 from .saved import load_actor
 
 __all__ = ["POLICY", "Acting", "Demonstrations", "demonstrate"]
@@ -78,12 +78,12 @@ class Acting:
         self._control = control
         self._actors = {slot: copy.deepcopy(actor) for slot in range(control.worlds.count)}
 
-    def __call__(self, runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+    def __call__(self, runs: Mapping[int, ControlEpisode]) -> dict[int, np.ndarray | None]:
         """Actions (A,) by slot."""
         with torch.no_grad():
             return {slot: self._acted(slot, run) for slot, run in runs.items()}
 
-    def _acted(self, slot: int, run: ControlRun) -> np.ndarray:
+    def _acted(self, slot: int, run: ControlEpisode) -> np.ndarray:
         seen = torch.from_numpy(observed(self._control, slot, run))
         action: np.ndarray = self._actors[slot](seen[None])[0].numpy()
         return action
@@ -107,10 +107,10 @@ def demonstrate(folder: Path, out: Path, *, episodes: int, progress: bool = True
     clock = time.perf_counter()
     if not 1 <= episodes <= FIRST_SEED["test"]:
         raise InputError(f"episodes is {episodes}; it must be 1 to {FIRST_SEED['test']}")
-    run = RunFolder(folder)
+    run = ControlRun(folder)
     settings, chosen = run.read_control()["control"], run.chosen()
     actor, task = load_actor(run.snapshot(chosen))
-    how = LedTask(type(control_task(task)), start="held", horizon=settings["horizon"])
+    how = ControlSetup(type(control_task(task)), start="held", horizon=settings["horizon"])
     control = control_worlds(how)
     weights = read_record(run.snapshot(chosen)).get("digest")
     description = {"policy": weights, "task": task, "horizon": settings["horizon"]}
@@ -120,7 +120,9 @@ def demonstrate(folder: Path, out: Path, *, episodes: int, progress: bool = True
         done_before = episodes - len(seeds)
         bar = progress_bar(f"demonstrate {task}", episodes, done=done_before, shown=progress)
         with bar as advance:
-            played = led(control, seeds, start=lambda runs: None, act=Acting(actor, control))
+            played = play_control(
+                control, seeds, start=lambda runs: None, act=Acting(actor, control)
+            )
             for slot, one in played:
                 success = one.ended == SOLVED
                 if success:

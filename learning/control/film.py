@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_deform.collecting.control_runs import LedTask, control_worlds, led, record_control
+from warp_deform.collecting.control_episodes import (
+    ControlSetup,
+    control_worlds,
+    play_control,
+    record_control,
+)
 from warp_deform.collecting.control_video import film_control_episodes
 from warp_deform.control.registry import control_task
 from warp_deform.episodes import Episode
@@ -29,14 +34,14 @@ def film_played(
         InputError: the path does not end with .mp4 or cannot be written.
         WarpDeformError: a seed has no valid start.
     """
-    how = LedTask(type(control_task(task)), start="held", horizon=horizon)
+    how = ControlSetup(type(control_task(task)), start="held", horizon=horizon)
     film_control_episodes([[_played(actor, how, seed)] for seed in seeds], path)
 
 
-def _played(actor: Actor | PlanActor, how: LedTask, seed: int) -> Episode:
+def _played(actor: Actor | PlanActor, how: ControlSetup, seed: int) -> Episode:
     """One episode, as recordings have it."""
     control = control_worlds(how)
-    played = led(control, [seed], start=lambda runs: None, act=Acting(actor, control))
+    played = play_control(control, [seed], start=lambda runs: None, act=Acting(actor, control))
     ((slot, run),) = played
     if not run.rows:
         raise WarpDeformError(f"the episode of seed {seed} cannot be filmed: {run.ended}")

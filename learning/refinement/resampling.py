@@ -7,25 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from warp_deform.collecting.control_runs import LedTask, control_worlds, led
+from warp_deform.collecting.control_episodes import ControlSetup, control_worlds, play_control
 from warp_deform.collecting.recording import recorded_task
 from warp_deform.control.tip_demonstrator import TipDemonstrator, usual_mode
 from warp_deform.episodes import Episode, EpisodeInfo
 from warp_deform.worlds.loop import SOLVED, EpisodeRun
 from warp_deform.worlds.worlds import Worlds
 
-__all__ = ["led_by", "resampled"]
+__all__ = ["resampled", "setup_for"]
 
 _PLACED = "placed"
 
 
-def led_by(info: EpisodeInfo, *, horizon: int | None) -> LedTask:
+def setup_for(info: EpisodeInfo, *, horizon: int | None) -> ControlSetup:
     """How tips are led that repeat a recorded episode of picks and places."""
     task = recorded_task(info)
-    return LedTask(type(task), info.robot, usual_mode(task), horizon=horizon)
+    return ControlSetup(type(task), info.robot, usual_mode(task), horizon=horizon)
 
 
-def resampled(episode: Episode, how: LedTask) -> tuple[np.ndarray | None, str]:
+def resampled(episode: Episode, how: ControlSetup) -> tuple[np.ndarray | None, str]:
     """Actions (T, A) that make a recorded episode's picks and places, and how that ended.
 
     None stands for actions that do not solve the task: things may move otherwise at 20 Hz. Picks
@@ -36,7 +36,7 @@ def resampled(episode: Episode, how: LedTask) -> tuple[np.ndarray | None, str]:
     ]
     control = control_worlds(how)
     tips = TipDemonstrator(control, _Recorded(picks).act)
-    runs = led(
+    runs = play_control(
         control,
         [episode.info.seed],
         start=lambda runs: tips.start(list(runs)),

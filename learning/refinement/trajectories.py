@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 
 from warp_deform.collecting.control_demos import replay_acts
-from warp_deform.collecting.control_replay import led_task_of
-from warp_deform.collecting.control_runs import (
-    ControlRun,
-    LedTask,
+from warp_deform.collecting.control_episodes import (
+    ControlEpisode,
+    ControlSetup,
     control_worlds,
-    led,
+    play_control,
     record_control,
     without_idle_end,
 )
+from warp_deform.collecting.control_replay import setup_of
 from warp_deform.collecting.folder import Attempt, Collection, append_attempt
 from warp_deform.collecting.goals import CONSTRUCTED
 from warp_deform.collecting.workers import Workers, worker_count
@@ -47,7 +47,7 @@ from warp_deform.support.progress import progress_bar
 from warp_deform.worlds.loop import SOLVED
 
 from .refine import REFINED, REFINEMENT, seeds_by_task
-from .resampling import led_by, resampled
+from .resampling import resampled, setup_for
 from .settings import TrajectorySettings
 
 __all__ = ["TrajectoryConfig", "TrajectoryReport", "refine_trajectories"]
@@ -159,9 +159,9 @@ def refine_trajectories(config: TrajectoryConfig) -> TrajectoryReport:
 
 def _groups(
     source: Path, infos: Sequence[EpisodeInfo], config: TrajectoryConfig
-) -> dict[LedTask, list[int]]:
+) -> dict[ControlSetup, list[int]]:
     """Seeds by how their tips are led."""
-    groups: dict[LedTask, list[int]] = {}
+    groups: dict[ControlSetup, list[int]] = {}
     for info in infos:
         if info.control is None:
             seeds_by_task(source, [info])  # refuses what is no demonstration
@@ -171,11 +171,11 @@ def _groups(
                     f"{source} has goals that are not those of its seeds, which control cannot "
                     "repeat; collect with `warp-deform demo --control` instead"
                 )
-            how = led_by(info, horizon=config.horizon)
+            how = setup_for(info, horizon=config.horizon)
         else:
             if config.horizon is not None:
                 raise InputError("--horizon is for picks and places; control has its own")
-            how = led_task_of(info)
+            how = setup_of(info)
         groups.setdefault(how, []).append(info.seed)
     return groups
 
@@ -183,7 +183,7 @@ def _groups(
 @dataclass(frozen=True)
 class _Chunk:
     config: TrajectoryConfig
-    how: LedTask
+    how: ControlSetup
     seeds: tuple[int, ...]
 
 
@@ -256,10 +256,10 @@ def _refined(
 
 def _played(
     control: ControlWorlds, seed: int, actions: np.ndarray, *, pictures: bool, to_the_end: bool
-) -> tuple[int, ControlRun]:
+) -> tuple[int, ControlEpisode]:
     """An episode as the environment plays actions, and its slot, where it has just ended."""
     act = replay_acts({seed: list(actions)})
-    runs = led(
+    runs = play_control(
         control, [seed], start=lambda runs: None, act=act, pictures=pictures, to_the_end=to_the_end
     )
     ((slot, run),) = runs

@@ -17,18 +17,18 @@ from ..control.plan_players import CornerPlayer
 from ..control.plan_search import optimize
 from ..control.registry import control_task
 from ..control.swing_problem import SwingProblem
-from ..control.tip_demonstrator import LED_MODES, TipDemonstrator, usual_mode
+from ..control.tip_demonstrator import TIP_MODES, TipDemonstrator, usual_mode
 from ..episodes import EpisodeWriter
 from ..errors import InputError
 from ..tasks.task import Task
 from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 from ..worlds.loop import SOLVED
-from .control_runs import (
+from .control_episodes import (
     Act,
-    ControlRun,
-    LedTask,
+    ControlEpisode,
+    ControlSetup,
     control_worlds,
-    led,
+    play_control,
     record_control,
     without_idle_end,
 )
@@ -66,7 +66,7 @@ def check_control(settings: CollectSettings) -> None:
         raise InputError(f"evaluations is {settings.evaluations}; it must be 1 or more")
     who = _demonstrates(task)
     if who is not None:
-        fixed = {"control_mode": (None, LED_MODES[0]), "horizon": (None,), "start": ("free",)}
+        fixed = {"control_mode": (None, TIP_MODES[0]), "horizon": (None,), "start": ("free",)}
         for name, allowed in fixed.items():
             if getattr(settings, name) not in allowed:
                 flag = name.replace("_", "-")
@@ -82,7 +82,7 @@ def has_horizon(task: str) -> bool:
 
 def describe_control(settings: CollectSettings) -> dict[str, Any]:
     """What all episodes of a collection have in common, beyond task, robot and seed."""
-    how, task = _led_task(settings), control_task(settings.task)
+    how, task = _setup(settings), control_task(settings.task)
     return {
         "mode": how.mode,
         "start": how.start,
@@ -106,10 +106,10 @@ def attempt_control_chunk(chunk: ControlChunk) -> Iterator[Attempt]:
     """Attempt seeds; a success is a file, and every attempt a line of the ledger, at once."""
     settings = chunk.settings
     writer = EpisodeWriter(chunk.out, overwrite=True)  # by the same episode, if at all
-    how = _led_task(settings)
+    how = _setup(settings)
     control = control_worlds(how)
     start, act, name = _demonstrator(control, settings)
-    played = led(control, chunk.seeds, start=start, act=act, pictures=settings.pictures)
+    played = play_control(control, chunk.seeds, start=start, act=act, pictures=settings.pictures)
     for slot, run in played:
         success = run.ended == SOLVED
         if success:
@@ -123,10 +123,12 @@ def attempt_control_chunk(chunk: ControlChunk) -> Iterator[Attempt]:
         yield attempt
 
 
-def _led_task(settings: CollectSettings) -> LedTask:
+def _setup(settings: CollectSettings) -> ControlSetup:
     task = control_task(settings.task)
     mode = settings.control_mode or usual_mode(task)
-    return LedTask(type(task), settings.robot, mode, start=settings.start, horizon=settings.horizon)
+    return ControlSetup(
+        type(task), settings.robot, mode, start=settings.start, horizon=settings.horizon
+    )
 
 
 def _is_searched(task: Task) -> bool:
@@ -144,7 +146,7 @@ def _demonstrates(task: Task) -> str | None:
 
 def _demonstrator(
     control: ControlWorlds, settings: CollectSettings
-) -> tuple[Callable[[Mapping[int, ControlRun]], None], Act, str]:
+) -> tuple[Callable[[Mapping[int, ControlEpisode]], None], Act, str]:
     """What is done at the start of runs, who acts in them, and the name of that."""
     if _is_searched(control.task):
         plans = _Plans(settings)
@@ -170,7 +172,7 @@ class _Carries:
         self._control, self._task = control, task
         self._players: dict[int, CornerPlayer] = {}
 
-    def start(self, runs: Mapping[int, ControlRun]) -> None:
+    def start(self, runs: Mapping[int, ControlEpisode]) -> None:
         task = self._task
         for slot, run in runs.items():
             player = CornerPlayer(task.control, task.fabric.columns, task.carries)
@@ -181,7 +183,7 @@ class _Carries:
             player.begin(numbers, [layout])
             self._players[slot] = player
 
-    def act(self, runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+    def act(self, runs: Mapping[int, ControlEpisode]) -> dict[int, np.ndarray | None]:
         worlds, targets = self._control.worlds, self._control.targets
         rows: dict[int, np.ndarray | None] = {}
         for slot, run in runs.items():
@@ -202,11 +204,11 @@ class _Plans:
         self._has_boxes = "box" in control_task(settings.task).objects
         self._actions: dict[int, np.ndarray] = {}
 
-    def start(self, runs: Mapping[int, ControlRun]) -> None:
+    def start(self, runs: Mapping[int, ControlEpisode]) -> None:
         for run in runs.values():
             self._actions[run.seed] = self._found(run.seed)
 
-    def act(self, runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+    def act(self, runs: Mapping[int, ControlEpisode]) -> dict[int, np.ndarray | None]:
         return {slot: self._actions[run.seed][len(run.actions)] for slot, run in runs.items()}
 
     def _found(self, seed: int) -> np.ndarray:
@@ -225,7 +227,7 @@ class _Plans:
 def replay_acts(actions: Mapping[int, Sequence[np.ndarray]]) -> Act:
     """Who takes recorded actions (A,), by seed, one after the other; then the episode ends."""
 
-    def act(runs: Mapping[int, ControlRun]) -> dict[int, np.ndarray | None]:
+    def act(runs: Mapping[int, ControlEpisode]) -> dict[int, np.ndarray | None]:
         chosen: dict[int, np.ndarray | None] = {}
         for slot, run in runs.items():
             rest = actions[run.seed][len(run.actions) :]

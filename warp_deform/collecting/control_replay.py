@@ -13,10 +13,10 @@ from ..episodes import EpisodeInfo, EpisodeReader, Step
 from ..errors import InputError
 from ..tasks.task import Task
 from .control_demos import replay_acts
-from .control_runs import LedTask, control_worlds, led
+from .control_episodes import ControlSetup, control_worlds, play_control
 from .recording import recorded_task
 
-__all__ = ["ReplayedControl", "compare_control_chunk", "led_task_of"]
+__all__ = ["ReplayedControl", "compare_control_chunk", "setup_of"]
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,12 @@ class ReplayedControl:
     """Seeds of a folder, all led in the same way, for one process."""
 
     folder: Path
-    how: LedTask
+    how: ControlSetup
     seeds: tuple[int, ...]
     tolerance: float | None
 
 
-def led_task_of(info: EpisodeInfo) -> LedTask:
+def setup_of(info: EpisodeInfo) -> ControlSetup:
     """How the tip of a recorded episode was led.
 
     Raises:
@@ -39,7 +39,7 @@ def led_task_of(info: EpisodeInfo) -> LedTask:
     if record is None:
         raise InputError("this is no episode of control at a fixed rate")
     task: Task = control_task(info.task) if info.task in CONTROL_TASKS else recorded_task(info)
-    return LedTask.of(task, info.robot, record)
+    return ControlSetup.of(task, info.robot, record)
 
 
 def compare_control_chunk(chunk: ReplayedControl) -> Iterator[tuple[int, int, float]]:
@@ -54,7 +54,7 @@ def compare_control_chunk(chunk: ReplayedControl) -> Iterator[tuple[int, int, fl
         for seed, episode in episodes.items()
     }
     control, act = control_worlds(chunk.how), replay_acts(actions)
-    runs = led(control, chunk.seeds, start=lambda runs: None, act=act, to_the_end=True)
+    runs = play_control(control, chunk.seeds, start=lambda runs: None, act=act, to_the_end=True)
     for _, run in runs:
         steps = episodes.pop(run.seed).steps
         wrong, largest = len(steps) - len(run.rows), 0.0

@@ -21,8 +21,8 @@ from ..rendering.caption import Caption
 from ..rendering.scene_view import ArmMeshes, SceneView
 from ..rendering.video import VideoWriter
 from ..worlds.worlds import Worlds
-from .control_replay import led_task_of
-from .control_runs import control_worlds
+from .control_episodes import control_worlds
+from .control_replay import setup_of
 from .video import FPS, LONGEST, STILL_SECONDS
 from .workers import single_threaded
 
@@ -131,7 +131,7 @@ def _panel(name: str, episode: Episode) -> _Panel:
 
 def _begun(episode: Episode) -> Worlds:
     """Worlds whose slot 0 has the scene of an episode at its start."""
-    control = control_worlds(led_task_of(episode.info))
+    control = control_worlds(setup_of(episode.info))
     control.reset({0: episode.info.seed})
     if control.worlds.hash(0) != episode.steps[0].state_hash:
         raise WarpDeformError(

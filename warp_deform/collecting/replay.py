@@ -17,8 +17,8 @@ from ..support.progress import progress_bar
 from ..tasks.registry import task as find_task
 from ..worlds.loop import SLOTS, EpisodeRun, play, worlds_for
 from ..worlds.worlds import Worlds
-from .control_replay import ReplayedControl, compare_control_chunk, led_task_of
-from .control_runs import LedTask
+from .control_episodes import ControlSetup
+from .control_replay import ReplayedControl, compare_control_chunk, setup_of
 from .goals import CONSTRUCTED, at_goal
 from .recording import recorded_task
 from .workers import Workers, worker_count
@@ -49,13 +49,13 @@ def verify(
         raise InputError(f"tolerance is {tolerance}; it must be a distance in metres, 0 or more")
     reader = EpisodeReader(folder, control=True)
     groups: dict[tuple[str, str, bool], list[int]] = {}
-    controlled: dict[LedTask, list[int]] = {}
+    controlled: dict[ControlSetup, list[int]] = {}
     own = cpu_fingerprint(), versions()
     same_cpu = same_versions = True
     for seed in reader.seeds:
         info = reader.info(seed)
         if info.control is not None:
-            controlled.setdefault(led_task_of(info), []).append(seed)
+            controlled.setdefault(setup_of(info), []).append(seed)
         else:
             recorded_task(info)
             kind = info.task, info.robot, info.demonstrator == CONSTRUCTED

@@ -15,10 +15,10 @@ from tyro.conf import Positional, arg
 from ..robots import RobotName
 from ..support.flag_range import COUNT, SEED
 
-__all__ = ["CollectSettings", "DemonstratorName", "LedMode"]
+__all__ = ["CollectSettings", "DemonstratorName", "TipMode"]
 
 DemonstratorName = Literal["scripted", "visible", "mpc", "planner"]
-LedMode = Literal["tip_delta_position", "tip_delta_pose"]
+TipMode = Literal["tip_delta_position", "tip_delta_pose"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class CollectSettings:
     control: bool = False
     """Demonstrate control at 20 Hz: the tip is led step by step, in the environment
     `WarpDeform/<Task>-Control-v1`. Swings (whip, whip-target) are searched for."""
-    control_mode: LedMode | None = None
+    control_mode: TipMode | None = None
     """With --control: what an action means. By default `tip_delta_pose` where the yaw of a place
     matters, else `tip_delta_position`."""
     start: Literal["free", "held"] = "free"

@@ -11,7 +11,7 @@ _HOME = {
     "ControlWorlds": ".control_worlds",
     "METHODS": ".plan_search",
     "EpisodeProblem": ".episode_problem",
-    "LedProblem": ".led_problem",
+    "HeldProblem": ".held_problem",
     "Replanner": ".replanner",
     "SwingProblem": ".swing_problem",
     "TensorControlWorlds": ".tensor_worlds",

@@ -280,7 +280,8 @@ class ControlWorlds:
         """Run one control step in every named slot.
 
         Args:
-            actions: as the mode says, each number from -1 to 1; see `check_action`
+            actions: as the mode says, each number from -1 to 1; `ControlEnv` has checked them with
+                `check_tip_action`, this does not
         """
         slots = list(actions)
         rows = np.array([actions[slot] for slot in slots], dtype=float)
@@ -342,7 +343,7 @@ class ControlWorlds:
         elif holds and not hold:
             self.control.let_go(slot, release=self.release)
             self.grips[slot] = _NOTHING
-            self._carried[slot].let_go(self.worlds.episodes[slot], self.task)
+            self._carried[slot].let_go(self.worlds.episodes[slot])
             self._set_floor(slot)
 
     def _note_taken(self, slot: int) -> None:

@@ -14,7 +14,7 @@ from .control_task import ControlTask
 from .control_worlds import ControlWorlds
 from .fold_fabric import CARRY_STEPS, FoldFabric1
 from .fold_fabric_3 import FoldFabric3
-from .led_cable import LedCable
+from .held_cable import HeldCable
 from .plan_players import (
     CornerPlayer,
     FoldPlayer,
@@ -120,7 +120,7 @@ class EpisodeProblem:
 
     @property
     def _pays(self) -> bool:
-        return isinstance(self.task, LedCable) and self.task.pays_on_the_way
+        return isinstance(self.task, HeldCable) and self.task.pays_on_the_way
 
     @property
     def goals(self) -> int:
@@ -179,7 +179,7 @@ class EpisodeProblem:
         player = self.player_of(numbers)
         player.begin(numbers, layouts)
         rows, returns = [], np.zeros(len(of))
-        pays = isinstance(self.task, LedCable)  # a return is told in any case
+        pays = isinstance(self.task, HeldCable)  # a return is told in any case
         for step in range(control.horizon):
             particle_q = np.stack([solver.particle_q(slot) for slot in slots])
             row = np.clip(player.rows(step, control.targets.asked[slots, :3], particle_q), -1, 1)

@@ -6,7 +6,7 @@ tip has 100 steps of 50 ms, at up to 1 m/s. Solved: the three distances between 
 sum to at most `together` times the edge.
 
 Source: Gathering of DLO-Lab. The cost is its own, with lengths in the source's metres (see
-`led_cable`): the three distances between the objects, a tenth of their distances from the nearest
+`held_cable`): the three distances between the objects, a tenth of their distances from the nearest
 vertex of the rope, and 100 times what either end is nearer than 10 cm to the nearest object. The
 last term is naive: it also forbids to reach over the objects, and makes a step worth nothing for an
 approach. It is kept, for gradients fail on it there.
@@ -33,7 +33,7 @@ from ..support.quaternion import quat_from_yaw
 from ..tasks.free_space import FreeSpace
 from ..tasks.losses import lengths
 from ..tasks.task import Layout, Snapshot
-from .led_cable import LedCable, pin
+from .held_cable import HeldCable, pin
 
 if TYPE_CHECKING:
     import newton
@@ -54,7 +54,7 @@ _CLEAR = 0.1
 """Distance that ends have to keep from objects, in the source's metres."""
 
 
-class Gather(LedCable):
+class Gather(HeldCable):
     """Three boxes together."""
 
     name = "gather"

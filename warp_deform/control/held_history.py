@@ -43,7 +43,7 @@ class HeldHistory:
         if task.looks_aloft:
             self._aloft = Aloft(episode.snapshot.particle_q, episode.snapshot.body_q)
 
-    def let_go(self, episode: RunningEpisode, task: Task) -> None:
+    def let_go(self, episode: RunningEpisode) -> None:
         """Write what was carried into the episode's history."""
         if self._held is None:
             return

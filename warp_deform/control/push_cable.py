@@ -30,7 +30,7 @@ from ..objects.colors import GRAY
 from ..tasks.free_space import FreeSpace
 from ..tasks.task import Layout, Snapshot, Stage
 from .cable_goal import CableGoalTask
-from .led_cable import CABLE
+from .held_cable import CABLE
 from .modes import ControlConfig
 
 if TYPE_CHECKING:

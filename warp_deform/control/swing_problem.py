@@ -58,7 +58,7 @@ class SwingProblem:
         if "box" in found.objects:
             raise InputError(
                 f"{found.name} has bodies, which are not put back after a swing: search its plans "
-                "with EpisodeProblem or LedProblem"
+                "with EpisodeProblem or HeldProblem"
             )
         self.task, self.seeds = found, [int(seed) for seed in seeds]
         self._solver = self._control.worlds.solver

@@ -254,7 +254,7 @@ class TensorControlWorlds(ControlWorlds):
     def _let_go(self, slot: int) -> None:
         self._tensors.let_go(slot, release=self.release)
         self.grips[slot] = _NOTHING
-        self._carried[slot].let_go(self.worlds.episodes[slot], self.task)
+        self._carried[slot].let_go(self.worlds.episodes[slot])
         self._set_floor(slot)
         self._floors = torch.from_numpy(self.targets.floors.copy())
 

@@ -20,9 +20,9 @@ from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
 from ..worlds.loop import Act, EpisodeRun
 from .control_worlds import ControlWorlds
 
-__all__ = ["LED_MODES", "TipDemonstrator", "usual_mode"]
+__all__ = ["TIP_MODES", "TipDemonstrator", "usual_mode"]
 
-LED_MODES = ("tip_delta_position", "tip_delta_pose")
+TIP_MODES = ("tip_delta_position", "tip_delta_pose")
 """Control modes in which a demonstrator leads a tip."""
 _TRAVEL = 0.10
 """Height at which an empty tip goes from place to place [m]. It meets nothing."""
@@ -36,7 +36,7 @@ _STEP = 1e-6
 
 def usual_mode(task: Task) -> str:
     """The control mode in which a task is demonstrated, unless another one is asked for."""
-    return LED_MODES[task.place_yaws > 1]
+    return TIP_MODES[task.place_yaws > 1]
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,13 @@ class TipDemonstrator:
             pick and place next, as those do
 
     Raises:
-        InputError: the mode of the worlds is none of `LED_MODES`.
+        InputError: the mode of the worlds is none of `TIP_MODES`.
     """
 
     def __init__(self, control: ControlWorlds, name: str | Act[Any] = "scripted") -> None:
-        if control.targets.mode not in LED_MODES:
+        if control.targets.mode not in TIP_MODES:
             raise InputError(
-                f"demonstrations are made in {' or '.join(LED_MODES)}, not {control.targets.mode!r}"
+                f"demonstrations are made in {' or '.join(TIP_MODES)}, not {control.targets.mode!r}"
             )
         self._control = control
         self._act = demonstrator(name) if isinstance(name, str) else name

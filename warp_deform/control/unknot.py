@@ -6,8 +6,8 @@ last two crossings, and keeps it. It has 100 steps of 50 ms, at up to 1 m/s. Sol
 no knot, see `knots.untied`.
 
 Source: Unknotting of DLO-Lab. The cost is its own, with lengths in the source's metres (see
-`led_cable`): the average crossing number, of midpoints of links and softened by 2 cm, and 100 times
-the squares of what two links that are no neighbours are nearer than 4 cm.
+`held_cable`): the average crossing number, of midpoints of links and softened by 2 cm, and 100
+times the squares of what two links that are no neighbours are nearer than 4 cm.
 
 Strands must not pass through each other, by which a knot that is drawn tight would come untied.
 Here the cable would stretch first: beads touch before strands cross, an overlap is undone at once
@@ -38,8 +38,8 @@ from ..tasks.free_space import FreeSpace
 from ..tasks.losses import lengths
 from ..tasks.task import Layout, Snapshot
 from ..xpbd.guards import GuardLimits
+from .held_cable import CABLE, HeldCable, weigh_down
 from .knots import overhand_knot, untied
-from .led_cable import CABLE, LedCable, weigh_down
 
 if TYPE_CHECKING:
     import newton
@@ -70,7 +70,7 @@ _SOFT, _APART = 0.02, 0.04
 metres."""
 
 
-class Unknot(LedCable):
+class Unknot(HeldCable):
     """The knot untied."""
 
     name = "unknot"

@@ -6,7 +6,7 @@ The tip has 100 steps of 50 ms, at up to 1 m/s. Solved: the cable crosses the li
 once, between them, at most `within` beads from its middle, and no bead is higher than they are.
 
 Source: Wiring-post of DLO-Lab. The cost is its own, with lengths in the source's metres (see
-`led_cable`): the mean distance of the beads from the nearest point of the target and of its points
+`held_cable`): the mean distance of the beads from the nearest point of the target and of its points
 from the nearest bead, the beads' mean height above 4 cm, and five times what the middle bead is
 farther than 2 cm from its place.
 
@@ -32,7 +32,7 @@ from ..objects.colors import GRAY
 from ..tasks.free_space import FreeSpace
 from ..tasks.losses import lengths
 from ..tasks.task import Layout, Snapshot
-from .led_cable import LedCable, fix
+from .held_cable import HeldCable, fix
 
 if TYPE_CHECKING:
     import newton
@@ -55,7 +55,7 @@ _HIGH, _NEAR = 0.04, 0.02
 """Height to which beads cost nothing, and distance of the middle bead, in the source's metres."""
 
 
-class Wire(LedCable):
+class Wire(HeldCable):
     """The cable between the posts."""
 
     name = "wire"

@@ -19,6 +19,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..rollout.rollouts import Frames, Rollout
+from ..xpbd.config import FOREVER
 from ..xpbd.guards import WatchValues
 from .jaw import Jaw, JawConfig, JawContact
 from .primitive import Motion, Outcome
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 __all__ = ["JawActionConfig", "JawCommand", "hand_pose", "jaw_motion", "jaw_script", "run_scripts"]
 
-_FOREVER = 1e7
 _FRAMES = 40
 """Waypoints of a motion that is drawn, at most."""
 
@@ -238,7 +238,7 @@ def run_scripts(
     tick = steps * solver.config.dt
     every = max(1, round(record / tick)) if record else 0
     solver.data.clear_grips()
-    solver.set_duration(_FOREVER, _FOREVER)
+    solver.set_duration(FOREVER, FOREVER)
     running = dict(scripts)
     commands = {w: next(script) for w, script in running.items()}
     seen: dict[int, list[WatchValues]] = {w: [] for w in scripts}

@@ -12,8 +12,8 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from ..objects.attributes import NAMESPACE, register_attributes
-from ..xpbd.config import SolverConfig
-from ..xpbd.fused_xpbd import FOREVER, FusedXPBD
+from ..xpbd.config import FOREVER, SolverConfig
+from ..xpbd.fused_xpbd import FusedXPBD
 from ..xpbd.guards import WatchValues
 from .newton_tape import TapedStep, recording, refuse_lost_derivatives, unrecorded
 from .stepping import grip_from_control, substeps

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from ..tasks.task import Task
 from .episode import DEMONSTRATOR_STREAM, episode_rng
 from .worlds import Worlds
 
-__all__ = ["SLOTS", "SOLVED", "Act", "EpisodeRun", "play", "worlds_for"]
+__all__ = ["SLOTS", "SOLVED", "Act", "EpisodeRun", "play", "reset_each", "worlds_for"]
 
 Row = TypeVar("Row")
 
@@ -127,13 +127,33 @@ def _start(
     new: Mapping[int, EpisodeRun[Row]],
     goals: Callable[[int], Goal | None] | None,
 ) -> None:
-    """Reset the slots of `new`; a seed without a valid start ends its own run alone."""
+    """Reset the slots of `new`, with the goals of their seeds."""
+
+    def reset(seeds: Mapping[int, int]) -> None:
+        given = {slot: goal for slot, seed in seeds.items() if goals and (goal := goals(seed))}
+        worlds.reset(seeds, goals=given)
+
+    reset_each(new, reset)
+
+
+class Startable(Protocol):
+    """An episode of a seed, which may end before it has begun."""
+
+    seed: int
+    ended: str | None
+
+
+def reset_each(new: Mapping[int, Startable], reset: Callable[[Mapping[int, int]], object]) -> None:
+    """Reset slots together; a seed without a valid start ends its own episode alone.
+
+    Args:
+        new: episodes by slot; where one has no start, its `ended` says why
+        reset: resets slots by their seeds
+    """
     if not new:
         return
-    seeds = {slot: run.seed for slot, run in new.items()}
-    given = {slot: goal for slot, seed in seeds.items() if goals and (goal := goals(seed))}
     try:
-        worlds.reset(seeds, goals=given)
+        reset({slot: run.seed for slot, run in new.items()})
     except InputError:
         raise
     except WarpDeformError as error:
@@ -141,7 +161,7 @@ def _start(
             next(iter(new.values())).ended = str(error)
             return
         for slot, run in new.items():
-            _start(worlds, {slot: run}, goals)
+            reset_each({slot: run}, reset)
 
 
 def _see(

@@ -8,7 +8,10 @@ from ..errors import InputError
 from ..support.checked import NOT_NEGATIVE, POSITIVE, Interval, check_fields
 from .guards import GuardLimits
 
-__all__ = ["WORLD_PARAMETERS", "SolverConfig"]
+__all__ = ["FOREVER", "WORLD_PARAMETERS", "SolverConfig"]
+
+FOREVER = 1.0e7
+"""More substeps than any launch has, exactly representable in float32."""
 
 WORLD_PARAMETERS = ("damping", "table_friction", "contact_friction", "stiffness")
 """What may differ from world to world, see `set_world`, and has derivatives."""

@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..support.checked import COUNT, NOT_NEGATIVE, POSITIVE, check_number
 from ..support.threads import default_threads
 from .bundle import write_bundle
-from .config import WORLD_PARAMETERS, SolverConfig
+from .config import FOREVER, WORLD_PARAMETERS, SolverConfig
 from .group_launch import GroupLaunch
 from .guards import PhysicsError, Problem, WatchValues
 from .kernels.forward import forward_kernel
@@ -27,10 +27,7 @@ from .packing.data import WATCHED, SolverData
 from .packing.topology import greatest_loss, pieces
 from .springs.viscosity import DAMP_EVERY
 
-__all__ = ["FOREVER", "FusedXPBD"]
-
-FOREVER = 1.0e7
-"""More substeps than any launch has, exactly representable in float32."""
+__all__ = ["FusedXPBD"]
 
 
 class FusedXPBD:

@@ -19,7 +19,7 @@ from learning.control.cloning import (
 )
 from learning.control.features import StateSizes
 from warp_deform.collecting.collect import CollectConfig, collect
-from warp_deform.collecting.control_runs import LedTask
+from warp_deform.collecting.control_episodes import ControlSetup
 from warp_deform.control.numbers import recorded_numbers
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
@@ -88,7 +88,7 @@ def test_proposals_follow_demonstrators_who_differ() -> None:
     sizes, count = StateSizes(0, 0, ()), 64
     sides = torch.where(torch.arange(count) % 2 == 0, 1.0, -1.0)
     actions = torch.stack([sides, torch.full_like(sides, -1.0)], dim=1)[:, None].repeat(1, 3, 1)
-    how = LedTask(task("block-notarget").__class__)
+    how = ControlSetup(task("block-notarget").__class__)
     chunks = Chunks(torch.zeros(count, sizes.numbers), actions, sizes, how)
     cloner = Cloner(chunks, CloningConfig(updates=300, batch=64), seed=0)
     for number in range(1, 301):

@@ -17,8 +17,8 @@ from learning.refinement.trajectories import (
     refine_trajectories,
 )
 from warp_deform.collecting.collect import CollectConfig, collect
-from warp_deform.collecting.control_replay import led_task_of
-from warp_deform.collecting.control_runs import control_worlds
+from warp_deform.collecting.control_episodes import control_worlds
+from warp_deform.collecting.control_replay import setup_of
 from warp_deform.collecting.replay import verify
 from warp_deform.command.main import main
 from warp_deform.control import optimize
@@ -91,7 +91,7 @@ def test_an_interrupted_refinement_goes_on_to_the_same_bytes(
 def test_a_block_that_is_let_go_early_beats_nothing(demos: Path) -> None:
     episode = EpisodeReader(demos, control=True).read(6)
     actions = np.array([s.action for s in episode.steps if s.action is not None], np.float32)
-    problem = TrajectoryProblem(control_worlds(led_task_of(episode.info)), 6, actions)
+    problem = TrajectoryProblem(control_worlds(setup_of(episode.info)), 6, actions)
     assert problem.recorded.rests and problem.recorded.measures is not None
     assert problem.loss(problem.recorded) == 1.0
     early = actions[: len(actions) * 2 // 3].copy()
@@ -105,7 +105,7 @@ def test_a_block_that_is_let_go_early_beats_nothing(demos: Path) -> None:
 def test_a_descent_begins_again_from_plans_of_another_pace(demos: Path) -> None:
     episode = EpisodeReader(demos, control=True).read(6)
     actions = np.array([s.action for s in episode.steps if s.action is not None])
-    problem = TrajectoryProblem(control_worlds(led_task_of(episode.info)), 6, actions)
+    problem = TrajectoryProblem(control_worlds(setup_of(episode.info)), 6, actions)
     found = optimize(problem, "adam", evaluations=70, population=4)
     assert found.gradients > 10 and found.losses[0] < 1.0  # all stages of the descent
     assert np.isfinite(found.losses).all() and found.numbers[0].shape[0] > problem.shape[0]

@@ -13,7 +13,7 @@ import pytest
 import warp_deform  # noqa: F401  (registers the ids)
 from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.collecting.control_demos import ControlChunk, attempt_control_chunk
-from warp_deform.collecting.control_runs import ControlRun, without_idle_end
+from warp_deform.collecting.control_episodes import ControlEpisode, without_idle_end
 from warp_deform.collecting.control_video import film_control
 from warp_deform.collecting.replay import verify
 from warp_deform.collecting.video import FPS, STILL_SECONDS
@@ -269,7 +269,7 @@ def test_the_idle_end_is_cut_and_nothing_else() -> None:
         ([go, stay, stay], [False, False, True, True], 2),
         ([go, stay], [False, False, False], 2),
     ):
-        run = without_idle_end(ControlRun(0, [row(s) for s in solved], told, "solved"))
+        run = without_idle_end(ControlEpisode(0, [row(s) for s in solved], told, "solved"))
         assert len(run.actions) == kept and len(run.rows) == kept + 1
 
 

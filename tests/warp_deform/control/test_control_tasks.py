@@ -11,7 +11,7 @@ from warp_deform.control import (
     ControlConfig,
     ControlWorlds,
     EpisodeProblem,
-    LedProblem,
+    HeldProblem,
     SwingProblem,
     optimize,
 )
@@ -97,7 +97,7 @@ def test_only_a_cable_that_lies_through_the_gap_with_its_middle_is_wired() -> No
 
 def test_a_path_far_to_one_side_wires_the_cable_at_every_goal() -> None:
     """A tip that goes straight through pulls the cable around a post."""
-    problem = LedProblem("wire", seeds=range(4), worlds=8)
+    problem = HeldProblem("wire", seeds=range(4), worlds=8)
     straight = np.linspace([-0.5, -0.5], [1.4, 1.0], 5)
     played = problem.play(range(4), np.stack([THROUGH] * 4))
     assert played.solved.all() and played.scores.min() > 0.9
@@ -111,7 +111,7 @@ def test_a_path_far_to_one_side_wires_the_cable_at_every_goal() -> None:
 
 def test_a_plan_that_wires_is_better_than_any_that_lies_near() -> None:
     """The cable lies along the gap at little cost, or through it at whatever cost."""
-    problem = LedProblem("wire", [0], worlds=8)
+    problem = HeldProblem("wire", [0], worlds=8)
     draws = np.random.default_rng(0).normal(0.0, 1.5, (16, *problem.shape))
     numbers = np.concatenate([THROUGH[None], draws])
     played, losses = problem.play([0] * 17, numbers), problem.evaluate(numbers[None])[0]
@@ -281,7 +281,7 @@ def test_what_has_no_plans_is_said() -> None:
 
 def test_the_gradients_of_a_held_cable_are_those_of_a_swing() -> None:
     """Another chain of code to the same derivatives: one launch, and a loop of control steps."""
-    led = LedProblem("whip-target", [3, 4], worlds=8)
+    led = HeldProblem("whip-target", [3, 4], worlds=8)
     swing = SwingProblem("whip-target", [3, 4], worlds=8)
     numbers = swing.refined(np.random.default_rng(0).normal(0, 1, (2, *swing.shape)))
     losses, gradients = led.gradients(numbers, np.arange(2))
@@ -293,7 +293,7 @@ def test_the_gradients_of_a_held_cable_are_those_of_a_swing() -> None:
 
 def test_the_gradients_of_pushes_are_those_of_their_losses() -> None:
     """By differences over the last steps alone: what comes before makes them chaotic."""
-    problem = LedProblem("push-cable", [10_003], worlds=8)
+    problem = HeldProblem("push-cable", [10_003], worlds=8)
     rng = np.random.default_rng(0)
     # one whose box still pushes at the end
     plans = problem.refined(rng.normal(0, 0.3, (4, *problem.shape))[3:])
@@ -312,7 +312,7 @@ def test_the_gradients_of_pushes_are_those_of_their_losses() -> None:
 
 
 def test_a_descent_from_pushes_loses_nothing_and_plays_as_it_says() -> None:
-    problem = LedProblem("push-cable", [10_000, 10_001], worlds=8)
+    problem = HeldProblem("push-cable", [10_000, 10_001], worlds=8)
     found = optimize(problem, "cem+adam", evaluations=14, population=4, seed=1)
     assert found.gradients > 0 and found.numbers.shape == (2, 120, 3)
     assert (np.diff(found.history, axis=0) <= 0).all()
@@ -325,14 +325,14 @@ def test_a_descent_from_pushes_loses_nothing_and_plays_as_it_says() -> None:
 
 def test_gradients_are_refused_where_there_are_none() -> None:
     with pytest.raises(InputError, match="may take and let go"):
-        LedProblem("fold-fabric-1", [0], worlds=8)
+        HeldProblem("fold-fabric-1", [0], worlds=8)
     with pytest.raises(InputError, match="depend on what is seen"):
-        LedProblem("push-cable", [0], worlds=8, player=FoldPlayer(ControlConfig(), 2, 1))
+        HeldProblem("push-cable", [0], worlds=8, player=FoldPlayer(ControlConfig(), 2, 1))
 
 
 def test_a_bundle_is_the_mean_of_directions_around_a_plan() -> None:
     alone, tight, wide = (
-        LedProblem("push-cable", [0, 1], worlds=8, bundle=bundle, spread=spread)
+        HeldProblem("push-cable", [0, 1], worlds=8, bundle=bundle, spread=spread)
         for bundle, spread in ((1, 0.1), (3, 0.0), (3, 0.1))
     )
     plans = np.random.default_rng(0).normal(0.0, 0.4, (2, *alone.shape))
@@ -348,4 +348,4 @@ def test_a_bundle_is_the_mean_of_directions_around_a_plan() -> None:
         sizes, most = (np.linalg.norm(g, axis=(1, 2)) for g in (bundled, gradients))
         assert (sizes <= most * (1 + 1e-12)).all() and np.isfinite(bundled).all()
     with pytest.raises(InputError, match="bundle"):
-        LedProblem("push-cable", [0], worlds=8, bundle=0)
+        HeldProblem("push-cable", [0], worlds=8, bundle=0)

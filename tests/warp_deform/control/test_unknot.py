@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warp_deform.control import ControlConfig, ControlWorlds, EpisodeProblem
+from warp_deform.control.held_cable import CABLE
 from warp_deform.control.knots import overhand_knot, untied
-from warp_deform.control.led_cable import CABLE
 from warp_deform.control.unknot import UNTIE, Unknot
 from warp_deform.errors import InputError
 from warp_deform.xpbd.guards import ProblemKind

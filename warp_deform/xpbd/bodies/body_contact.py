@@ -31,7 +31,7 @@ AHEAD = 1.0e-4
 
 @functools.cache
 def body_contact(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
-    """What happens to one contact: `list_contact`, then visits of the kinds that `body_sweeps` asks
+    """What happens to one contact: `list_contact`, then visits of the kinds that `body_visits` asks
     for, between `begin_body` and `end_body` of every body.
 
     `relative` is how far the points of a contact have been moved against each other, which the

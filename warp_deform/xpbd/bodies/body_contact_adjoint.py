@@ -1,7 +1,7 @@
 """Adjoint of the contacts of bodies with each other and the table, see `body_contact`.
 
 The sweep lists and solves them again, from the poses on the tape and with every visit noted, and
-goes back through the visits (`body_sweeps_adjoint`). For functions called `..._loss` see
+goes back through the visits (`body_visits_adjoint`). For functions called `..._loss` see
 `rigid_body_adjoint`.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from ..lanes.structures import structures
-from .body_sweeps_adjoint import body_sweeps_adjoint
+from .body_visits_adjoint import body_visits_adjoint
 from .overlap_recovery import overlap_recovery
 from .rigid_body import rigid_body
 
@@ -31,7 +31,7 @@ def body_contact_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     Bodies, Contacts, BodyAdjoint = t.Bodies, t.Contacts, t.BodyAdjoint
     turned = rigid_body(scalar, lanes).turned
     remaining = overlap_recovery(scalar).remaining
-    add_mass = body_sweeps_adjoint(scalar, lanes).add_mass
+    add_mass = body_visits_adjoint(scalar, lanes).add_mass
 
     @wp.func
     def dot4(a: Q, b: Q):

@@ -21,6 +21,8 @@ corners are solved lets a resting box creep. It keeps its velocity, so that a fo
 does not hold still accelerates it, and it moves off once it is faster."""
 SLEEP_TURN = 0.05
 """The same for its angular speed [rad/s]."""
+AWAKE, STAYS, STOPS = 0, 1, 2
+"""A sleeping body stays where it was; late in a world of fabrics it loses its velocity as well."""
 
 
 @functools.cache
@@ -28,7 +30,7 @@ def rigid_body(scalar: Any, lanes: int) -> SimpleNamespace:
     """`predict_body` begins a substep of a body, `apply_impulse` moves it, `finish_body` ends it.
 
     Contacts also ask for its `response` to an impulse, and how far a point of it has `moved`.
-    `turned` and `stepped_body` are what the adjoint shares with these.
+    `turned`, `stepped_body` and `sleep_state` are what the adjoint shares with these.
     """
     t = structures(scalar, lanes)
     S, R3, Q, Bodies = t.S, t.R3, t.Q, t.Bodies
@@ -95,6 +97,20 @@ def rigid_body(scalar: Any, lanes: int) -> SimpleNamespace:
         return step + (bodies.x[b] - (bodies.xp[b] + step))
 
     @wp.func
+    def sleep_state(b: int, d: R3, rotation: R3, dt: S, drowsy: S, bodies: Bodies):
+        """Whether a body that moved by `d` [m] and turned by `rotation` [rad] is asleep.
+
+        Args:
+            drowsy: see `finish_body`
+        """
+        state = int(AWAKE)
+        if bodies.w[b] > S(0.0) and bodies.support[b] >= 3:
+            still = wp.length(d) < S(SLEEP_SPEED) * drowsy * dt
+            if still and wp.length(rotation) < S(SLEEP_TURN) * drowsy * dt:
+                state = wp.where(drowsy > S(1.0), wp.static(STOPS), wp.static(STAYS))
+        return state
+
+    @wp.func
     def finish_body(
         b: int, dt: S, damping_factor: S, gravity: R3, fastest: S, drowsy: S, bodies: Bodies
     ):
@@ -109,14 +125,13 @@ def rigid_body(scalar: Any, lanes: int) -> SimpleNamespace:
         # the inverse of `turned`, which turns by twice the arc tangent of half the vector's length
         turn = bodies.q[b] * wp.quat_inverse(bodies.qp[b])
         rotation = R3(turn[0], turn[1], turn[2]) * (S(2.0) / turn[3])
-        if bodies.w[b] > S(0.0) and bodies.support[b] >= 3:
-            still = wp.length(d) < S(SLEEP_SPEED) * drowsy * dt
-            if still and wp.length(rotation) < S(SLEEP_TURN) * drowsy * dt:
-                bodies.x[b] = bodies.xp[b]
-                bodies.q[b] = bodies.qp[b]
-                if drowsy > S(1.0):
-                    d = R3()
-                    rotation = R3()
+        state = sleep_state(b, d, rotation, dt, drowsy, bodies)
+        if state != wp.static(AWAKE):
+            bodies.x[b] = bodies.xp[b]
+            bodies.q[b] = bodies.qp[b]
+            if state == wp.static(STOPS):
+                d = R3()
+                rotation = R3()
         # a calmed body is slowed as a whole
         limit = fastest / wp.max(wp.length(d), fastest)
         bodies.v[b] = d * (limit / dt)
@@ -130,5 +145,6 @@ def rigid_body(scalar: Any, lanes: int) -> SimpleNamespace:
         moved=moved,
         predict_body=predict_body,
         stepped_body=stepped_body,
+        sleep_state=sleep_state,
         finish_body=finish_body,
     )

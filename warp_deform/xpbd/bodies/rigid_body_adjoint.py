@@ -17,12 +17,9 @@ import warp as wp
 from ..lanes.lane_access import lane_access
 from ..lanes.structures import structures
 from ..lanes.tape import Kind, tape
-from .rigid_body import SLEEP_SPEED, SLEEP_TURN, rigid_body
+from .rigid_body import STOPS, rigid_body
 
 __all__ = ["rigid_body_adjoint"]
-
-AWAKE, STAYS, STOPS = 0, 1, 2
-"""A sleeping body stays where it was; late in a world of fabrics it loses its velocity as well."""
 
 
 @functools.cache
@@ -37,7 +34,8 @@ def rigid_body_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     tape_ = tape(scalar, lanes)
     record_pose, position, quaternion = tape_.record_pose, tape_.position, tape_.quaternion
     count_one = lane_access(scalar, lanes).count_one
-    turned, stepped_body = rigid_body(scalar, lanes).turned, rigid_body(scalar, lanes).stepped_body
+    body = rigid_body(scalar, lanes)
+    turned, stepped_body, sleep_state = body.turned, body.stepped_body, body.sleep_state
 
     @wp.func
     def rotate_adjoint(o: R3, q: Q, g: R3):
@@ -70,15 +68,10 @@ def rigid_body_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
             tape.s[at + 14 + k] = v[k]
             tape.s[at + 17 + k] = omega[k]
         tape.s[at + 20] = bodies.w[b]
-        state = int(AWAKE)
         d = stepped_body(b, dt, damping_factor, gravity, bodies)
         turn = bodies.q[b] * wp.quat_inverse(bodies.qp[b])
         rotation = R3(turn[0], turn[1], turn[2]) * (S(2.0) / turn[3])
-        if bodies.w[b] > S(0.0) and bodies.support[b] >= 3:
-            still = wp.length(d) < S(SLEEP_SPEED) * drowsy * dt
-            if still and wp.length(rotation) < S(SLEEP_TURN) * drowsy * dt:
-                state = wp.where(drowsy > S(1.0), wp.static(STOPS), wp.static(STAYS))
-        return state
+        return sleep_state(b, d, rotation, dt, drowsy, bodies)
 
     @wp.func
     def load_body(at: int, b: int, bodies: Bodies, tape: Tape):

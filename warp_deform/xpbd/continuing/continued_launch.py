@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...errors import InputError
+from ..config import FOREVER
 from ..group_launch import GroupLaunch
 from ..guards import Problem, WatchValues
 from ..lanes.tape import STATE, RunColumn
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ContinuedLaunch"]
 
-FOREVER = 1.0e7
 _OWN = ("near", "watch")
 _OWN_OF_GROUPS = ("active", "calm_steps", "calm_after", "least_steps", "most_steps")
 

@@ -3,8 +3,8 @@
 The sweep meets the constraints in exactly the opposite order of the forward kernel, pops each one's
 inputs from the tape, takes the branch that the forward pass took on these inputs, and adds the
 product of the loss's derivatives with the constraint's Jacobian. Contact lists play no part in it:
-what touched is on the tape. The phases stand in `sweeps`, `sweep_sheets` and
-`sweep_solids`. Source: Griewank, Walther, "Evaluating Derivatives", 2008, chapter 3.
+what touched is on the tape. The phases stand in `adjoint_phases`, `adjoint_sheets` and
+`adjoint_bodies`. Source: Griewank, Walther, "Evaluating Derivatives", 2008, chapter 3.
 """
 
 import functools
@@ -13,10 +13,10 @@ from typing import Any
 import warp as wp
 
 from ..lanes.algebra import add, kernel_options, mul, sub  # noqa: F401  (operators by name)
+from .adjoint_bodies import adjoint_bodies
+from .adjoint_phases import adjoint_phases
+from .adjoint_sheets import adjoint_sheets
 from .grip_adjoint import grip_adjoint
-from .sweep_sheets import sweep_sheets
-from .sweep_solids import sweep_solids
-from .sweeps import sweeps
 
 __all__ = ["adjoint_kernel"]
 
@@ -37,17 +37,17 @@ def adjoint_kernel(
     inverse masses of the state likewise. With `leave`, the prediction of the first substep is left
     to the sweep of the tape before (`pending`), which finds the velocity without a tape.
     """
-    t = sweeps(scalar, lanes, with_bodies, with_sheets, with_lines)
+    t = adjoint_phases(scalar, lanes, with_bodies, with_sheets, with_lines)
     S, V, span_of, pace_of = t.S, t.V, t.span_of, t.pace_of
     held_again = grip_adjoint(scalar, lanes, with_bodies).held_again
-    solids = sweep_solids(scalar, lanes, with_sheets)
+    solids = adjoint_bodies(scalar, lanes, with_sheets)
     sweep_finished_bodies, sweep_bodies = solids.sweep_finished_bodies, solids.sweep_bodies
     sweep_predicted_bodies = solids.sweep_predicted_bodies
     look_ahead, open_substep = t.look_ahead, t.open_substep
     sweep_finishes, sweep_contacts = t.sweep_finishes, t.sweep_contacts
     sweep_springs, sweep_grips = t.sweep_springs, t.sweep_grips
     sweep_pushes, sweep_predictions = t.sweep_pushes, t.sweep_predictions
-    sheets_ = sweep_sheets(scalar, lanes, with_edges)
+    sheets_ = adjoint_sheets(scalar, lanes, with_edges)
     sweep_sleep, sweep_viscosity = sheets_.sweep_sleep, sheets_.sweep_viscosity
     sweep_tethers, sweep_fabrics = sheets_.sweep_tethers, sheets_.sweep_fabrics
     Settings, Topology, Pairs, Shapes = t.Settings, t.Topology, t.Pairs, t.Shapes

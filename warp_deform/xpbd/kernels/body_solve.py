@@ -8,7 +8,7 @@ import warp as wp
 
 from ..bodies.body_contact import body_contact
 from ..bodies.body_pairs import body_pairs
-from ..bodies.body_sweeps import body_sweeps
+from ..bodies.body_visits import body_visits
 from ..bodies.box_particle import box_particle
 from ..bodies.box_particle_adjoint import box_particle_adjoint
 from ..bodies.box_triangle import box_triangle
@@ -41,7 +41,7 @@ def body_solve(scalar: Any, lanes: int, with_sheets: bool, taped: bool = False) 
     record_pose = tape(scalar, lanes).record_pose
     bodies_ = body_contact(scalar, lanes)
     end_body = bodies_.end_body
-    solve_contacts = body_sweeps(scalar, lanes).solve_contacts
+    solve_contacts = body_visits(scalar, lanes).solve_contacts
 
     @wp.func
     def meet_particles(

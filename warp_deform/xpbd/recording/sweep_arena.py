@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..bodies.body_contact import VISIT
-from ..bodies.body_sweeps import VISITS
+from ..bodies.body_visits import VISITS
 from ..continuing.continued_launch import ContinuedLaunch
 from ..kernels.adjoint import adjoint_kernel
 from ..kernels.forward import forward_kernel

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import newton
     from torch import Tensor
 
-__all__ = ["CABLE", "LedCable", "fix", "pin", "weigh_down"]
+__all__ = ["CABLE", "HeldCable", "fix", "pin", "weigh_down"]
 
 _SPACING = 0.02
 """Between two vertices of the source's ropes [m]."""
@@ -57,7 +57,7 @@ def fix(builder: newton.ModelBuilder, box: Box) -> None:
     builder.body_inertia[box.body] = builder.body_inv_inertia[box.body] = wp.mat33(0.0)
 
 
-class LedCable(ControlTask):
+class HeldCable(ControlTask):
     """A cable of which the tip holds a bead, and never lets go."""
 
     stages = (Stage(lift=0.04, speed=0.15),)

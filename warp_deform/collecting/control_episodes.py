@@ -20,27 +20,26 @@ from ..episodes import (
     Episode,
     Step,
 )
-from ..errors import InputError, WarpDeformError
 from ..tasks.task import Task
-from ..worlds.loop import SLOTS, SOLVED
+from ..worlds.loop import SLOTS, SOLVED, reset_each
 from .recording import episode_info, observe, origin
 
 __all__ = [
-    "ControlRun",
-    "LedTask",
+    "ControlEpisode",
+    "ControlSetup",
     "control_worlds",
-    "led",
     "observed",
+    "play_control",
     "record_control",
     "without_idle_end",
 ]
 
-Act = Callable[[Mapping[int, "ControlRun"]], Mapping[int, np.ndarray | None]]
+Act = Callable[[Mapping[int, "ControlEpisode"]], Mapping[int, np.ndarray | None]]
 """Next action (A,) of every running slot, or None for a slot whose episode is to end."""
 
 
 @dataclass(frozen=True)
-class LedTask:
+class ControlSetup:
     """A task and how its tips are led: what makes `ControlWorlds`.
 
     Attributes:
@@ -59,19 +58,19 @@ class LedTask:
     horizon: int | None = None
 
     @staticmethod
-    def of(task: Task, robot: str, record: ControlRecord) -> LedTask:
+    def of(task: Task, robot: str, record: ControlRecord) -> ControlSetup:
         """That of a recorded episode."""
         config = ControlConfig(
             rate=record.rate, max_speed=record.max_speed, max_turn=record.max_turn
         )
-        return LedTask(
+        return ControlSetup(
             type(task), robot, record.mode, record.start, record.release, record.reward_mode,
             config, record.horizon,
         )  # fmt: skip
 
 
 @functools.lru_cache(maxsize=2)
-def control_worlds(how: LedTask) -> ControlWorlds:
+def control_worlds(how: ControlSetup) -> ControlWorlds:
     """This process's worlds of a task that is led so, built once and used again."""
     return ControlWorlds(
         how.task(), SLOTS, robot=how.robot, mode=how.mode, reward_mode=how.reward_mode,
@@ -80,7 +79,7 @@ def control_worlds(how: LedTask) -> ControlWorlds:
 
 
 @dataclass(eq=False)
-class ControlRun:
+class ControlEpisode:
     """One episode as it goes.
 
     Attributes:
@@ -95,15 +94,15 @@ class ControlRun:
     ended: str | None = None
 
 
-def led(
+def play_control(
     control: ControlWorlds,
     seeds: Iterable[int],
     *,
-    start: Callable[[Mapping[int, ControlRun]], None],
+    start: Callable[[Mapping[int, ControlEpisode]], None],
     act: Act,
     pictures: bool = False,
     to_the_end: bool = False,
-) -> Iterator[tuple[int, ControlRun]]:
+) -> Iterator[tuple[int, ControlEpisode]]:
     """Play the episodes of `seeds` and yield each, with its slot, the moment it is over.
 
     A slot whose episode is over gets the next seed. Neither the order of the seeds nor the company
@@ -116,12 +115,12 @@ def led(
     """
     waiting = iter(seeds)
     free = list(range(control.worlds.count))
-    running: dict[int, ControlRun] = {}
+    running: dict[int, ControlEpisode] = {}
     while True:
         # zip asks `free` first, so no seed is lost when the slots run out
-        new = {slot: ControlRun(seed) for slot, seed in zip(free, waiting, strict=False)}
+        new = {slot: ControlEpisode(seed) for slot, seed in zip(free, waiting, strict=False)}
         free = free[len(new) :]
-        _reset(control, new)
+        reset_each(new, control.reset)
         running |= new
         if not running:
             return
@@ -152,22 +151,6 @@ def led(
             yield slot, running.pop(slot)
 
 
-def _reset(control: ControlWorlds, new: Mapping[int, ControlRun]) -> None:
-    """Reset the slots of `new`; a seed without a valid start ends its own run alone."""
-    if not new:
-        return
-    try:
-        control.reset({slot: run.seed for slot, run in new.items()})
-    except InputError:
-        raise
-    except WarpDeformError as error:
-        if len(new) == 1:
-            next(iter(new.values())).ended = str(error)
-            return
-        for slot, run in new.items():
-            _reset(control, {slot: run})
-
-
 def _row(control: ControlWorlds, slot: int, reward: float, pictures: bool) -> Step:
     """The row of a slot's present state, without heights; `record_control` fills in the action."""
     tip = np.array(control.worlds.episodes[slot].tip, dtype=float)
@@ -178,7 +161,7 @@ def _row(control: ControlWorlds, slot: int, reward: float, pictures: bool) -> St
     )
 
 
-def observed(control: ControlWorlds, slot: int, run: ControlRun) -> np.ndarray:
+def observed(control: ControlWorlds, slot: int, run: ControlEpisode) -> np.ndarray:
     """The observation "state" (D,) float32 of a slot, as environments show it."""
     episode, tip = control.worlds.episodes[slot], run.rows[-1].control
     assert tip is not None, "rows of control have a tip"
@@ -194,7 +177,7 @@ def observed(control: ControlWorlds, slot: int, run: ControlRun) -> np.ndarray:
     return np.concatenate([np.asarray(array, np.float32).ravel() for array in numbers.values()])
 
 
-def without_idle_end(run: ControlRun) -> ControlRun:
+def without_idle_end(run: ControlEpisode) -> ControlEpisode:
     """The run without the control steps at its end in which the tip was told nothing.
 
     What was learnt from them is to stand still. None may be cut at the beginning: the simulation
@@ -213,13 +196,13 @@ def _idle(actions: Sequence[np.ndarray], t: int) -> bool:
 
 
 def record_control(
-    control: ControlWorlds, slot: int, run: ControlRun, *, demonstrator: str, pictures: bool
+    control: ControlWorlds, slot: int, run: ControlEpisode, *, demonstrator: str, pictures: bool
 ) -> Episode:
     """The episode that has just ended in a slot."""
     worlds = control.worlds
     episode, last = worlds.episodes[slot], run.rows[-1]
     rows = [
-        replace(row, action=action, outcome="led")
+        replace(row, action=action, outcome="play_control")
         for row, action in zip(run.rows, run.actions, strict=False)
     ]
     targets = np.asarray(episode.layout.targets, dtype=float)

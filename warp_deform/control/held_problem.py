@@ -1,4 +1,4 @@
-"""`LedProblem`: plans with gradients, for tasks in which something is held from start to end."""
+"""`HeldProblem`: plans with gradients, for tasks in which something is held from start to end."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _MOST = 1.0 - 1e-6
 """Length of an action that numbers can stand for at most."""
 
 
-class LedProblem(EpisodeProblem):
+class HeldProblem(EpisodeProblem):
     """`EpisodeProblem` with gradients: `optimize` takes it with every method.
 
-        problem = LedProblem("push-cable", seeds=[10_000, 10_001])
+        problem = HeldProblem("push-cable", seeds=[10_000, 10_001])
         found = optimize(problem, "cem+adam", seconds=20)
 
     A descent goes on with three numbers a step, from the actions that the player makes of a plan.

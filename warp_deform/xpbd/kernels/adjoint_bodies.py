@@ -8,8 +8,8 @@ import warp as wp
 
 from ..bodies.body_contact_adjoint import body_contact_adjoint
 from ..bodies.body_pairs import body_pairs
-from ..bodies.body_sweeps import VISITS, body_sweeps
-from ..bodies.body_sweeps_adjoint import body_sweeps_adjoint
+from ..bodies.body_visits import VISITS, body_visits
+from ..bodies.body_visits_adjoint import body_visits_adjoint
 from ..bodies.box_box_adjoint import box_box_adjoint
 from ..bodies.box_particle_adjoint import box_particle_adjoint
 from ..bodies.box_table import box_table_adjoint
@@ -19,13 +19,13 @@ from ..lanes.algebra import add  # noqa: F401  (operators are found by name)
 from ..lanes.sweep_state import sweep_state
 from ..lanes.tape import BODY_SCALARS, BODY_WORDS, BOX_PARTICLE_SCALARS, BOX_TRIANGLE_SCALARS, tape
 
-__all__ = ["sweep_solids"]
+__all__ = ["adjoint_bodies"]
 
 POSE = 7
 
 
 @functools.cache
-def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
+def adjoint_bodies(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     """`sweep_finished_bodies`, `sweep_bodies` and `sweep_predicted_bodies` of a group."""
     t = sweep_state(scalar, lanes)
     S, V, R3, Q, L = t.S, t.V, t.R3, t.Q, t.L
@@ -36,13 +36,13 @@ def sweep_solids(scalar: Any, lanes: int, with_sheets: bool) -> SimpleNamespace:
     list_pairs = body_pairs(scalar, lanes, True).list_pairs
     sweep_boxes = box_box_adjoint(scalar, lanes).sweep_boxes
     sweep_table = box_table_adjoint(scalar, lanes).sweep_table
-    solve_contacts = body_sweeps(scalar, lanes, True).solve_contacts
+    solve_contacts = body_visits(scalar, lanes, True).solve_contacts
     contact_ = body_contact_adjoint(scalar, lanes)
     sweep_end_body, sweep_listed, sweep_spread, clear_contacts = (
         getattr(contact_, name)
         for name in ("sweep_end_body", "sweep_listed", "sweep_spread", "clear_contacts")
     )
-    visits_ = body_sweeps_adjoint(scalar, lanes)
+    visits_ = body_visits_adjoint(scalar, lanes)
     sweep_visits, count_contacts = visits_.sweep_visits, visits_.count_contacts
     sweep_box_particle = box_particle_adjoint(scalar, lanes).sweep_box_particle
     sweep_box_triangle = box_triangle_adjoint(scalar, lanes).sweep_box_triangle

@@ -1,4 +1,4 @@
-"""Adjoint of the visits of contacts of bodies, see `body_sweeps`.
+"""Adjoint of the visits of contacts of bodies, see `body_visits`.
 
 Corrections are undone one by one from the last visit on the log, so every visit finds the state
 that it met.
@@ -15,11 +15,11 @@ from ..lanes.structures import structures
 from ..lanes.tape import Kind
 from .body_contact import ALONE, REACTION, SHARED, VISIT, body_contact
 
-__all__ = ["body_sweeps_adjoint"]
+__all__ = ["body_visits_adjoint"]
 
 
 @functools.cache
-def body_sweeps_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
+def body_visits_adjoint(scalar: Any, lanes: int) -> SimpleNamespace:
     """`sweep_visits(first, last, ...)` takes visits first .. last of the log back; `count_contacts`
     counts what acts after the last; `add_mass` adds to the derivative by an inverse mass.
 

@@ -24,11 +24,11 @@ from ..springs.chain import chain_adjoint
 from ..springs.distance import distance_adjoint
 from .grip_adjoint import grip_adjoint
 
-__all__ = ["sweeps"]
+__all__ = ["adjoint_phases"]
 
 
 @functools.cache
-def sweeps(
+def adjoint_phases(
     scalar: Any, lanes: int, with_bodies: bool, with_sheets: bool, with_lines: bool
 ) -> SimpleNamespace:
     """The phases for a precision and a width, with the variants of `forward_kernel`."""

@@ -16,12 +16,12 @@ from ..springs.sleep import sleep_adjoint
 from ..springs.tether import tether_adjoint
 from ..springs.viscosity import viscosity_adjoint
 
-__all__ = ["sweep_sheets"]
+__all__ = ["adjoint_sheets"]
 
 
 @functools.cache
-def sweep_sheets(scalar: Any, lanes: int, with_edges: bool) -> SimpleNamespace:
-    """`sweep_sleep`, `sweep_viscosity`, `sweep_fabrics`, `sweep_tethers`; see `sweeps`."""
+def adjoint_sheets(scalar: Any, lanes: int, with_edges: bool) -> SimpleNamespace:
+    """`sweep_sleep`, `sweep_viscosity`, `sweep_fabrics`, `sweep_tethers`; see `adjoint_phases`."""
     t = sweep_state(scalar, lanes)
     S, V, V3, L = t.S, t.V, t.V3, t.L
     Span, Pace, By, Substep, Always = t.Span, t.Pace, t.By, t.Substep, t.Always

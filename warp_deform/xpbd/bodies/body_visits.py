@@ -19,7 +19,7 @@ import warp as wp
 from ..lanes.structures import structures
 from .body_contact import body_contact
 
-__all__ = ["VISITS", "body_sweeps"]
+__all__ = ["VISITS", "body_visits"]
 
 HOLDS_ALONE = 6
 """Passes over the contacts that hold one body, at most, where no body stands on another one."""
@@ -37,7 +37,7 @@ VISITS = 2 * (1 + HOLDS) + 1 + PASSES
 
 
 @functools.cache
-def body_sweeps(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
+def body_visits(scalar: Any, lanes: int, noted: bool = False) -> SimpleNamespace:
     """`solve_contacts(start, end, ...)` returns how many visits it made.
 
     Args:
