@@ -32,7 +32,11 @@ from warp_deform.worlds import Worlds
 from warp_deform.worlds.loop import SOLVED, Act, EpisodeRun, play, worlds_for
 
 TASKS = ("cable-line-notarget", "cable-shape", "fabric-flat-notarget", "block-notarget")
-GRIDS = {"none": "as it is", "paper": "grid of `paper`", "fast": "grid of `fast`"}
+GRIDS = {
+    "none": "exact actions",
+    "paper": "rounded to 3.125 mm (`paper`)",
+    "fast": "rounded to 6.25 mm (`fast`)",
+}
 FIRST_SEED = 700_000
 
 

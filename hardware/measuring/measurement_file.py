@@ -107,7 +107,7 @@ def gather(
         InputError: stopped
     """
     if measured.items and not operator.wait(measured.where()):
-        raise InputError("stopped")
+        raise InputError("stopped; what was measured is kept, the same command goes on")
     again: int | None = None
     while True:
         while len(measured.items) < wanted:

@@ -136,7 +136,9 @@ def points_from_file(
     """
     without_address = config.robot in NETWORKED_ROBOTS and config.host is None
     if config.robot not in REAL_ROBOTS or without_address:
-        raise InputError("whose are the points? give --robot and --host, as later for run")
+        raise InputError(
+            "whose are the points? give the --robot and --host that you will give to run"
+        )
     table = touched_table(config)
     intrinsics = lens_of(config)
     if intrinsics is None:

@@ -40,5 +40,8 @@ def correct(options: CorrectOptions) -> Outcome:
     )
     failure = None
     if not report.corrected:
-        failure = f"none of {report.episodes} episodes has a label; {options.out} holds no new one"
+        failure = (
+            f"the teacher labelled none of {report.episodes} episodes; "
+            "try another --teacher or --seed"
+        )
     return Outcome(data=asdict(report), text=text, failure=failure)

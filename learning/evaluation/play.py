@@ -19,7 +19,7 @@ from .failures import bag_opening, failure
 from .protocol import Protocol
 from .summary import PlayedEpisode
 
-__all__ = ["Measures", "acting", "goal_distance", "play_policy"]
+__all__ = ["Measures", "acting", "goal_distance", "observation_of", "play_policy"]
 
 
 class Measures(NamedTuple):
@@ -95,7 +95,7 @@ def acting(
             if _failed_motion(run, protocol):
                 chosen[slot] = None
                 continue
-            seen = _observe(worlds, slot, state=isinstance(policy, StatePolicy))
+            seen = observation_of(worlds, slot, policy)
             action = players[slot].act(seen, rng=run.rng)
             if protocol.stage_rule == "privileged":
                 before = stages.get(slot) if run.actions else None
@@ -132,10 +132,12 @@ def _player(policy: ImagePolicy | StatePolicy, protocol: Protocol) -> Policy:
     return policy
 
 
-def _observe(worlds: Worlds, slot: int, *, state: bool) -> dict[str, np.ndarray]:
-    """What a policy sees of a slot."""
+def observation_of(
+    worlds: Worlds, slot: int, policy: ImagePolicy | StatePolicy
+) -> dict[str, np.ndarray]:
+    """What a policy sees of a slot: `ground_truth`, or the pictures, and those of its goal."""
     episode = worlds.episodes[slot]
-    if state:
+    if isinstance(policy, StatePolicy):
         return {"ground_truth": worlds.task.ground_truth(episode.layout, episode.snapshot)}
     images = episode.snapshot.images
     seen = {"color": images.color, "height": images.height}

@@ -6,14 +6,13 @@ import copy
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from warp_deform.errors import InputError
 from warp_deform.page.players import Player, Sight
 from warp_deform.tasks.task import Action
 from warp_deform.worlds.loop import EpisodeRun
 from warp_deform.worlds.worlds import Worlds
 
+from ..evaluation.play import observation_of
 from ..evaluation.video import heat_maps
 from ..policy.policy import ImagePolicy, RetryingPolicy, StatePolicy, load_policy
 
@@ -57,21 +56,11 @@ class PolicyPlayer:
 
     def choose(self, worlds: Worlds, run: EpisodeRun[Any]) -> Action | None:
         """See `Player.choose`."""
-        return self._acting.act(self._observe(worlds), rng=run.rng)
+        return self._acting.act(observation_of(worlds, 0, self._policy), rng=run.rng)
 
     def sight(self, worlds: Worlds, action: Action) -> Sight | None:
         """Where the network looks; what the memory of missed picks avoids is not left out."""
         if not isinstance(self._policy, ImagePolicy):
             return None
-        maps = heat_maps(self._policy, self._observe(worlds), action)
+        maps = heat_maps(self._policy, observation_of(worlds, 0, self._policy), action)
         return Sight(maps.pick, maps.place)
-
-    def _observe(self, worlds: Worlds) -> dict[str, np.ndarray]:
-        episode = worlds.episodes[0]
-        if isinstance(self._policy, StatePolicy):
-            return {"ground_truth": worlds.task.ground_truth(episode.layout, episode.snapshot)}
-        images = episode.snapshot.images
-        seen = {"color": images.color, "height": images.height}
-        if episode.goal is not None:
-            seen |= {"goal_color": episode.goal.color, "goal_height": episode.goal.height}
-        return seen

@@ -213,7 +213,7 @@ def read_snapshot(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """
     record, (weights, _) = read_record(path), _read(Path(path))
     if record.get("digest", _digest(weights)) != _digest(weights):
-        raise InputError(f"{path} is damaged: these are not the weights that were written")
+        raise InputError(f"{path} is damaged: these are not the weights that were written; copy it or train again")
     return weights, record
 
 
@@ -230,7 +230,7 @@ def read_record(path: Path) -> dict[str, Any]:
     record = read_json(beside)
     if record.get("format") != _FORMAT:
         raise InputError(
-            f"{path} has format {record.get('format')!r}; this release reads {_FORMAT}"
+            f"{path} has format {record.get('format')!r}; this release reads {_FORMAT}: train again"
         )
     what = f"{beside} is no record of a snapshot"
     check_fields(record, {"step": int, "agent": dict}, what=what)

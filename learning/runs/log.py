@@ -131,7 +131,7 @@ class TrainingLog:
         """
         mean = float(self._sums["loss"]) / self._count if self._count else 0.0
         if not math.isfinite(mean):
-            raise WarpDeformError(f"the loss is {mean} at step {step}; lower the step size")
+            raise WarpDeformError(f"the loss is {mean} at step {step}; train with a lower --lr")
 
     def flush(self) -> None:
         """Write the lines so far, whole or not at all.

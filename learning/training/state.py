@@ -86,7 +86,7 @@ class Trained:
         """
         weights = self._flat if self._average is None else self._average
         if not bool(weights.isfinite().all()):
-            raise WarpDeformError(f"weights are not finite at step {step}; lower the step size")
+            raise WarpDeformError(f"weights are not finite at step {step}: train with a lower --lr")
 
     def store(self, step: int) -> None:
         """Store the state after a step in place of what was stored before."""

@@ -103,7 +103,7 @@ class DemoOptions(CollectSettings, CommandOptions):
     """Collect successful demonstrations of a task. Attempts that fail are only counted."""
 
     verify: bool = False
-    """Then simulate all of them again, and fail with exit code 1 unless every state is the same."""
+    """After collecting, simulate all of them again; the exit code is 1 if any state differs."""
 
 
 def demo(options: DemoOptions) -> Outcome:

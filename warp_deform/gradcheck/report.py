@@ -127,7 +127,7 @@ def _compare_states(worlds: Worlds, level: str, count: int, seed: int) -> list[l
         states.append(compare(run, worlds, draw, substeps, rng, bound=bound))
     if len(states) < count:
         raise WarpDeformError(
-            f"{worlds.task.name}: its episodes gave {len(states)} states of {count}"
+            f"{worlds.task.name}: its episodes gave {len(states)} states of {count}; ask for fewer"
         )
     if level == "window":
         return states

@@ -235,7 +235,7 @@ def test_no_snapshot_and_no_state_hold_what_is_not_finite(
 ) -> None:
     """The loss of step 2 is not finite, long before a line of the log is due."""
     wild = Schedule(steps=4, batch=4, lr=1e30, snapshots=snapshots)
-    with pytest.raises(WarpDeformError, match=r"the loss is .* lower the step size"):
+    with pytest.raises(WarpDeformError, match=r"the loss is .* train with a lower --lr"):
         train(config(folder, tmp_path, schedule=wild))
     run = RunFolder(tmp_path)
     assert run.steps() == ([1] if snapshots == 4 else [])
