@@ -82,8 +82,8 @@ class CollectOptions(RunOptions):
 
 
 _CALIBRATE = (
-    "Measure the setup, in the order board, lens, table, camera, empty. points or hand can take the "
-    "place of camera. docs/hardware.md explains each step."
+    "Measure the setup, in the order board, lens, table, camera, empty. points or hand can stand "
+    "in for camera. docs/hardware.md explains each step."
 )
 
 _Options = (

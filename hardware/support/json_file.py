@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from warp_deform.errors import InputError
+from warp_deform.support.whole_file import whole_file
 
 __all__ = ["read_json", "read_numbers", "require", "write_json", "write_whole"]
 
@@ -24,23 +24,17 @@ def write_json(path: Path, record: dict[str, Any]) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write under a temporary name, flush to the disk, then give the file its name.
+    """Write a file, whole or not at all.
 
     Raises:
         InputError: it cannot be written; what stood there before still does
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        with whole_file(path) as temporary:
+            temporary.write_bytes(data)
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}; choose another") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_json(path: Path, *, what: str, schema: int) -> dict[str, Any]:

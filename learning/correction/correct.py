@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,6 +42,7 @@ from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.rendering.pixels import SHAPE
 from warp_deform.robots import robot as find_robot
 from warp_deform.support.progress import progress_bar
+from warp_deform.support.whole_file import whole_file
 from warp_deform.tasks.task import Action, Task
 from warp_deform.worlds.loop import EpisodeRun, play, worlds_for
 from warp_deform.worlds.worlds import Worlds
@@ -224,9 +224,8 @@ def _copy(source: Path, out: Path, seeds: Sequence[int]) -> None:
     for name in map(episode_name, seeds):
         if (out / name).exists():
             continue
-        partial = out / f".{name}.{os.getpid()}.tmp"
-        shutil.copyfile(source / name, partial)
-        partial.replace(out / name)
+        with whole_file(out / name) as temporary:
+            shutil.copyfile(source / name, temporary)
 
 
 @dataclass(frozen=True)

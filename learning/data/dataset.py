@@ -8,8 +8,6 @@ it was made from. It may be deleted at any time, and several processes may make 
 from __future__ import annotations
 
 import copy
-import os
-import secrets
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -21,6 +19,7 @@ import numpy as np
 from warp_deform.episodes import Episode, EpisodeReader, Step, episode_name, read_index
 from warp_deform.episodes.corrected import is_corrected, labels_of
 from warp_deform.errors import InputError
+from warp_deform.support.whole_file import whole_file
 from warp_deform.tasks.registry import task as find_task
 
 from .goal_name import GoalName
@@ -330,19 +329,13 @@ def _rows(episode: Episode) -> np.ndarray:
 
 
 def _write(rows: np.ndarray, path: Path) -> None:
-    """Store rows under a temporary name, then give them theirs."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    """Store rows, whole or not at all."""
     try:
         path.parent.mkdir(exist_ok=True)
-        with temporary.open("xb") as file:
+        with whole_file(path) as temporary, temporary.open("xb") as file:
             np.save(file, rows, allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
     except OSError as error:
         raise InputError(
             f"the cache {path.parent} cannot be written ({error.strerror}); make room or copy the "
             "demonstrations to where you may write"
         ) from error
-    finally:
-        temporary.unlink(missing_ok=True)

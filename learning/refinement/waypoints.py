@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -29,6 +28,7 @@ from warp_deform.errors import InputError
 from warp_deform.planning.waypoints import BentPath, WaypointConfig, Waypoints
 from warp_deform.rollout.rollouts import GripPath
 from warp_deform.support.progress import progress_bar
+from warp_deform.support.whole_file import whole_file
 from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Action
 from warp_deform.worlds.loop import EpisodeRun, play, worlds_for
@@ -261,6 +261,5 @@ def _file(folder: Path, seed: int) -> Path:
 
 def _write(path: Path, values: Mapping[str, Any]) -> None:
     """Write a whole file or none."""
-    whole = path.with_suffix(".part")
-    whole.write_text(json.dumps(values, allow_nan=False))
-    os.replace(whole, path)
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(values, allow_nan=False))

@@ -29,6 +29,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from warp_deform.errors import InputError, WarpDeformError
+from warp_deform.support.whole_file import whole_file
 
 Fields = Mapping[str, type | tuple[type, ...]]
 """Names that a JSON object has to have, and the Python types that their values may be of."""
@@ -309,18 +310,13 @@ def _write_tensors(
 
 
 def _publish(path: Path, write: Callable[[Path], object]) -> None:
-    """Have a file written under a temporary name, then give it its name."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    """Have a file written, whole or not at all."""
     try:
-        temporary.touch()
-        mode = temporary.stat().st_mode
-        write(temporary)
-        temporary.chmod(mode)  # safetensors keeps its files from others
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        with whole_file(path) as temporary:
+            temporary.touch()
+            mode = temporary.stat().st_mode
+            write(temporary)
+            temporary.chmod(mode)  # safetensors keeps its files from others
     except (OSError, SafetensorError) as error:
         reason = getattr(error, "strerror", None) or error
         raise WarpDeformError(f"{path} cannot be written: {reason}") from error
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -6,7 +6,7 @@ import re
 import tomllib
 
 import cv2
-from fixtures.places import ROOT
+from fixtures.places import ROOT, TESTS
 
 import warp_deform
 from warp_deform.command.doctor import DEPENDENCIES
@@ -38,6 +38,20 @@ def test_texts_hold_no_machine_path_and_nothing_undone() -> None:
     assert [path for path, text in texts.items() if MACHINE_PATH.search(text)] == []
     assert [path for path, text in texts.items() if LEFT_UNDONE.search(text)] == []
     assert MACHINE_PATH.search("/" + "tmp/a") and LEFT_UNDONE.search("TO" + "DO: later")
+
+
+def test_tests_stand_in_the_rooms_of_what_they_test() -> None:
+    rooms = [
+        folder.relative_to(TESTS)
+        for package in ("warp_deform", "learning", "hardware")
+        for folder in (TESTS / package).iterdir()
+        if any(folder.glob("test_*.py"))
+    ]
+    assert len(rooms) > 30
+    homes = {room: (ROOT / room, (ROOT / room).with_suffix(".py")) for room in rooms}
+    assert [
+        room for room, (folder, file) in homes.items() if not (folder.is_dir() or file.is_file())
+    ] == []
 
 
 def test_readme_is_short() -> None:

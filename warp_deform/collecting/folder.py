@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any
 
 from ..episodes import EpisodeReader, EpisodeWriter, episode_name, versions
 from ..errors import InputError
+from ..support.whole_file import whole_file
 
 __all__ = ["Attempt", "Collection", "append_attempt", "check_seeds"]
 
@@ -159,9 +159,8 @@ class Collection:
         wanted = json.loads(json.dumps(description, allow_nan=False))
         if not path.exists():
             self._refuse_others()
-            partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-            partial.write_text(json.dumps(wanted, indent=1, sort_keys=True) + "\n")
-            partial.replace(path)
+            with whole_file(path) as temporary:
+                temporary.write_text(json.dumps(wanted, indent=1, sort_keys=True) + "\n")
             return
         try:
             stored = json.loads(path.read_bytes())

@@ -6,13 +6,13 @@ import errno
 import json
 import os
 import re
-import secrets
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, WarpDeformError
+from ..support.whole_file import whole_file
 from ._provenance import combine_hashes
 from ._records import MAX_SEED, Episode, EpisodeInfo, Goal, Step
 
@@ -267,24 +267,15 @@ def _publish(path: Path, data: bytes, *, overwrite: bool) -> None:
     refused = f"{path} exists; choose another folder or seed, or write with overwrite=True"
     if not overwrite and path.exists():
         raise InputError(refused)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
-        with temporary.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        if overwrite:
-            temporary.replace(path)
-        else:
-            _link(temporary, path)
+        with whole_file(path, os.replace if overwrite else _link) as temporary:
+            temporary.write_bytes(data)
     except FileExistsError as error:
         raise InputError(refused) from error
     except OSError as error:
         raise WarpDeformError(
             f"{path} cannot be written: {error.strerror}; what is complete is kept"
         ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
     _sync_folder(path.parent)
 
 
