@@ -34,7 +34,7 @@ from warp_deform.support.checked import POSITIVE, check_fields
 from .actor import PlanActor
 from .checkpoint import put_back, tensors_of
 
-__all__ = ["Plan", "PlanConfig"]
+__all__ = ["PlanConfig", "PlanLearner"]
 
 _STREAM = 19
 """Keeps the generator of this training apart from those of episodes."""
@@ -62,7 +62,7 @@ class PlanConfig:
         check_fields(self, dict.fromkeys(vars(self), POSITIVE))
 
 
-class Plan:
+class PlanLearner:
     """A network in training. The same seed gives the same bits on one thread of torch.
 
     Whatever is random in an update is drawn from (seed, update), so an interrupted training goes on

@@ -21,7 +21,7 @@ from ..runs.log import LINE_STEPS, TrainingLog
 from ..training.processes import join_processes
 from .actor import Actor, PlanActor
 from .apg import Apg, ApgConfig
-from .plan import Plan, PlanConfig
+from .plan import PlanConfig, PlanLearner
 from .play import play_control
 from .run import ControlRun
 from .saved import load_actor, save_actor
@@ -41,7 +41,7 @@ _TIMED = 3
 
 
 class Learner(Protocol):
-    """What every method is: see `Apg`, `Shac` and `Plan`."""
+    """What every method is: see `Apg`, `Shac` and `PlanLearner`."""
 
     @property
     def actor(self) -> Actor | PlanActor:
@@ -214,7 +214,7 @@ def make_learner(
     if isinstance(method, ApgConfig):
         return Apg(worlds, method, **options)
     if isinstance(method, PlanConfig):
-        return Plan(worlds, method, **options)
+        return PlanLearner(worlds, method, **options)
     return Shac(worlds, method, **options)
 
 

@@ -23,7 +23,15 @@ from .recorded_path import (
     walked,
 )
 from .trajectory_measures import LEAST_LOSS, Measures, Walk
-from .trajectory_run import REST_STEPS, Plan, PlanRun, counts_at_rest, remaining, settle, things
+from .trajectory_run import (
+    REST_STEPS,
+    DisplacedPath,
+    PlanRun,
+    counts_at_rest,
+    remaining,
+    settle,
+    things,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -113,7 +121,7 @@ class TrajectoryProblem:
 
     # -- plans of numbers
 
-    def _plan(self, numbers: np.ndarray) -> Plan:
+    def _plan(self, numbers: np.ndarray) -> DisplacedPath:
         """The plan that numbers (K, 3) stand for; those beyond `shape` displace it finely."""
         few = self.shape[0]
         share = 1.0 / (1.0 + np.exp(-numbers[0, :2]))
@@ -129,7 +137,7 @@ class TrajectoryProblem:
         displaced = self._basis(path, fine=False) @ numbers[1:few]
         if len(numbers) > few:
             displaced = displaced + self._basis(path, fine=True) @ numbers[few:]
-        return Plan(path, _UNIT * displaced)
+        return DisplacedPath(path, _UNIT * displaced)
 
     def _basis(self, path: WalkedPath, *, fine: bool) -> np.ndarray:
         """Shares (T + 1, K) of knots in the displacements of every step's end."""
@@ -189,7 +197,7 @@ class TrajectoryProblem:
             run.note(row)
         return self._ended([run])[0]
 
-    def _walked(self, plans: Sequence[Plan]) -> list[Walk]:
+    def _walked(self, plans: Sequence[DisplacedPath]) -> list[Walk]:
         for slot in range(len(plans)):
             put_start(self.control, slot, self.start)
         runs = [self._run(slot, plan) for slot, plan in enumerate(plans)]
@@ -200,7 +208,7 @@ class TrajectoryProblem:
                 run.note(row)
         return self._ended(runs)
 
-    def _run(self, slot: int, plan: Plan) -> PlanRun:
+    def _run(self, slot: int, plan: DisplacedPath) -> PlanRun:
         return PlanRun(self.control, slot, plan.path.steps, self.longest, plan)
 
     def _ended(self, runs: Sequence[PlanRun]) -> list[Walk]:

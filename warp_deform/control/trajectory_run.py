@@ -10,7 +10,15 @@ from .control_task import ControlTask
 from .control_worlds import SOLVED_STEPS, ControlWorlds
 from .recorded_path import Stretch, WalkedPath
 
-__all__ = ["REST_STEPS", "Plan", "PlanRun", "counts_at_rest", "remaining", "settle", "things"]
+__all__ = [
+    "REST_STEPS",
+    "DisplacedPath",
+    "PlanRun",
+    "counts_at_rest",
+    "remaining",
+    "settle",
+    "things",
+]
 
 REST_STEPS = 20
 """Control steps after the end in which the tip has let go and waits, before the loss counts."""
@@ -23,7 +31,7 @@ def counts_at_rest(control: ControlWorlds) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class DisplacedPath:
     """A walked path and how its holds are displaced (T + 1, 3) [m]."""
 
     path: WalkedPath
@@ -45,7 +53,12 @@ class PlanRun:
     """
 
     def __init__(
-        self, control: ControlWorlds, slot: int, steps: int, longest: int, plan: Plan | None = None
+        self,
+        control: ControlWorlds,
+        slot: int,
+        steps: int,
+        longest: int,
+        plan: DisplacedPath | None = None,
     ) -> None:
         self.slot, self._control, self._plan = slot, control, plan
         self._steps, self._longest = steps, longest

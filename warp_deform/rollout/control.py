@@ -187,19 +187,19 @@ class ControlLoop:
             InputError: shapes that do not fit, numbers that are not finite, a world that has not
                 begun; nothing has moved then.
         """
-        plan = self._launch.plan(worlds)
-        positions = self._knots(targets, len(plan.worlds), 3, "targets")
-        turns = self._knots(rotations, len(plan.worlds), 4, "rotations")
+        selection = self._launch.select(worlds)
+        positions = self._knots(targets, len(selection.worlds), 3, "targets")
+        turns = self._knots(rotations, len(selection.worlds), 4, "rotations")
         if positions is not None and turns is not None and positions.shape[1] != turns.shape[1]:
             counts = positions.shape[1], turns.shape[1]
             raise InputError(f"targets and rotations have {counts} knots a step: as many of both")
         if positions is not None:
-            positions = positions[plan.held]
+            positions = positions[selection.held]
         if turns is not None:
-            turns = turns[plan.held]
+            turns = turns[selection.held]
             turns = _unit(turns, turns.shape, "rotations")
-        self._launch.advance(plan, positions, turns)
-        return self._launch.problems(plan.worlds)
+        self._launch.advance(selection, positions, turns)
+        return self._launch.problems(selection.worlds)
 
     def _knots(
         self, values: np.ndarray | None, count: int, width: int, name: str

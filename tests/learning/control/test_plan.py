@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from learning.control.actor import PlanActor
-from learning.control.plan import Plan, PlanConfig
+from learning.control.plan import PlanConfig, PlanLearner
 from learning.control.play import play_control
 from warp_deform.control import TensorControlWorlds
 from warp_deform.errors import InputError
@@ -18,8 +18,8 @@ def worlds() -> TensorControlWorlds:
     return TensorControlWorlds("whip-target", 8, action_penalty=0.0)
 
 
-def trained(worlds: TensorControlWorlds, updates: int) -> Plan:
-    learner = Plan(worlds, PlanConfig(lr=2e-3), episodes=8, updates=updates, seed=0)
+def trained(worlds: TensorControlWorlds, updates: int) -> PlanLearner:
+    learner = PlanLearner(worlds, PlanConfig(lr=2e-3), episodes=8, updates=updates, seed=0)
     for number in range(1, updates + 1):
         learner.update(number)
     return learner
@@ -99,4 +99,4 @@ def test_a_row_that_begins_again_gets_a_plan_of_its_own() -> None:
 def test_what_it_cannot_plan_is_refused(task: str, options: dict, match: str) -> None:
     others = TensorControlWorlds(task, 8, action_penalty=0.0, **options)
     with pytest.raises(InputError, match=match):
-        Plan(others, PlanConfig(), episodes=8, updates=1, seed=0)
+        PlanLearner(others, PlanConfig(), episodes=8, updates=1, seed=0)

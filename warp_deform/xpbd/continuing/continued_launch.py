@@ -20,7 +20,7 @@ from .guard_notes import GuardNotes
 from .lane_runs import LaneRuns
 from .lasting_grips import LastingGrips
 from .near_lists import NearLists
-from .plan import Plan, plan_of
+from .selection import Selection, selection_of
 from .world_run import WorldRun, lists_of, places_of
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class ContinuedLaunch:
         """Which worlds (W,) have begun and not ended."""
         self._launched = np.zeros(data.world_count, bool)
         """Worlds whose near pairs stand in the lists; those of others are parked."""
-        self._plans: dict[tuple[int, ...] | None, Plan] = {}
+        self._selections: dict[tuple[int, ...] | None, Selection] = {}
 
     # -- worlds
 
@@ -125,7 +125,7 @@ class ContinuedLaunch:
         return rows
 
     def _open(self, worlds: np.ndarray, is_open: bool) -> None:
-        self._plans = {}
+        self._selections = {}
         self.open[worlds] = self.solver.continued[worlds] = is_open
 
     # -- holding
@@ -170,7 +170,7 @@ class ContinuedLaunch:
         else:
             data.views["bodies.w"][data.body_rows(world)][body] = 0.0
         self._runs.set(world, RunColumn.HOLDING, 1.0)
-        self._plans = {}
+        self._selections = {}
 
     def check_holdable(self, world: int, particle: int | None, body: int | None) -> None:
         """Refuse to hold what cannot be held.
@@ -219,7 +219,7 @@ class ContinuedLaunch:
         self.grips.let_go(slot)
         self._runs.set(world, RunColumn.HOLDING, 0.0)
         self._runs.set(world, RunColumn.CALM, calm)
-        self._plans = {}
+        self._selections = {}
 
     def holding(self, worlds: Sequence[int] | np.ndarray) -> np.ndarray:
         """Which of the worlds hold something (W,)."""
@@ -234,37 +234,37 @@ class ContinuedLaunch:
 
     # -- running
 
-    def plan(self, worlds: Sequence[int] | np.ndarray | None = None) -> Plan:
+    def select(self, worlds: Sequence[int] | np.ndarray | None = None) -> Selection:
         """How to run worlds (None: all that have begun, ascending), worked out once.
 
         Raises:
             InputError: one has not begun.
         """
         key = None if worlds is None else tuple(worlds)
-        if key not in self._plans:
+        if key not in self._selections:
             rows = self._known(np.flatnonzero(self.open) if key is None else key, begun=True)
             held = np.flatnonzero(self.holding(rows))
-            self._plans[key] = plan_of(self.data, rows, held)
-        return self._plans[key]
+            self._selections[key] = selection_of(self.data, rows, held)
+        return self._selections[key]
 
     def advance(
         self,
-        plan: Plan,
+        selection: Selection,
         positions: np.ndarray | None = None,
         rotations: np.ndarray | None = None,
     ) -> None:
-        """Run the next part in the worlds of a plan; the others that have begun pause.
+        """Run the next part in the worlds of a selection; the others that have begun pause.
 
         Args:
-            plan: what `plan` gave since anything began, ended, was taken or let go
-            positions: of the tips that hold something, in the plan's order (S, K, 3) [m]; None:
+            selection: what `select` gave since anything began, ended, was taken or let go
+            positions: of the tips that hold something, in its order (S, K, 3) [m]; None:
                 they wait
             rotations: (S, K, 4) quat_xyzw; None: they do not turn
         """
-        worlds = plan.worlds
+        worlds = selection.worlds
         self.check_room()
-        if len(plan.slots):
-            self.grips.append(plan.slots, self.substeps, positions, rotations)
+        if len(selection.slots):
+            self.grips.append(selection.slots, self.substeps, positions, rotations)
         if not self._runs.launched_last(worlds):
             goes = np.zeros(self.data.world_count, bool)
             goes[worlds] = True
@@ -279,7 +279,7 @@ class ContinuedLaunch:
         try:
             self._run_kernel(begins=False)
         except InputError:
-            self.grips.cut(plan.slots)
+            self.grips.cut(selection.slots)
             raise
 
     def check_room(self) -> None:
@@ -335,8 +335,8 @@ class ContinuedLaunch:
         return self.solver._new_settings(self.solver.config, substeps, 0, self.dt, every)
 
     def particles(self, name: str, worlds: Sequence[int] | None) -> np.ndarray:
-        """Positions "x" or velocities "v" (W, P, 3) of worlds of one topology, see `plan`."""
-        scalars = self.plan(worlds).scalars
+        """Positions "x" or velocities "v" (W, P, 3) of worlds of one topology, see `select`."""
+        scalars = self.select(worlds).scalars
         if scalars is None:
             raise InputError("no world is under control: call begin() first")
         return self.data.views[f"particles.{name}"].reshape(-1).take(scalars)

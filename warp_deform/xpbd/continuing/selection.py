@@ -1,4 +1,4 @@
-"""`Plan`: how some worlds are run together, worked out once for many parts of a launch."""
+"""`Selection`: how some worlds are run together, worked out once for many parts of a launch."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from ..packing.data import SolverData
 
-__all__ = ["Plan", "plan_of"]
+__all__ = ["Selection", "selection_of"]
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Selection:
     """How some worlds are run together.
 
     Attributes:
@@ -29,12 +29,12 @@ class Plan:
     scalars: np.ndarray | None
 
 
-def plan_of(data: SolverData, worlds: np.ndarray, held: np.ndarray) -> Plan:
-    """The plan for worlds (W,), of which `held` (S,) hold something."""
+def selection_of(data: SolverData, worlds: np.ndarray, held: np.ndarray) -> Selection:
+    """The selection of worlds (W,), of which `held` (S,) hold something."""
     scalars: np.ndarray | None = None
     if len(worlds):
         group, lane = np.divmod(data.slot[worlds], data.lanes)
         count = data.topologies[data.world_topology[worlds[0]]].particle_count
         rows = data.group_particle[group][:, None, None] + np.arange(count)[:, None]
         scalars = (rows * 3 + np.arange(3)) * data.lanes + lane[:, None, None]
-    return Plan(worlds, held, data.slot[worlds[held]], scalars)
+    return Selection(worlds, held, data.slot[worlds[held]], scalars)
