@@ -75,8 +75,8 @@ class EvalOptions(EvalSettings, CommandOptions):
     run: _Folder
     """Folder of a training run."""
     no_retry: bool = False
-    """Switch off the memory of an episode, by which an agent picks elsewhere after a miss.
-    The paper's agents have no such memory."""
+    """Do not let agents remember their last actions, and pick elsewhere after a miss. The paper's
+    agents have no such memory."""
     first_seed: Annotated[int | None, arg(metavar="S"), SEED] = None
     """Play test episodes of seeds S and up instead of 10,000 and up. Their result is kept apart
     from that of the test seeds."""

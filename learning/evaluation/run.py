@@ -76,10 +76,19 @@ def evaluate_run(
     `stage_rule` of `paper` says, and an action that the arm cannot carry out ends an episode.
 
     Args:
+        path: folder of the run
+        episodes: test episodes
+        validation_episodes: of every snapshot
+        paper: also evaluate by the paper's protocol
+        stage_rule: who chooses the lift, see `EvalSettings`
+        retry: whether an agent remembers what it missed, and picks elsewhere
+        robot: the arm
         goals: folder of goals for the test episodes; None: constructed from goal seeds
         first_seed: of other test episodes; their results are kept apart
         video: folder for videos of the first `videos` test episodes
+        videos: at most so many
         video_arm: also with the arm
+        workers: processes; None: one a core, and fewer for few episodes
         progress: tell of it on stderr, see `warp_deform.support.progress`
 
     Raises:

@@ -12,7 +12,7 @@ from ..episodes import Goal
 from ..errors import InputError, WarpDeformError
 from ..objects.box import Box
 from ..objects.cable import Cable
-from ..objects.scene_object import SceneObject
+from ..objects.scene_object import SceneObject, box_of
 from ..planning.demonstrators import demonstrator as find_demonstrator
 from ..robots.primitive import Grasp
 from ..support.checked import NOT_NEGATIVE, check_number
@@ -32,11 +32,11 @@ from .limits import TipLimits
 from .modes import CONTROL_MODES, ControlConfig, TipTargets
 from .registry import control_task
 
-__all__ = ["SOLVED_STEPS", "ControlStep"]  # `warp_deform.control` has `ControlWorlds`
+__all__ = ["NOTHING", "SOLVED_STEPS", "ControlStep"]  # `warp_deform.control` has `ControlWorlds`
 
 SOLVED_STEPS = 5
 """An episode has ended when it was solved for so many steps running."""
-_NOTHING = (None, None)
+NOTHING = (None, None)
 """What a tip holds, a particle or a body, when it holds neither."""
 _CABLE_SPEED, _CABLE_MARGIN = 8.0, 0.02
 """Speed clamp [m/s] and margin [m] of cables under control."""
@@ -125,7 +125,7 @@ class ControlWorlds:
         self._solved = np.zeros(count, int)
         self._last = np.zeros((count, self.targets.width))
         self._carried = [HeldHistory() for _ in range(count)]
-        self.grips: list[tuple[int | None, int | None]] = [_NOTHING] * count
+        self.grips: list[tuple[int | None, int | None]] = [NOTHING] * count
         """The particle or body that every tip holds; None twice where it holds nothing."""
 
     @property
@@ -153,7 +153,7 @@ class ControlWorlds:
             disturb(self.worlds, self.task, slots)
             self._goals_by_plans(self.task, slots)
         grasps: Mapping[int, Grasp] = {}
-        if self.start == "held" and self._held == _NOTHING:
+        if self.start == "held" and self._held == NOTHING:
             grasps = self._scripted_grasps(slots)
         self._begin(slots, grasps)
         for slot in slots:
@@ -172,7 +172,7 @@ class ControlWorlds:
     def _held(self) -> tuple[int | None, int | None]:
         """The particle or body that the tip holds from the start."""
         if not isinstance(self.task, ControlTask):
-            return _NOTHING
+            return NOTHING
         return self.task.held_particle, self.task.held_body
 
     @property
@@ -342,7 +342,7 @@ class ControlWorlds:
                 self._set_floor(slot)
         elif holds and not hold:
             self.control.let_go(slot, release=self.release)
-            self.grips[slot] = _NOTHING
+            self.grips[slot] = NOTHING
             self._carried[slot].let_go(self.worlds.episodes[slot])
             self._set_floor(slot)
 
@@ -360,7 +360,7 @@ class ControlWorlds:
             radius = float(solver.data.topologies[0].particle_radius[particle])
             floor = float(episode.tip[2] - solver.particle_q(slot)[particle, 2]) + radius
         elif body is not None:
-            box = next(o for o in episode.objects if isinstance(o, Box) and o.body == body)
+            box = box_of(episode.objects, body)
             floor = float(episode.tip[2]) - _lowest(box, solver.body_q(slot)[body].astype(float))
         self.targets.floors[slot] = floor
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..objects.box import Box
+from ..objects.scene_object import object_of
 from ..robots.primitive import LIFT, Outcome
 from ..tasks.history import Aloft, PastAction
 from ..tasks.task import Task
@@ -27,11 +27,7 @@ class HeldHistory:
     def take(self, episode: RunningEpisode, *, particle: int | None, body: int | None) -> None:
         """Note that a particle or a body is held from now on."""
         episode.over |= episode.ended
-        self._held = next(
-            number
-            for number, item in enumerate(episode.objects)
-            if (item.body == body if isinstance(item, Box) else particle in item.particles)
-        )
+        self._held = object_of(episode.objects, particle, body)
         self._pick, self._highest = episode.tip.copy(), float(episode.tip[2])
         self._aloft = None
 

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..rollout.tensor_control import TensorControlLoop
 from ..support.quaternion import quat_from_yaw
 from .control_task import ControlTask
-from .control_worlds import _NOTHING, SOLVED_STEPS, ControlWorlds
+from .control_worlds import NOTHING, SOLVED_STEPS, ControlWorlds
 from .held_history import HeldHistory
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class TensorControlWorlds(ControlWorlds):
                 f"reward_mode {self.rewards.mode} has no derivative: choose dense or "
                 "normalized_dense"
             )
-        if self._held == _NOTHING and self.start != "held":
+        if self._held == NOTHING and self.start != "held":
             raise InputError('what is taken hold of has no derivative: choose start="held"')
         self._tensors = TensorControlLoop(self.worlds.solver, rate=self.config.rate, memory=memory)
         self.beyond = torch.zeros(count, dtype=torch.float64)
@@ -120,7 +120,7 @@ class TensorControlWorlds(ControlWorlds):
 
     def holding(self, slot: int) -> bool:
         """Whether the tip of a slot holds something."""
-        return self.grips[slot] != _NOTHING
+        return self.grips[slot] != NOTHING
 
     @property
     def trusted(self) -> np.ndarray:
@@ -253,7 +253,7 @@ class TensorControlWorlds(ControlWorlds):
 
     def _let_go(self, slot: int) -> None:
         self._tensors.let_go(slot, release=self.release)
-        self.grips[slot] = _NOTHING
+        self.grips[slot] = NOTHING
         self._carried[slot].let_go(self.worlds.episodes[slot])
         self._set_floor(slot)
         self._floors = torch.from_numpy(self.targets.floors.copy())

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..objects.bag import Bag
-from ..objects.cloth import Cloth
+from ..objects.scene_object import is_surface
 from ..planning.demonstrators import demonstrator
 from ..robots.primitive import Grasp, Motion, PrimitiveConfig, Stage, approach, carry, find_grasp
 from ..support.quaternion import quat_from_yaw
@@ -165,7 +164,7 @@ class TipDemonstrator:
         objects = self._control.worlds.episodes[slot].objects
         grasp = Grasp(
             float(asked[2]), np.zeros(3), quat_from_yaw(0.0), particle, body,
-            sheet=any(isinstance(o, Cloth | Bag) and particle in o.particles for o in objects),
+            sheet=particle is not None and is_surface(objects, particle),
         )  # fmt: skip
         motion, _ = carry(action, grasp, stage, floor, _TRAVEL, self._primitive)
         loaded = Motion(motion.times[:-1], motion.waypoints[:-1])

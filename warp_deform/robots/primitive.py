@@ -21,7 +21,7 @@ from ..objects.bag import Bag
 from ..objects.box import Box
 from ..objects.cable import Cable
 from ..objects.cloth import Cloth
-from ..objects.scene_object import SceneObject
+from ..objects.scene_object import SceneObject, box_of, is_surface
 from ..rollout.rollouts import GripPath
 from ..support.quaternion import quat_from_yaw, quat_inverse, quat_multiply, quat_rotate
 from .arm import Robot
@@ -174,10 +174,10 @@ def find_grasp(
     back = quat_from_yaw(-yaw)
     if particle is not None:
         offset = quat_rotate(back, particle_q[particle] - tip)
-        sheet = any(isinstance(o, Cloth | Bag) and particle in o.particles for o in objects)
+        sheet = is_surface(objects, particle)
         return Grasp(height, offset, quat_from_yaw(0.0), particle=particle, sheet=sheet)
     assert body is not None
-    com = next(o for o in objects if isinstance(o, Box) and o.body == body).config.inertia()[0]
+    com = box_of(objects, body).config.inertia()[0]
     centre = body_q[body, :3] + quat_rotate(body_q[body, 3:], com)
     turn = quat_multiply(back, body_q[body, 3:])
     return Grasp(height, quat_rotate(back, centre - tip), turn, body=body)

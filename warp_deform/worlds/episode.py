@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..episodes import Goal
-from ..objects.box import Box
-from ..objects.scene_object import SceneObject
+from ..objects.scene_object import SceneObject, box_of, object_of
 from ..rendering.drawables import Drawables
 from ..robots.arm import Robot
 from ..robots.primitive import Grasp, Motion, Outcome, carry, find_grasp
@@ -172,14 +171,7 @@ class Carry:
     @property
     def held(self) -> int:
         """Number of what is carried among the world's objects."""
-        grasp = self.grasp
-        for number, item in enumerate(self.snapshot.objects):
-            if isinstance(item, Box):
-                if grasp.body == item.body:
-                    return number
-            elif grasp.particle in item.particles:
-                return number
-        raise ValueError(f"no object has particle {grasp.particle} or body {grasp.body}")
+        return object_of(self.snapshot.objects, self.grasp.particle, self.grasp.body)
 
     def __call__(self, action: np.ndarray) -> tuple[Motion, GripPath]:
         """Motion of the loaded tip, down to where what it holds would rest on the table."""
@@ -187,7 +179,8 @@ class Carry:
         if grasp.particle is not None:
             lowest = snapshot.particle_q[grasp.particle, 2] - self.radii[grasp.particle]
         else:
-            box = next(o for o in snapshot.objects if isinstance(o, Box) and o.body == grasp.body)
+            assert grasp.body is not None
+            box = box_of(snapshot.objects, grasp.body)
             lowest = snapshot.body_q[box.body, 2] + box.config.lowest
         config = self.task.primitive
         hover = self.robot.hover_height(action[3], action[4], config.hover)

@@ -66,7 +66,8 @@ def test_killed_and_called_again_it_ends_with_the_same_weights(
         assert main(["train-control", "whip-target", "--out", str(whole), *flags]) == 0
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
-        killed_at(4, patch, {"apg": Apg, "shac": training.Shac, "plan": training.PlanLearner}[method])
+        learners = {"apg": Apg, "shac": training.Shac, "plan": training.PlanLearner}
+        killed_at(4, patch, learners[method])
         assert main(["train-control", "whip-target", "--out", str(out), *flags]) == 130
     assert "updates up to 2 are kept, the same command goes on" in capfd.readouterr().err
     assert main(["train-control", "whip-target", "--out", str(out), *flags, "--json"]) == 0
