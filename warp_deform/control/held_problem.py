@@ -13,6 +13,7 @@ from ..support.checked import NOT_NEGATIVE, Interval, check_number
 from .control_task import ControlTask
 from .episode_problem import EpisodeProblem
 from .plan_players import OpenPlayer, Player
+from .plan_problem import in_parts
 from .smooth_plans import KNOTS, numbers_of, tensor_actions_of
 
 if TYPE_CHECKING:
@@ -100,13 +101,7 @@ class HeldProblem(EpisodeProblem):
         return losses, sizes * directions / self.bundle
 
     def _parts(self, numbers: np.ndarray, goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        room = self.control.worlds.count
-        parts = [
-            self._gradients(goals[first : first + room], numbers[first : first + room])
-            for first in range(0, len(goals), room)
-        ]
-        losses, gradients = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return losses, gradients
+        return in_parts(self._gradients, goals, numbers, self.control.worlds.count)
 
     def _gradients(self, of: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         import torch

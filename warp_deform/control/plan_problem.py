@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, cast
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["DifferentiableProblem", "OptimizedPlans", "PlanProblem"]
+__all__ = ["DifferentiableProblem", "OptimizedPlans", "PlanProblem", "in_parts"]
 
 GRADIENT = 2.5
 """What a plan with its gradient costs, in plans."""
@@ -46,6 +47,21 @@ class DifferentiableProblem(PlanProblem, Protocol):
         Args:
             goals: the numbers of n different goals that the plans are for, ascending
         """
+
+
+def in_parts(
+    gradients: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    goals: np.ndarray,
+    numbers: np.ndarray,
+    room: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Losses and gradients of plans, taken by `gradients` for at most `room` goals at a time."""
+    parts = [
+        gradients(goals[first : first + room], numbers[first : first + room])
+        for first in range(0, len(goals), room)
+    ]
+    losses, found = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return losses, found
 
 
 @dataclass(frozen=True, eq=False)

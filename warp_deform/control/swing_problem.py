@@ -14,6 +14,7 @@ from ..rollout.rollouts import GripPath, rollout
 from .control_task import ControlTask
 from .control_worlds import ControlWorlds
 from .modes import TipTargets
+from .plan_problem import in_parts
 from .smooth_plans import KNOTS, actions_of, numbers_of, tensor_actions_of
 
 if TYPE_CHECKING:
@@ -217,13 +218,7 @@ class SwingProblem:
         The losses have the bits of `evaluate`. Where a guard fires they are inf, and the
         gradients mean nothing.
         """
-        room = self._control.worlds.count
-        parts = [
-            self._gradients(goals[first : first + room], numbers[first : first + room])
-            for first in range(0, len(goals), room)
-        ]
-        losses, gradients = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return losses, gradients
+        return in_parts(self._gradients, goals, numbers, self._control.worlds.count)
 
     def _gradients(self, of: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A plan is one launch, forth and back: what is led through N steps has the same bits."""
