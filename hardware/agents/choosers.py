@@ -16,7 +16,7 @@ import numpy as np
 
 from warp_deform.errors import InputError
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
-from warp_deform.tasks.strand_grasp import find_grasp, map_direction
+from warp_deform.tasks.strand_grasp import find_strand_grasp, map_direction
 from warp_deform.tasks.task import Layout, Snapshot
 
 from ..arm.pick_place import PickPlaceAction, PickPlaceOutcome
@@ -57,7 +57,7 @@ def tangent_at(mask: np.ndarray, view: TopDownView, xy: tuple[float, float]) -> 
     row, column = np.rint(view.base_to_pixel(np.array(xy)))
     if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]):
         return 0.0
-    grasp = find_grasp(mask, (int(row), int(column)))
+    grasp = find_strand_grasp(mask, (int(row), int(column)))
     return 0.0 if grasp is None else map_direction(grasp.tangent, np.eye(2))
 
 

@@ -188,18 +188,18 @@ def run_episode(
     if goal is not None and goal.shape != config.view.shape:
         raise InputError(f"the goal has {goal.shape} pixels, the view {config.view.shape}")
     episode = _Episode(
-        robot,
-        camera,
-        calibration,
-        chooser,
-        recorder,
-        goal,
-        config,
-        operator or Unattended(),
-        empty,
-        toss,
-        say,
-        show,
+        robot=robot,
+        camera=camera,
+        calibration=calibration,
+        chooser=chooser,
+        recorder=recorder,
+        goal=goal,
+        config=config,
+        operator=operator or Unattended(),
+        empty=empty,
+        toss=toss,
+        say=say,
+        show=show,
     )
     robot.begin_episode()
     chooser.reset()

@@ -18,8 +18,8 @@ from ..support.checked import real_array
 from ..tasks.task import Task
 from ..worlds.observing import Observing, ObsMode, goal_shape
 from ..worlds.rewards import RewardMode
-from .env import WorldsView, check_render_mode
 from .reset_options import single_start
+from .worlds_view import WorldsView, check_render_mode
 
 __all__ = ["ControlEnv", "ControlNumbers", "TipActions"]
 
@@ -192,11 +192,7 @@ class ControlEnv(gymnasium.Env[Any, np.ndarray]):
 
     def render(self) -> np.ndarray | None:
         """The scene (360, 640, 3) uint8, black if it cannot be drawn; None without render mode."""
-        if self.render_mode is None:
-            return None
-        if not self.worlds.episodes:
-            raise ResetNeeded("nothing to draw: call reset() first")
-        return self._view.frame(0)
+        return self._view.render(self.render_mode)
 
 
 def control_information(

@@ -10,9 +10,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
-from ..errors import InputError
 from ..planning.demonstrators import demonstrator as find_demonstrator
-from ..rendering.scene_view import ArmMeshes, SceneView
 from ..tasks.task import Action, Task
 from ..worlds.acting import Acting, ActionMode, reachable
 from ..worlds.episode import DEMONSTRATOR_STREAM, episode_rng
@@ -22,10 +20,9 @@ from ..worlds.rewards import RewardMode, Rewards
 from ..worlds.spaces import information
 from ..worlds.worlds import Worlds
 from .reset_options import single_start
+from .worlds_view import WorldsView, check_render_mode
 
-__all__ = ["PickPlaceEnv", "WorldsView"]
-
-_FRAME = (360, 640)  # [pixels] rows, columns
+__all__ = ["PickPlaceEnv"]
 
 
 class PickPlaceEnv(gymnasium.Env[Any, np.ndarray]):
@@ -150,40 +147,7 @@ class PickPlaceEnv(gymnasium.Env[Any, np.ndarray]):
 
     def render(self) -> np.ndarray | None:
         """The scene (360, 640, 3) uint8, black if it cannot be drawn; None without render mode."""
-        if self.render_mode is None:
-            return None
-        if not self.worlds.episodes:
-            raise ResetNeeded("nothing to draw: call reset() first")
-        return self._view.frame(0)
-
-
-class WorldsView:
-    """Draws slots of `worlds` for people.
-
-    Args:
-        arm_follows: whether the arm is where the tip is; else it is in its home posture
-    """
-
-    def __init__(self, worlds: Worlds, *, arm_follows: bool = False) -> None:
-        self._worlds, self._follows = worlds, arm_follows
-        self._scene: SceneView | None = None
-
-    def frame(self, slot: int) -> np.ndarray:
-        """Picture (360, 640, 3) uint8 of a slot."""
-        robot = self._worlds.robot
-        if self._scene is None:
-            self._scene = SceneView(_FRAME)
-            self._meshes = ArmMeshes(robot.meshes())
-            self._home = self._meshes.at(robot.link_poses(robot.home_q))
-        episode = self._worlds.episodes[slot]
-        state = episode.snapshot.particle_q, episode.snapshot.body_q
-        if not all(np.isfinite(array).all() for array in state):
-            return np.zeros((*_FRAME, 3), np.uint8)
-        links = self._home
-        if self._follows:
-            found = robot.solve_top_down(episode.tip[None])
-            links = self._meshes.at(robot.link_poses(found.q[0])) if found.reached[0] else links
-        return self._scene.render(episode.drawables, *state, links)
+        return self._view.render(self.render_mode)
 
 
 def ending(worlds: Worlds, slot: int, info: Mapping[str, Any]) -> tuple[bool, bool]:
@@ -192,10 +156,3 @@ def ending(worlds: Worlds, slot: int, info: Mapping[str, Any]) -> tuple[bool, bo
     terminated = bool(info["physics_ok"] and worlds.episodes[slot].ended)
     over = info["actions"] >= worlds.task.max_actions or not info["physics_ok"]
     return terminated, bool(over and not terminated)
-
-
-def check_render_mode(mode: str | None, metadata: Mapping[str, Any]) -> str | None:
-    """The mode; InputError when it is unknown."""
-    if mode is not None and mode not in metadata["render_modes"]:
-        raise InputError(f"render_mode is None or 'rgb_array', not {mode!r}")
-    return mode

@@ -20,9 +20,9 @@ from ..support.checked import real_array
 from ..tasks.task import Task
 from ..worlds.worlds import Worlds
 from .backends import Backend, as_backend, check_backend, stacked
-from .env import WorldsView, check_render_mode
 from .named_calls import NamedCalls
 from .reset_options import IGNORED, GoalOption, check_options, next_seed
+from .worlds_view import WorldsView, check_render_mode
 
 __all__ = ["LaneVectorEnv", "Stepped"]
 

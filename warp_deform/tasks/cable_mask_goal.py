@@ -33,7 +33,7 @@ from .chain_shapes import curved_chain, straight_chain, tossed_chain
 from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows
 from .metrics import mask_iou
-from .strand_grasp import find_grasp, map_direction, wrap_half_turn
+from .strand_grasp import find_strand_grasp, map_direction, wrap_half_turn
 from .target_shapes import chain_yaw
 from .task import Action, Layout, Snapshot, Stage, Task
 
@@ -133,7 +133,7 @@ class CableMaskGoal(Task):
     def pick_yaw(self, color: np.ndarray, xy: np.ndarray) -> float:
         """The chain's tangent [rad] in the mask near `xy`; 0 where there is no chain."""
         row, column = self.grid.to_pixel(xy)
-        grasp = find_grasp(color[..., 0] > 127, (int(row), int(column)))
+        grasp = find_strand_grasp(color[..., 0] > 127, (int(row), int(column)))
         return 0.0 if grasp is None else map_direction(grasp.tangent, np.eye(2))
 
     def score(self, layout: Layout, snapshot: Snapshot) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["Grasp", "GraspConfig", "find_grasp", "map_direction", "wrap_half_turn"]
+__all__ = ["Grasp", "GraspConfig", "find_strand_grasp", "map_direction", "wrap_half_turn"]
 
 _SIGMA = 0.5  # of the Gaussian, relative to the crop's radius
 _REFINEMENTS = 3
@@ -82,7 +82,7 @@ def wrap_half_turn(angle: float) -> float:
     return math.pi / 2 if wrapped <= -math.pi / 2 else wrapped
 
 
-def find_grasp(
+def find_strand_grasp(
     mask: np.ndarray, pick: tuple[float, float], *, config: GraspConfig | None = None
 ) -> Grasp | None:
     """Return how to take the cable of `mask` (H, W) near row and column `pick`.

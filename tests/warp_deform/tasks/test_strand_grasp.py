@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from warp_deform.errors import InputError
 from warp_deform.tasks import strand_grasp
-from warp_deform.tasks.strand_grasp import find_grasp, map_direction, wrap_half_turn
+from warp_deform.tasks.strand_grasp import find_strand_grasp, map_direction, wrap_half_turn
 
 
 def crossing(rng: np.random.Generator, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
@@ -54,7 +54,7 @@ def test_tangent_on_curved_cables(record_property: Callable[[str, object], None]
         mask = draw([points], width)
         for i in rng.integers(60, 3940, 8):
             column, row = np.round(points[i])
-            grasp = find_grasp(mask, (row, column))
+            grasp = find_strand_grasp(mask, (row, column))
             assert grasp is not None
             nearest = int(np.argmin(np.linalg.norm(points - (column, row), axis=1)))
             errors.append(abs(wrap_half_turn(grasp.tangent - angles[nearest])))
@@ -79,7 +79,7 @@ def test_crossings_are_flagged(low: float, high: float, share: float) -> None:
     for _ in range(50):
         mask, centre = crossing(rng, low, high)
         column, row = centre + rng.normal(0.0, 1.0, 2)
-        grasp = find_grasp(mask, (row, column))
+        grasp = find_strand_grasp(mask, (row, column))
         flagged += grasp is not None and grasp.crossing
     assert flagged >= share * 50
 
@@ -88,35 +88,35 @@ def test_a_neighbouring_strand_does_not_turn_the_tangent() -> None:
     t = np.linspace(-60, 60, 200)
     strand = np.stack([80 + 0 * t, 160 + t], axis=1)
     beside = strand + np.array([7.0, 0.0])
-    grasp = find_grasp(draw([strand, beside], 3.0), (160, 80))
+    grasp = find_strand_grasp(draw([strand, beside], 3.0), (160, 80))
     assert grasp is not None and not grasp.crossing
     assert abs(abs(grasp.tangent) - np.pi / 2) < 0.01
 
 
 def test_a_blob_is_a_crossing() -> None:
     mask = np.hypot(*(np.indices((320, 160)) - np.array([160, 80])[:, None, None])) < 8
-    grasp = find_grasp(mask, (160, 80))
+    grasp = find_strand_grasp(mask, (160, 80))
     assert grasp is not None and grasp.crossing and grasp.spread > 0.5
 
 
 def test_a_pick_beside_the_cable_moves_to_it_or_finds_nothing() -> None:
     mask = draw([np.array([[20.0, 160.0], [140.0, 160.0]])], 3.0)
-    near = find_grasp(mask, (165, 80))
+    near = find_strand_grasp(mask, (165, 80))
     assert near is not None and near.point[0] == pytest.approx(160.0, abs=0.1)
     assert abs(near.tangent) < 1e-6
-    assert find_grasp(mask, (180, 80)) is None
-    assert find_grasp(np.zeros((320, 160), bool), (180, 80)) is None
+    assert find_strand_grasp(mask, (180, 80)) is None
+    assert find_strand_grasp(np.zeros((320, 160), bool), (180, 80)) is None
 
 
 @pytest.mark.parametrize("pick", [(-1, 5), (320, 5), (5, 160), (float("nan"), 5)])
 def test_a_pick_outside_of_the_mask(pick: tuple[float, float]) -> None:
     with pytest.raises(InputError, match="outside"):
-        find_grasp(np.ones((320, 160), bool), pick)
+        find_strand_grasp(np.ones((320, 160), bool), pick)
 
 
 def test_at_the_rim_of_the_picture() -> None:
     mask = draw([np.array([[-20.0, 100.0], [30.0, 100.0]])], 3.0)
-    grasp = find_grasp(mask, (100, 0))
+    grasp = find_strand_grasp(mask, (100, 0))
     assert grasp is not None and abs(grasp.tangent) < 0.02
 
 
