@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -63,10 +64,12 @@ def test_a_constructed_goal_is_the_one_that_its_seed_gets(constructed: Path) -> 
         assert stored is not None and np.array_equal(stored.targets, goal.targets)
 
 
-def test_a_set_grows_without_changing(constructed: Path) -> None:
-    before = {path.name: path.read_bytes() for path in constructed.glob("*.parquet")}
-    make_goals(TASK, constructed, count=4, kind="constructed")
-    after = {path.name: path.read_bytes() for path in constructed.glob("*.parquet")}
+def test_a_set_grows_without_changing(constructed: Path, tmp_path: Path) -> None:
+    growing = tmp_path / "goals"  # other tests count those of the fixture
+    shutil.copytree(constructed, growing)
+    before = {path.name: path.read_bytes() for path in growing.glob("*.parquet")}
+    make_goals(TASK, growing, count=4, kind="constructed")
+    after = {path.name: path.read_bytes() for path in growing.glob("*.parquet")}
     assert len(after) == 4 and before.items() <= after.items()
 
 
