@@ -73,7 +73,7 @@ class ControlSetup:
 def control_worlds(how: ControlSetup) -> ControlWorlds:
     """This process's worlds of a task that is led so, built once and used again."""
     return ControlWorlds(
-        how.task(), SLOTS, robot=how.robot, mode=how.mode, reward_mode=how.reward_mode,
+        how.task(), SLOTS, robot=how.robot, control_mode=how.mode, reward_mode=how.reward_mode,
         start=how.start, release=how.release, config=how.config, horizon=how.horizon, lanes=SLOTS,
     )  # fmt: skip
 

@@ -70,7 +70,7 @@ class ControlWorlds:
 
     Args:
         task: a name, of `warp_deform.control.registry.CONTROL_TASKS` or of the benchmark, or a task
-        mode: see `CONTROL_MODES`
+        control_mode: see `CONTROL_MODES`
         reward_mode: see `Rewards`
         start: "free", with the tip at its waiting place; "held", where the scripted demonstrator
             has taken what it would move first
@@ -89,7 +89,7 @@ class ControlWorlds:
         count: int = 1,
         *,
         robot: str = "ur5",
-        mode: str = "tip_delta_position",
+        control_mode: str = "tip_delta_position",
         reward_mode: str = "dense",
         start: str = "free",
         release: str = "rest",
@@ -110,14 +110,16 @@ class ControlWorlds:
         own = found.control if isinstance(found, ControlTask) else ControlConfig()
         self.config = config or own
         self.horizon = horizon or horizon_of(found, self.config)
-        if mode not in CONTROL_MODES:
-            raise InputError(f"control_mode is one of {', '.join(CONTROL_MODES)}, not {mode!r}")
+        if control_mode not in CONTROL_MODES:
+            raise InputError(
+                f"control_mode is one of {', '.join(CONTROL_MODES)}, not {control_mode!r}"
+            )
         self.worlds = Worlds(found, count, robot=robot, lanes=lanes)
         self._usual = self.worlds.solver.config
         self._led_config = _for_control(self._usual, self.worlds.objects)
         self.limits = TipLimits(self.worlds.robot)
-        self.targets = TipTargets(mode, self.config, self.limits, count)
-        self.control = TipControl(self.worlds, rate=self.config.rate)
+        self.targets = TipTargets(control_mode, self.config, self.limits, count)
+        self.tips = TipControl(self.worlds, rate=self.config.rate)
         self.rewards = Rewards(self.worlds, reward_mode)
         self.start, self.release = start, release
         self.steps = np.zeros(count, int)
@@ -135,7 +137,7 @@ class ControlWorlds:
 
     def holding(self, slot: int) -> bool:
         """Whether the tip of a slot holds something."""
-        return bool(self.control.loop.holding([slot])[0])
+        return bool(self.tips.loop.holding([slot])[0])
 
     # -- starting
 
@@ -182,7 +184,7 @@ class ControlWorlds:
     def _begin(self, slots: Sequence[int], grasps: Mapping[int, Grasp]) -> None:
         """Take slots under control, with what they hold from the start."""
         self.worlds.solver.config = self._led_config
-        self.control.begin(slots)
+        self.tips.begin(slots)
         particle, body = self._held
         for slot in slots:
             episode, solver = self.worlds.episodes[slot], self.worlds.solver
@@ -190,15 +192,15 @@ class ControlWorlds:
             if particle is not None:
                 place = solver.particle_q(slot)[particle].astype(float)
                 episode.tip = np.append(place, 0.0)
-                self.control.loop.hold(slot, particle=particle)
+                self.tips.loop.hold(slot, particle=particle)
             elif body is not None:
                 pose = solver.body_q(slot)[body].astype(float)
                 episode.tip = np.append(pose[:3], 0.0)
-                self.control.loop.hold(slot, body=body, tip=pose[:3])
+                self.tips.loop.hold(slot, body=body, tip=pose[:3])
             elif slot in grasps:
                 grasp, tip = grasps[slot], episode.tip
                 self.grips[slot] = (grasp.particle, grasp.body)
-                self.control.loop.hold(
+                self.tips.loop.hold(
                     slot, particle=grasp.particle, body=grasp.body, tip=tip[:3],
                     rotation=quat_from_yaw(float(tip[3])),
                 )  # fmt: skip
@@ -269,9 +271,9 @@ class ControlWorlds:
         for step in range(len(plans[slots[0]])):
             actions = np.array([np.append(plans[slot][step], 1.0) for slot in slots])
             knots = targets.follow(slots, actions)
-            fired |= self.control.loop.advance(knots[..., :3], worlds=slots)
+            fired |= self.tips.loop.advance(knots[..., :3], worlds=slots)
         ends = {slot: self.worlds.solver.particle_q(slot) for slot in slots if slot not in fired}
-        self.control.loop.end(slots)
+        self.tips.loop.end(slots)
         return ends
 
     # -- going on
@@ -301,11 +303,11 @@ class ControlWorlds:
             self._take_or_let_go(slot, bool(row[-1] > 0))
         knots = self.targets.follow(slots, rows)
         turns = quat_from_yaw(knots[..., 3])
-        fired = self.control.loop.advance(knots[..., :3], turns, worlds=slots)
+        fired = self.tips.loop.advance(knots[..., :3], turns, worlds=slots)
         for slot, tip in zip(slots, knots[:, -1], strict=True):
             episode = self.worlds.episodes[slot]
             episode.tip = np.array(tip)
-            episode.sim_seconds += self.control.loop.seconds
+            episode.sim_seconds += self.tips.loop.seconds
             # these are of all control so far
             episode.problems = fired.get(slot, ()) or episode.problems
         self.steps[list(slots)] += 1
@@ -335,13 +337,13 @@ class ControlWorlds:
             return
         holds = self.holding(slot)
         if hold and not holds:
-            grasp = self.control.hold(slot)
+            grasp = self.tips.hold(slot)
             if grasp is not None:
                 self.grips[slot] = (grasp.particle, grasp.body)
                 self._note_taken(slot)
                 self._set_floor(slot)
         elif holds and not hold:
-            self.control.let_go(slot, release=self.release)
+            self.tips.let_go(slot, release=self.release)
             self.grips[slot] = NOTHING
             self._carried[slot].let_go(self.worlds.episodes[slot])
             self._set_floor(slot)

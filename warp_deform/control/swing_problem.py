@@ -82,7 +82,7 @@ class SwingProblem:
         """Positions, velocities, lowest height of the tip and layout of every seed."""
         control = self._control
         control.reset(dict(enumerate(seeds)))
-        control.control.end()
+        control.tips.end()
         solver, episodes = self._solver, control.worlds.episodes
         return [
             (solver.particle_q(slot), solver.particle_qd(slot),
@@ -92,7 +92,7 @@ class SwingProblem:
 
     def _times(self) -> np.ndarray:
         """Of the knots (T + 2,) [s], in the kernel's arithmetic; the last is never reached."""
-        number, loop = self._solver.data.number, self._control.control.loop
+        number, loop = self._solver.data.number, self._control.tips.loop
         ticks = loop.substeps * np.arange(self._control.horizon + 1)
         clock = ticks.astype(number) * number(self._solver.config.dt)
         return np.append(clock.astype(float), 1e6)
@@ -163,7 +163,7 @@ class SwingProblem:
         solver, worlds = self._solver, list(range(len(of)))
         steps = self._led(of, actions)
         self._put(of)
-        seconds = self.steps * self._control.control.loop.seconds
+        seconds = self.steps * self._control.tips.loop.seconds
         paths = self._paths(of, steps)
         runs = rollout(solver, worlds, paths=paths, min_seconds=2 * seconds, max_seconds=seconds)
         ends = np.stack([solver.particle_q(w).astype(float) for w in worlds])
@@ -227,7 +227,7 @@ class SwingProblem:
         worlds, steps = list(range(len(of))), self._led(of, self.actions(numbers))
         self._put(of)
         run = self._run = self._run or DifferentiableRollout(self._solver)
-        seconds = self.steps * self._control.control.loop.seconds
+        seconds = self.steps * self._control.tips.loop.seconds
         ends = run.forward(worlds, [seconds], paths=self._paths(of, steps))[:, -1]
         places = torch.from_numpy(ends.astype(float)).requires_grad_()
         with torch.enable_grad():

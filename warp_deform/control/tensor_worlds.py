@@ -158,7 +158,7 @@ class TensorControlWorlds(ControlWorlds):
                 starts[slot] = start = self._start_of(slot)
                 if slot not in given and len(self._starts) < _KEPT_STARTS:
                     self._starts[seed] = start
-            self.control.end(list(new))
+            self.tips.end(list(new))
         self.worlds.solver.config = self._led_config
         for slot in slots:
             self._put(slot, starts[slot])
@@ -278,7 +278,7 @@ class TensorControlWorlds(ControlWorlds):
     def _note(self, slot: int) -> None:
         episode = self.worlds.episodes[slot]
         episode.tip = self._sent[slot].detach().numpy().copy()
-        episode.sim_seconds += self.control.loop.seconds
+        episode.sim_seconds += self.tips.loop.seconds
         episode.problems = self._tensors.problems.get(slot, ()) or episode.problems
         self.worlds.look(slot)
         self._carried[slot].follow(episode, self.task)

@@ -134,7 +134,7 @@ class ControlEnv(gymnasium.Env[Any, np.ndarray]):
     ) -> None:
         self.render_mode = check_render_mode(render_mode, self.metadata)
         self.control = ControlWorlds(
-            task, robot=robot, mode=control_mode, reward_mode=reward_mode, start=start,
+            task, robot=robot, control_mode=control_mode, reward_mode=reward_mode, start=start,
             release=release, config=control, horizon=horizon,
         )  # fmt: skip
         self.worlds = self.control.worlds

@@ -72,8 +72,8 @@ class ControlVectorEnv(LaneVectorEnv):
         if num_envs < 1:
             raise InputError(f"num_envs must be at least 1, got {num_envs}")
         options: dict[str, Any] = {
-            "robot": robot, "mode": control_mode, "reward_mode": reward_mode, "start": start,
-            "release": release, "config": control, "horizon": horizon,
+            "robot": robot, "control_mode": control_mode, "reward_mode": reward_mode,
+            "start": start, "release": release, "config": control, "horizon": horizon,
         }  # fmt: skip
         self.tensors: TensorControlWorlds | None = None
         if differentiable:

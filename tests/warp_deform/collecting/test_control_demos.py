@@ -208,7 +208,7 @@ def test_a_swing_has_no_choices_and_no_other_task_is_led_by_its_velocity(tmp_pat
     with pytest.raises(InputError, match="played with a jaw"):
         config(tmp_path, task="cable-mask-goal")
     with pytest.raises(InputError, match="demonstrations are made in"):
-        TipDemonstrator(ControlWorlds("whip", 8, mode="tip_velocity", lanes=8))
+        TipDemonstrator(ControlWorlds("whip", 8, control_mode="tip_velocity", lanes=8))
 
 
 @pytest.mark.parametrize("task", ["fold-fabric-1", "fold-fabric-3"])

@@ -113,7 +113,7 @@ def test_what_is_let_go_moving_keeps_the_tips_velocity(release: str) -> None:
 
 def test_no_random_action_makes_a_guard_fire_whatever_the_mode() -> None:
     for mode, names in CONTROL_MODES.items():
-        worlds = ControlWorlds("whip", 8, mode=mode, lanes=8)
+        worlds = ControlWorlds("whip", 8, control_mode=mode, lanes=8)
         worlds.reset({slot: slot for slot in range(8)})
         rng = np.random.default_rng(0)
         for _ in range(20):
@@ -189,7 +189,7 @@ def test_dense_rewards_sum_to_the_progress_less_what_restless_actions_cost() -> 
 def test_a_guard_that_fires_ends_the_episode_without_a_reward(block, monkeypatch) -> None:
     block.reset(seed=0)
     fired = {0: (Problem(ProblemKind.STRETCH, 0, 2.0, 1.5),)}
-    loop = block.control.control.loop
+    loop = block.control.tips.loop
     advance = loop.advance
     monkeypatch.setattr(loop, "advance", lambda *a, **k: advance(*a, **k) or fired)
     _, reward, terminated, truncated, info = block.step(towards(block, tip_at_goal(block, 0.1)))
