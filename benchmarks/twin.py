@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hardware.agents.make import make_chooser
+from hardware.choosers.make import make_chooser
 from hardware.episodes.episode import EpisodeResult, run_episode
 from hardware.episodes.goals import sampled_goal
 from hardware.recordings.recorder import EpisodeRecorder, RecorderConfig

@@ -17,7 +17,7 @@ from tyro.conf import arg, subcommand
 from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.support.flag_range import FlagRange
 
-from ..rig.config import CameraName, HomeFlag, RigConfig, RobotName, SetupFlag, WorkspaceFlag
+from ..rig.config import BackendName, CameraName, HomeFlag, RigConfig, SetupFlag, WorkspaceFlag
 
 if TYPE_CHECKING:
     from ..calibration.charuco import BoardSpec
@@ -57,7 +57,7 @@ class _CameraFlags(_SetupFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class _PlaceFlags(_SetupFlags):
-    robot: RobotName = "dry_run"
+    robot: BackendName = "dry_run"
     """The robot: panda, fr3 or frankapy."""
     host: str | None = None
     """Address of the robot."""

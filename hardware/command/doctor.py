@@ -17,7 +17,7 @@ from warp_deform.command.main import CommandOptions, Outcome
 from warp_deform.errors import InputError
 from warp_deform.support.extras import install_extra
 
-from ..rig.config import NETWORKED_ROBOTS, REAL_ROBOTS, RobotName, SetupFlag
+from ..rig.config import NETWORKED_ROBOTS, REAL_ROBOTS, BackendName, SetupFlag
 
 __all__ = ["Check", "DoctorOptions", "doctor", "examine"]
 
@@ -51,7 +51,7 @@ _TAKE_PRIORITY = (
 class DoctorOptions(CommandOptions):
     """Show what this machine has for a robot, what is missing and how to get it. Moves nothing."""
 
-    robot: RobotName = "sim"
+    robot: BackendName = "sim"
     """Robot that must work for the exit code to be 0. sim needs nothing but this package."""
     host: str | None = None
     """Address of a robot to connect to and read."""
@@ -90,7 +90,7 @@ class Check(NamedTuple):
     advice: str
 
 
-def examine(robot: RobotName, *, host: str | None, setup: Path) -> list[Check]:
+def examine(robot: BackendName, *, host: str | None, setup: Path) -> list[Check]:
     """Look at packages, kernel, compiler, cameras and setup, and at a robot where `host` names one.
 
     With a `host` the network is measured for 4 s, and the robot is read. Packages are imported in
@@ -229,12 +229,12 @@ def _calibration(setup: Path, *, needed: bool) -> Check:
     return Check("calibration", age.days <= _OLD_DAYS, False, found, "calibrate the camera again")
 
 
-def _robot(robot: RobotName, host: str) -> Check:
+def _robot(robot: BackendName, host: str) -> Check:
     from ..arm.robot import RobotError
     from ..rig.config import RigConfig
     from ..rig.rig import open_robot
 
-    backend: RobotName = robot if robot in REAL_ROBOTS else "panda"
+    backend: BackendName = robot if robot in REAL_ROBOTS else "panda"
     config = RigConfig(robot=backend, host=host, execute=True)
     try:
         with open_robot(config) as connected:

@@ -181,8 +181,8 @@ def _episode(
 ) -> EpisodeResult:
     from warp_deform.support.revision import running_revision
 
-    from ..agents.human import click_pick_and_place
-    from ..agents.make import make_chooser
+    from ..choosers.human import click_pick_and_place
+    from ..choosers.make import make_chooser
     from ..episodes.episode import EpisodeConfig, run_episode
     from ..episodes.goals import write_picture
     from ..recordings.recorder import EpisodeRecorder, RecorderConfig

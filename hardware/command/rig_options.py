@@ -38,7 +38,7 @@ class RigOptions(RigConfig, PageOptions):
             page: of `operator_page`
             watched: whether a person at the terminal is asked where there is no page
         """
-        from ..agents.human import TerminalOperator
+        from ..choosers.human import TerminalOperator
         from ..episodes.operators import Unattended
 
         if self.auto:

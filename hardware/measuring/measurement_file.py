@@ -14,8 +14,8 @@ from typing import Generic, TypeVar
 
 from warp_deform.errors import InputError
 
-from ..agents.human import TerminalOperator
 from ..calibration.poor_fit import PoorFit
+from ..choosers.human import TerminalOperator
 
 __all__ = ["MeasurementFile", "gather"]
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from ..agents.human import TerminalOperator
 from ..arm.safe_robot import SafeRobot
 from ..arm.table_plane import TablePlane
 from ..calibration.calibration import Calibration
@@ -19,6 +18,7 @@ from ..calibration.picture_coverage import check_picture
 from ..calibration.reach import check_workplace
 from ..calibration.workplace import Workplace
 from ..cameras.camera import CameraIntrinsics
+from ..choosers.human import TerminalOperator
 from ..episodes.operators import until_cleared
 from ..rig.config import CAMERAS_WITHOUT_INTRINSICS, REAL_ROBOTS, RigConfig
 from ..rig.rig import open_robot, read_intrinsics, read_table

@@ -19,7 +19,6 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from ..agents.human import TerminalOperator
 from ..arm.safe_robot import SafeRobot
 from ..arm.table_plane import TablePlane, fit_table_plane
 from ..calibration.charuco import (
@@ -34,6 +33,7 @@ from ..calibration.hand_eye import MIN_POSES, HandEye, calibrate_hand_eye
 from ..calibration.homography import board_on_table, fit_homography, plane_homography
 from ..calibration.poor_fit import PoorFit
 from ..cameras.camera import Camera, CameraIntrinsics
+from ..choosers.human import TerminalOperator
 from ..episodes.goals import write_picture
 from ..episodes.operators import until_cleared
 from ..rig.config import RigConfig

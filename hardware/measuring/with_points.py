@@ -19,12 +19,12 @@ import numpy as np
 
 from warp_deform.errors import InputError
 
-from ..agents.human import TerminalOperator
 from ..arm.limits import FINGERTIP_BELOW_TCP, SafetyLimits
 from ..arm.safe_robot import SafeRobot
 from ..arm.table_plane import TablePlane
 from ..calibration.homography import MIN_POINTS, HomographyFit, solve_homography
 from ..cameras.camera import Camera, CameraIntrinsics
+from ..choosers.human import TerminalOperator
 from ..episodes.goals import write_picture
 from ..rig.config import NETWORKED_ROBOTS, REAL_ROBOTS, RigConfig
 from ..rig.rig import open_camera

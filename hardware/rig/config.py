@@ -14,16 +14,16 @@ __all__ = [
     "CAMERAS_WITHOUT_INTRINSICS",
     "NETWORKED_ROBOTS",
     "REAL_ROBOTS",
+    "BackendName",
     "CameraName",
     "ChooserName",
     "HomeFlag",
     "RigConfig",
-    "RobotName",
     "SetupFlag",
     "WorkspaceFlag",
 ]
 
-RobotName = Literal["dry_run", "sim", "panda", "fr3", "frankapy"]
+BackendName = Literal["dry_run", "sim", "panda", "fr3", "frankapy"]
 CameraName = Literal["sim", "file", "uvc", "realsense", "azure-kinect"]
 ChooserName = Literal["planner", "policy", "scripted", "random", "human", "typed"]
 
@@ -37,9 +37,9 @@ WorkspaceFlag = Annotated[
     tuple[float, float, float, float] | None, arg(metavar="X0 X1 Y0 Y1"), FlagRange(-1.0, 1.0)
 ]
 
-REAL_ROBOTS: tuple[RobotName, ...] = ("panda", "fr3", "frankapy")
+REAL_ROBOTS: tuple[BackendName, ...] = ("panda", "fr3", "frankapy")
 """Those that are outside of this process."""
-NETWORKED_ROBOTS: tuple[RobotName, ...] = ("panda", "fr3")
+NETWORKED_ROBOTS: tuple[BackendName, ...] = ("panda", "fr3")
 """Those of them whose control box is spoken to directly, at `RigConfig.host`."""
 CAMERAS_WITHOUT_INTRINSICS: tuple[CameraName, ...] = ("uvc",)
 """Cameras that do not tell their intrinsics: `calibrate lens` measures them."""
@@ -49,7 +49,7 @@ CAMERAS_WITHOUT_INTRINSICS: tuple[CameraName, ...] = ("uvc",)
 class RigConfig:
     """Robot, camera and where their calibration is."""
 
-    robot: RobotName = "dry_run"
+    robot: BackendName = "dry_run"
     """dry_run prints commands and moves nothing. sim moves a simulated chain. panda (panda-python,
     server version 5), fr3 (franky, 10) and frankapy (ROS) move an arm if --execute is given."""
     camera: CameraName = "sim"

@@ -59,7 +59,7 @@ FLOORS = {
     "hardware": [
         "command",
         "measuring page",
-        "agents",
+        "choosers",
         "rig episodes",
         "twin recordings",
         "calibration",

@@ -14,7 +14,6 @@ from fixtures.franka_arm import Arm, episode
 from fixtures.franka_episodes import ACTION, CALIBRATION, LIMITS
 from fixtures.guided_robot import Homing
 
-from hardware.agents.human import TerminalOperator
 from hardware.arm.panda import HOME_Q, PandaKinematics
 from hardware.arm.safe_robot import SafeRobot
 from hardware.arm.table_plane import TablePlane
@@ -22,6 +21,7 @@ from hardware.calibration.calibration import Calibration
 from hardware.calibration.picture_coverage import camera_pose, check_picture, outside
 from hardware.calibration.reach import check_workplace
 from hardware.calibration.workplace import Workplace
+from hardware.choosers.human import TerminalOperator
 from hardware.measuring.points_file import origin_line
 from hardware.measuring.steps import touched_table
 from hardware.measuring.with_board import measure_table

@@ -37,9 +37,9 @@ from hardware import (
     SafetyViolation,
     UserStopped,
 )
-from hardware.agents.choosers import PolicyChooser
-from hardware.agents.human import TerminalOperator
 from hardware.arm.safe_robot import SafeRobot
+from hardware.choosers.human import TerminalOperator
+from hardware.choosers.simple import PolicyChooser
 from hardware.emulator import EmulatorProcess
 from hardware.episodes.episode import EpisodeConfig, run_episode
 from hardware.episodes.operators import Answer, Proposal

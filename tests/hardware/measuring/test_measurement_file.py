@@ -13,13 +13,13 @@ from fixtures.board_photographs import BOARD, INTRINSICS, TABLE, projected, rota
 from fixtures.guided_robot import BASE_T_BOARD, TCP_T_CAMERA, GuidedRobot, setup
 from fixtures.safety_spy import HOME, SpyRobot
 
-from hardware.agents.human import TerminalOperator
 from hardware.arm.limits import SafetyLimits
 from hardware.arm.safe_robot import SafeRobot
 from hardware.calibration.calibration import Calibration
 from hardware.calibration.charuco import BoardSpec, Corners
 from hardware.calibration.poor_fit import PoorFit
 from hardware.cameras.camera import CameraError
+from hardware.choosers.human import TerminalOperator
 from hardware.measuring.measurement_file import MeasurementFile, gather
 from hardware.measuring.with_board import measure_hand_eye, measure_lens
 from hardware.rig.config import RigConfig

@@ -13,13 +13,13 @@ from fixtures.safety_spy import ARM, HOME, SpyRobot, joints_at, pose, solved_lin
 from fixtures.touched_table import TouchedTable
 
 from hardware import GraspError, RobotMode
-from hardware.agents.human import TerminalOperator
 from hardware.arm.limits import SafetyLimits
 from hardware.arm.safe_robot import SafeRobot
 from hardware.arm.table_plane import TablePlane
 from hardware.calibration.calibration import Calibration
 from hardware.calibration.homography import plane_homography
 from hardware.cameras.camera import Frame
+from hardware.choosers.human import TerminalOperator
 from hardware.measuring.with_board import (
     measure_camera,
     measure_hand_eye,

@@ -15,12 +15,12 @@ from fixtures.board_photographs import INTRINSICS, TABLE, camera_above
 from fixtures.guided_robot import setup
 from fixtures.safety_spy import HOME, SpyRobot, joints_at, pose
 
-from hardware.agents.human import TerminalOperator
 from hardware.arm.limits import SafetyLimits
 from hardware.arm.safe_robot import SafeRobot
 from hardware.calibration.calibration import Calibration
 from hardware.calibration.homography import apply_homography, plane_homography
 from hardware.calibration.poor_fit import PoorFit
+from hardware.choosers.human import TerminalOperator
 from hardware.measuring.points_file import TouchedPoint, read_points, write_points
 from hardware.measuring.with_points import click_point, measure_points, points_from_file, type_point
 from hardware.rig.config import RigConfig

@@ -16,9 +16,9 @@ from fixtures.page_server import hear
 from websockets.exceptions import ConnectionClosed
 
 import hardware.page.session as session_module
-from hardware.agents.human import HumanChooser
 from hardware.arm.pick_place import waypoints
 from hardware.arm.robot import UserStopped
+from hardware.choosers.human import HumanChooser
 from hardware.episodes.operators import Answer, Proposal
 from hardware.page.pictures import plan_head
 from hardware.page.session import OperatorSession

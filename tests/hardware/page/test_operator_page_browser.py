@@ -9,7 +9,7 @@ from fixtures.franka_episodes import ACTION, CALIBRATION
 from fixtures.operator_desk import desk
 from fixtures.page_browser import Tab, chromium_path, driver
 
-from hardware.agents.human import HumanChooser
+from hardware.choosers.human import HumanChooser
 from hardware.page.session import OperatorSession
 from hardware.vision.top_down_view import TopDownView
 

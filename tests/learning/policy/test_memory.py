@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from fixtures.franka_episodes import GOAL, TASK, chain
 
-from hardware.agents.choosers import PolicyChooser
 from hardware.arm.pick_place import PickPlaceAction, PickPlaceOutcome
+from hardware.choosers.simple import PolicyChooser
 from hardware.episodes.episode import Observation
 from learning.data.batches import task_lifts
 from learning.models.transporter import PRESETS
@@ -168,7 +168,7 @@ def test_a_pick_without_finger_room_is_passed_over_unless_there_is_no_other(
 
         asked.clear()
         chooser.reset()
-        monkeypatch.setattr("hardware.agents.choosers.has_finger_clearance", room)
+        monkeypatch.setattr("hardware.choosers.simple.has_finger_clearance", room)
 
     after(2)
     action = chosen(chooser, 0.45)

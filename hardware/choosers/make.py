@@ -13,8 +13,8 @@ from ..episodes.episode import Chooser
 from ..episodes.goals import GoalMask
 from ..rig.config import ChooserName
 from ..rig.rig import Rig
-from .choosers import PolicyChooser, RandomChooser, ScriptedChooser
 from .human import HumanChooser, Show, click_pick_and_place, type_pick_and_place
+from .simple import PolicyChooser, RandomChooser, ScriptedChooser
 
 __all__ = ["make_chooser"]
 

@@ -20,12 +20,12 @@ from fixtures.franka_episodes import (
     recorder,
 )
 
-from hardware.agents.choosers import RandomChooser, ScriptedChooser, still_chain, to_action
-from hardware.agents.finger_clearance import has_finger_clearance
-from hardware.agents.human import HumanChooser
-from hardware.agents.planner import PlannerChooser, PlannerConfig, SeenChain, chord_error
 from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig, refusal
 from hardware.arm.safe_robot import SafeRobot
+from hardware.choosers.finger_clearance import has_finger_clearance
+from hardware.choosers.human import HumanChooser
+from hardware.choosers.planner import PlannerChooser, PlannerConfig, SeenChain, chord_error
+from hardware.choosers.simple import RandomChooser, ScriptedChooser, still_chain, to_action
 from hardware.episodes.episode import EpisodeConfig, Observation, run_episode
 from hardware.recordings.recording import Recording
 from hardware.recordings.replay import replay_recording

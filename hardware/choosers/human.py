@@ -15,7 +15,7 @@ from ..episodes.episode import Observation
 from ..episodes.operators import Answer, Proposal, described
 from ..vision.overlay import draw_action
 from ..vision.top_down_view import TopDownView
-from .choosers import tangent_at
+from .simple import tangent_at
 
 __all__ = [
     "HumanChooser",

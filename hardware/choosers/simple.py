@@ -1,8 +1,8 @@
-"""The choosers of the agents `policy`, `random` and `scripted`.
+"""The choosers `policy`, `random` and `scripted`.
 
 Actions are in the base frame. What was missed, refused or skipped is not proposed again until
-something is brought elsewhere. Those of the other agents stand in `hardware.agents.planner` and
-`hardware.agents.human`.
+something is brought elsewhere. The others stand in `hardware.choosers.planner` and
+`hardware.choosers.human`.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from ..arm.pick_place import PickPlaceAction
 from ..episodes.episode import Observation
 from ..vision.chain_from_mask import estimate_chain
 from ..vision.top_down_view import TopDownView
-from .choosers import FailedPicks, to_action
+from .simple import FailedPicks, to_action
 
 __all__ = ["PlannerChooser", "PlannerConfig", "SeenChain", "chord_error"]
 

@@ -14,8 +14,8 @@ import pytest
 from fixtures.franka_arm import FAR, Arm, Person, episode
 from fixtures.franka_episodes import ACTION, GOAL
 
-from hardware.agents.human import TerminalOperator
 from hardware.cameras.camera import read_image
+from hardware.choosers.human import TerminalOperator
 from hardware.episodes.episode import EpisodeConfig
 from hardware.episodes.operators import Answer, Proposal
 from hardware.recordings.recording import Recording
