@@ -42,7 +42,7 @@ _NEAR = 0.008
 """Picks this close to one that failed are the same one [m]: the paper's pixels are 1.9 mm."""
 _TWO_PICTURES = 2
 _MOST_PROPOSALS = 8
-"""Picks that are looked at for finger room; where none of them has it, the first is taken."""
+"""Picks that are looked at for finger clearance; where none of them has it, the first is taken."""
 _MARGIN = 0.02  # [m] that random places keep from the workspace's rim
 
 

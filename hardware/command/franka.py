@@ -76,7 +76,7 @@ class CollectOptions(RunOptions):
     """
 
     agent: ChooserName = "human"
-    """Who chooses the actions: the agents of `run`."""
+    """Who chooses the actions, by the names that `run --agent` takes."""
     episodes: Annotated[int, arg(aliases=["-n"], metavar="N"), FlagRange(1, 100_000)] = 1
     """Episodes to record."""
 

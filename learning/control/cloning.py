@@ -32,7 +32,7 @@ from warp_deform.collecting.control_episodes import (
     ControlSetup,
     control_worlds,
     observed,
-    play_control,
+    play_control_episodes,
 )
 from warp_deform.collecting.control_replay import setup_of
 from warp_deform.control.numbers import recorded_numbers
@@ -284,5 +284,5 @@ def play_clone(
             len(run.actions),
             run.ended or "",
         )
-        for _, run in play_control(control, seeds, start=lambda runs: None, act=act)
+        for _, run in play_control_episodes(control, seeds, start=lambda runs: None, act=act)
     }

@@ -20,7 +20,7 @@ from warp_deform.collecting.control_episodes import (
     ControlSetup,
     control_worlds,
     observed,
-    play_control,
+    play_control_episodes,
     record_control,
     without_idle_end,
 )
@@ -120,7 +120,7 @@ def demonstrate(folder: Path, out: Path, *, episodes: int, progress: bool = True
         done_before = episodes - len(seeds)
         bar = progress_bar(f"demonstrate {task}", episodes, done=done_before, shown=progress)
         with bar as advance:
-            played = play_control(
+            played = play_control_episodes(
                 control, seeds, start=lambda runs: None, act=Acting(actor, control)
             )
             for slot, one in played:

@@ -8,7 +8,7 @@ from pathlib import Path
 from warp_deform.collecting.control_episodes import (
     ControlSetup,
     control_worlds,
-    play_control,
+    play_control_episodes,
     record_control,
 )
 from warp_deform.collecting.control_video import film_control_episodes
@@ -41,7 +41,9 @@ def film_played(
 def _played(actor: Actor | PlanActor, how: ControlSetup, seed: int) -> Episode:
     """One episode, as recordings have it."""
     control = control_worlds(how)
-    played = play_control(control, [seed], start=lambda runs: None, act=Acting(actor, control))
+    played = play_control_episodes(
+        control, [seed], start=lambda runs: None, act=Acting(actor, control)
+    )
     ((slot, run),) = played
     if not run.rows:
         raise WarpDeformError(f"the episode of seed {seed} cannot be filmed: {run.ended}")

@@ -7,7 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from warp_deform.collecting.control_episodes import ControlSetup, control_worlds, play_control
+from warp_deform.collecting.control_episodes import (
+    ControlSetup,
+    control_worlds,
+    play_control_episodes,
+)
 from warp_deform.collecting.recording import recorded_task
 from warp_deform.control.tip_demonstrator import TipDemonstrator, usual_mode
 from warp_deform.episodes import Episode, EpisodeInfo
@@ -36,7 +40,7 @@ def resampled(episode: Episode, how: ControlSetup) -> tuple[np.ndarray | None, s
     ]
     control = control_worlds(how)
     tips = TipDemonstrator(control, _Recorded(picks).act)
-    runs = play_control(
+    runs = play_control_episodes(
         control,
         [episode.info.seed],
         start=lambda runs: tips.start(list(runs)),

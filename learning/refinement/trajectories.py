@@ -22,7 +22,7 @@ from warp_deform.collecting.control_episodes import (
     ControlEpisode,
     ControlSetup,
     control_worlds,
-    play_control,
+    play_control_episodes,
     record_control,
     without_idle_end,
 )
@@ -259,7 +259,7 @@ def _played(
 ) -> tuple[int, ControlEpisode]:
     """An episode as the environment plays actions, and its slot, where it has just ended."""
     act = replay_acts({seed: list(actions)})
-    runs = play_control(
+    runs = play_control_episodes(
         control, [seed], start=lambda runs: None, act=act, pictures=pictures, to_the_end=to_the_end
     )
     ((slot, run),) = runs

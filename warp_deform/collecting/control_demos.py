@@ -28,7 +28,7 @@ from .control_episodes import (
     ControlEpisode,
     ControlSetup,
     control_worlds,
-    play_control,
+    play_control_episodes,
     record_control,
     without_idle_end,
 )
@@ -84,7 +84,7 @@ def describe_control(settings: CollectSettings) -> dict[str, Any]:
     """What all episodes of a collection have in common, beyond task, robot and seed."""
     how, task = _setup(settings), control_task(settings.task)
     return {
-        "mode": how.mode,
+        "mode": how.control_mode,
         "start": how.start,
         "horizon": how.horizon,
         "pictures": settings.pictures,
@@ -109,7 +109,9 @@ def attempt_control_chunk(chunk: ControlChunk) -> Iterator[Attempt]:
     how = _setup(settings)
     control = control_worlds(how)
     start, act, name = _demonstrator(control, settings)
-    played = play_control(control, chunk.seeds, start=start, act=act, pictures=settings.pictures)
+    played = play_control_episodes(
+        control, chunk.seeds, start=start, act=act, pictures=settings.pictures
+    )
     for slot, run in played:
         success = run.ended == SOLVED
         if success:
@@ -147,7 +149,7 @@ def _demonstrates(task: Task) -> str | None:
 def _demonstrator(
     control: ControlWorlds, settings: CollectSettings
 ) -> tuple[Callable[[Mapping[int, ControlEpisode]], None], Act, str]:
-    """What is done at the start of runs, who acts in them, and the name of that."""
+    """What is done at the start of episodes, who acts in them, and the name of that."""
     if _is_searched(control.task):
         plans = _Plans(settings)
         return plans.start, plans.act, SEARCHED

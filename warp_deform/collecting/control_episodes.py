@@ -29,7 +29,7 @@ __all__ = [
     "ControlSetup",
     "control_worlds",
     "observed",
-    "play_control",
+    "play_control_episodes",
     "record_control",
     "without_idle_end",
 ]
@@ -50,7 +50,7 @@ class ControlSetup:
 
     task: type[Task]
     robot: str = "ur5"
-    mode: str = "tip_delta_position"
+    control_mode: str = "tip_delta_position"
     start: str = "free"
     release: str = "rest"
     reward_mode: str = "dense"
@@ -73,8 +73,9 @@ class ControlSetup:
 def control_worlds(how: ControlSetup) -> ControlWorlds:
     """This process's worlds of a task that is led so, built once and used again."""
     return ControlWorlds(
-        how.task(), SLOTS, robot=how.robot, control_mode=how.mode, reward_mode=how.reward_mode,
-        start=how.start, release=how.release, config=how.config, horizon=how.horizon, lanes=SLOTS,
+        how.task(), SLOTS, robot=how.robot, control_mode=how.control_mode,
+        reward_mode=how.reward_mode, start=how.start, release=how.release, config=how.config,
+        horizon=how.horizon, lanes=SLOTS,
     )  # fmt: skip
 
 
@@ -94,7 +95,7 @@ class ControlEpisode:
     ended: str | None = None
 
 
-def play_control(
+def play_control_episodes(
     control: ControlWorlds,
     seeds: Iterable[int],
     *,
@@ -109,7 +110,7 @@ def play_control(
     changes an episode.
 
     Args:
-        start: called with runs that were just reset
+        start: called with the episodes that were just reset, by slot
         pictures: whether rows have them
         to_the_end: episodes end when `act` says so, and by no other rule
     """
@@ -178,7 +179,7 @@ def observed(control: ControlWorlds, slot: int, run: ControlEpisode) -> np.ndarr
 
 
 def without_idle_end(run: ControlEpisode) -> ControlEpisode:
-    """The run without the control steps at its end in which the tip was told nothing.
+    """The episode without the control steps at its end in which the tip was told nothing.
 
     What was learnt from them is to stand still. None may be cut at the beginning: the simulation
     goes on in them, so the actions that follow would lead to other states.
@@ -202,7 +203,7 @@ def record_control(
     worlds = control.worlds
     episode, last = worlds.episodes[slot], run.rows[-1]
     rows = [
-        replace(row, action=action, outcome="play_control")
+        replace(row, action=action, outcome="led")
         for row, action in zip(run.rows, run.actions, strict=False)
     ]
     targets = np.asarray(episode.layout.targets, dtype=float)

@@ -13,7 +13,7 @@ from ..episodes import EpisodeInfo, EpisodeReader, Step
 from ..errors import InputError
 from ..tasks.task import Task
 from .control_demos import replay_acts
-from .control_episodes import ControlSetup, control_worlds, play_control
+from .control_episodes import ControlSetup, control_worlds, play_control_episodes
 from .recording import recorded_task
 
 __all__ = ["ReplayedControl", "compare_control_chunk", "setup_of"]
@@ -54,7 +54,9 @@ def compare_control_chunk(chunk: ReplayedControl) -> Iterator[tuple[int, int, fl
         for seed, episode in episodes.items()
     }
     control, act = control_worlds(chunk.how), replay_acts(actions)
-    runs = play_control(control, chunk.seeds, start=lambda runs: None, act=act, to_the_end=True)
+    runs = play_control_episodes(
+        control, chunk.seeds, start=lambda runs: None, act=act, to_the_end=True
+    )
     for _, run in runs:
         steps = episodes.pop(run.seed).steps
         wrong, largest = len(steps) - len(run.rows), 0.0

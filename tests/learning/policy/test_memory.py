@@ -155,7 +155,7 @@ def test_a_pull_along_the_chain_counts_and_noise_does_not(
     assert reaches == [[], [MISSED], [PUT_DOWN]]
 
 
-def test_a_pick_without_finger_room_is_passed_over_unless_there_is_no_other(
+def test_a_pick_without_finger_clearance_is_passed_over_unless_there_is_no_other(
     chooser: PolicyChooser, avoided: Avoided, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = chosen(chooser, 0.45)

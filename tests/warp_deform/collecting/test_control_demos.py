@@ -66,6 +66,7 @@ def assert_repeats(env: gymnasium.Env, episode: Episode) -> None:
     steps = episode.steps
     _, info = env.reset(seed=episode.info.seed)
     assert info["state_hash"] == steps[0].state_hash
+    assert {step.outcome for step in steps[:-1]} == {"led"}, "as docs/dataset.md says"
     for before, after in itertools.pairwise(steps):
         seen, reward, terminated, truncated, info = env.step(np.array(before.action, np.float32))
         tip = env.unwrapped.worlds.episodes[0].tip

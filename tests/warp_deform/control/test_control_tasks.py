@@ -281,13 +281,13 @@ def test_what_has_no_plans_is_said() -> None:
 
 def test_the_gradients_of_a_held_cable_are_those_of_a_swing() -> None:
     """Another chain of code to the same derivatives: one launch, and a loop of control steps."""
-    led = HeldProblem("whip-target", [3, 4], worlds=8)
+    held = HeldProblem("whip-target", [3, 4], worlds=8)
     swing = SwingProblem("whip-target", [3, 4], worlds=8)
     numbers = swing.refined(np.random.default_rng(0).normal(0, 1, (2, *swing.shape)))
-    losses, gradients = led.gradients(numbers, np.arange(2))
+    losses, gradients = held.gradients(numbers, np.arange(2))
     expected, known = swing.gradients(numbers, np.arange(2))
     np.testing.assert_array_equal(losses, expected)
-    np.testing.assert_array_equal(led.evaluate(numbers[:, None])[:, 0], expected)
+    np.testing.assert_array_equal(held.evaluate(numbers[:, None])[:, 0], expected)
     np.testing.assert_allclose(gradients, known, atol=1e-5 * np.abs(known).max())
 
 
