@@ -192,7 +192,9 @@ def open_camera(config: RigConfig, intrinsics: CameraIntrinsics | None) -> Camer
     """
     name = config.camera
     if name == "sim":
-        raise InputError("--camera sim is drawn for a simulated arm: name one, as --camera uvc")
+        raise InputError(
+            "--camera sim is drawn for a simulated arm; name a camera, as --camera uvc"
+        )
     if name == "file":
         if config.frames is None or intrinsics is None:
             raise InputError("--camera file needs --frames, and a calibration in --setup")
