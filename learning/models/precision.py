@@ -8,9 +8,9 @@ __all__ = ["has_bfloat16_units"]
 
 
 def has_bfloat16_units() -> bool:
-    """Whether this processor multiplies bfloat16 natively (AVX-512 BF16 or AMX).
+    """Whether this processor multiplies whole tiles of bfloat16 (AMX).
 
-    Elsewhere torch converts to float32 and back, which takes several times longer than float32.
+    With AVX-512 BF16 alone a step takes a third longer than in float32 (`benchmarks/steps.py
+    --bfloat16`). Elsewhere torch converts to float32 and back, which takes several times longer.
     """
-    found = torch.cpu.get_capabilities()
-    return bool(found.get("avx512_bf16") or found.get("amx_bf16"))
+    return bool(torch.cpu.get_capabilities().get("amx_bf16"))

@@ -72,7 +72,7 @@ class TrainMethod:
     validation. By default, 2 for `fast` agents over pictures, and 0 for others."""
     precision: PrecisionName = "auto"
     """Number format of the convolutions in agents that see pictures. `auto` takes bfloat16 for
-    `fast` on a processor that multiplies it natively, and float32 otherwise."""
+    `fast` on a processor with AMX, and float32 otherwise."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the network computes. Under `torchrun`, each process takes one GPU."""
     untrained: bool = False
