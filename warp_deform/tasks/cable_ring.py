@@ -16,7 +16,7 @@ from ..objects.push import Push
 from ..objects.zone import ring_zone
 from ..rendering.pixels import BOUNDS
 from .cable_physics import CABLE_GRADIENT_DAMPING, CABLE_SOLVER, CABLE_STAGE
-from .demonstrators import best_map, met_particle, pick_place, ring_maps
+from .demonstrators import best_map, met_particle, nearest_shift, pick_place, ring_maps
 from .free_space import FreeSpace
 from .ground_truth import Row, pose_rows
 from .losses import mean_distance
@@ -99,27 +99,27 @@ class CableRing(Task):
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
     ) -> Action | None:
         """Move the bead that is farthest from its target under the best of 64 maps."""
-        return self._moves(layout, snapshot)[0]
+        return self._moves(layout.targets, snapshot)[0]
 
     def demonstrate_visible(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
     ) -> Action | None:
         """Of the beads that the tip would really take, move the one farthest from its target."""
-        moves = self._moves(layout, snapshot)
+        moves = self._moves(layout.targets, snapshot)
         return next((move for move in moves if self._takes(move, snapshot)), moves[0])
 
     def candidates(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
     ) -> list[Action]:
-        """The scripted action, far beads to their targets, and beads pulled out of the hull."""
-        scripted, *others = self._moves(layout, snapshot)
+        """The farthest bead to its aim, other far beads, and beads pulled out of the hull."""
+        farthest, *others = self._moves(self.aims(layout, snapshot), snapshot)
         others.sort(key=lambda move: not self._takes(move, snapshot))  # the order else stays
-        drawn = [scripted, *others[:_FAR_BEADS]]
+        drawn = [farthest, *others[:_FAR_BEADS]]
         return drawn + self._outward(snapshot, count - len(drawn))
 
     def state_value(self, layout: Layout, snapshot: Snapshot) -> float:
         """Share of the circle that is spanned, less half the beads' mean distance in radii."""
-        _, distances = self._mapped(layout, snapshot)
+        _, distances = self._mapped(self.aims(layout, snapshot), snapshot)
         return self.score(layout, snapshot) - 0.5 * float(distances.mean()) / self.cable.ring_radius
 
     def losses(
@@ -129,22 +129,26 @@ class CableRing(Task):
         particle_q: Tensor,
         body_q: Tensor,
     ) -> Tensor:
-        """Mean distances [m] of the beads from their targets under the best of 64 maps."""
+        """Mean distances [m] of the beads from their aims under the best of 64 maps."""
         maps = ring_maps(self.cable.beads, reversals=True)
-        targets = np.stack([layout.targets for layout in layouts])
-        return mean_distance(particle_q[..., :2], targets, maps)
+        aims = np.stack([self.aims(*each) for each in zip(layouts, snapshots, strict=True)])
+        return mean_distance(particle_q[..., :2], aims, maps)
 
-    def _mapped(self, layout: Layout, snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
+    def aims(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
+        """Where who plans wants the beads (32, 2) [m], one for each: the marks."""
+        return layout.targets
+
+    def _mapped(self, targets: np.ndarray, snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
         """Bead of every target (32,) under the best of 64 maps, and its distance (32,) [m]."""
-        targets = np.column_stack([layout.targets, np.zeros(self.cable.beads)])
+        on_table = np.column_stack([targets, np.zeros(self.cable.beads)])
         maps = ring_maps(self.cable.beads, reversals=True)
-        return best_map(snapshot.particle_q, targets, maps)
+        return best_map(snapshot.particle_q, on_table, maps)
 
-    def _moves(self, layout: Layout, snapshot: Snapshot) -> list[Action]:
-        """Every bead to its target, those farthest from it first."""
-        bead_of, distances = self._mapped(layout, snapshot)
+    def _moves(self, targets: np.ndarray, snapshot: Snapshot) -> list[Action]:
+        """Every bead to its target (32, 2), those farthest from it first."""
+        bead_of, distances = self._mapped(targets, snapshot)
         return [
-            pick_place(snapshot.particle_q[bead_of[t]], layout.targets[t], stage=self.stages[0])
+            pick_place(snapshot.particle_q[bead_of[t]], targets[t], stage=self.stages[0])
             for t in np.argsort(-distances, kind="stable")
         ]
 
@@ -194,6 +198,19 @@ class CableRingNotarget(CableRing):
     instruction = "Open the ring of beads to a circle."
     ground_truth_rows = ((Row.BEAD, 32),)
     visible = False
+
+    def aims(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
+        """The circle (32, 2) [m] that the beads are nearest to, wherever on the table it lies.
+
+        Nobody who looks can tell where the circle of the start was. A teacher that led there would
+        teach what no picture shows, as the scripted demonstrator does.
+        """
+        beads = snapshot.particle_q[:, :2].astype(float)
+        middle, reach = layout.targets.mean(axis=0), self.cable.ring_radius + self.cable.radius
+        low, high = np.array(BOUNDS[:2]).T
+        room = (low + reach - middle, high - reach - middle)
+        maps = ring_maps(self.cable.beads, reversals=True)
+        return layout.targets + nearest_shift(beads, layout.targets, maps, room=room)
 
     def ground_truth(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
         """(96,): x, y, -yaw / 15 of every bead."""

@@ -17,11 +17,16 @@ __all__ = [
     "best_map",
     "farthest_bead",
     "met_particle",
+    "nearest_shift",
     "pick_place",
     "pick_place_pose",
     "ring_maps",
     "visible_point",
 ]
+
+_MAP_TURNS, _SHIFT_TURNS = 8, 200
+_STILL = 1e-9
+"""Change of a shift that no longer counts [m]."""
 
 
 def visible_point(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
@@ -79,6 +84,48 @@ def best_map(
     mapped = distances[maps, np.arange(len(targets))]
     best = int(np.argmin(mapped.mean(axis=1)))
     return maps[best], mapped[best]
+
+
+def nearest_shift(
+    beads: np.ndarray,
+    targets: np.ndarray,
+    maps: np.ndarray,
+    *,
+    room: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """How far (2,) [m] to shift the targets, all together, to where the beads are nearest to them.
+
+    The least mean distance under the best of the maps, by turns: the map for a shift, and the shift
+    for a map. From the shift that joins their centres, so it is a local minimum; beads that lie
+    right already hold the targets to where they are.
+
+    Args:
+        beads: (n, 2) [m]
+        targets: (n, 2) [m]
+        maps: (m, n), as from `ring_maps`
+        room: least and greatest shift, each (2,) [m]
+
+    Source: Weiszfeld's algorithm for the geometric median, within bounds.
+    """
+    shift = np.clip(beads.mean(axis=0) - targets.mean(axis=0), *room)
+    chosen = -1
+    for _ in range(_MAP_TURNS):
+        distances = _rounded(beads[maps] - (targets + shift))
+        best = int(np.argmin(distances.mean(axis=-1)))
+        if best == chosen:
+            break
+        chosen, offsets = best, beads[maps[best]] - targets
+        for _ in range(_SHIFT_TURNS):
+            weights, before = 1 / _rounded(offsets - shift), shift
+            shift = np.clip(weights @ offsets / weights.sum(), *room)
+            if np.abs(shift - before).max() < _STILL:
+                break
+    return shift
+
+
+def _rounded(offsets: np.ndarray) -> np.ndarray:
+    """Lengths as `losses.lengths` has them, so that the shift is of the loss's minimum too."""
+    return np.sqrt((offsets**2).sum(axis=-1) + 1e-8)
 
 
 def farthest_bead(beads: np.ndarray, targets: np.ndarray, maps: np.ndarray) -> tuple[int, int]:
