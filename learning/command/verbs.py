@@ -131,8 +131,8 @@ class ReportOptions(CommandOptions):
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUNS")]
     """Folders of training runs, or folders that hold some."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for report.md, report.csv, report.tex and the curves. Without it only the text is
-    shown."""
+    """Folder for report.md, report.csv, report.tex, runs.csv and the curves. Without it only the
+    text is shown."""
 
 
 def report(options: ReportOptions) -> Outcome:

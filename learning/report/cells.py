@@ -31,11 +31,11 @@ from ..evaluation.summary import wilson
 __all__ = ["Cell", "CurvePoint", "RunResult", "check_run", "environment_notes", "pool",
            "version_notes"]  # fmt: skip
 
-_ALIKE = ("agent", "schedule", "augment", "processes", "device", "patience")
+_ALIKE = ("schedule", "augment", "processes", "patience")
 """Settings that runs of a cell have in common."""
+_PRECISION = "bfloat16"
 _SPREAD = ("snapshots", "doubling", "shares", "validate", "confirm", "patience")
 """Of a schedule: when snapshots are taken, and what they play, which is compared by itself."""
-_VERSIONS = ("warp-deform", "torch")
 
 
 @dataclass(frozen=True)
@@ -137,19 +137,32 @@ def check_run(run: RunResult) -> None:
 
 
 def version_notes(runs: Sequence[RunResult]) -> list[str]:
-    """A line for every cell whose runs were trained by different versions of what decides."""
+    """A line for every cell whose runs were computed differently: versions, devices, precisions."""
     notes = []
     for members in _grouped(runs).values():
-        for name in _VERSIONS:
-            values = {str(run.settings.get("versions", {}).get(name)) for run in members}
+        computed = [_computed_by(run) for run in members]
+        for name in computed[0]:
+            values = {each[name] for each in computed}
             if len(values) > 1:
                 first = members[0]
                 notes.append(
                     f"{first.task}, {first.agent}, {first.demos} demonstrations ({first.variant}): "
-                    f"trained by different versions of {name}, {', '.join(sorted(values))}, and "
-                    "taken together all the same"
+                    f"trained by different {name}, {', '.join(sorted(values))}, and taken together "
+                    "all the same"
                 )
     return notes
+
+
+def _computed_by(run: RunResult) -> dict[str, str]:
+    """What changes how numbers are rounded, and not what is trained."""
+    settings = run.settings
+    versions, network = settings.get("versions", {}), settings["agent"]["config"]
+    return {
+        "versions of warp-deform": str(versions.get("warp-deform")),
+        "versions of torch": str(versions.get("torch")),
+        "devices": str(settings.get("device")),
+        "precisions": "bfloat16" if network.get(_PRECISION) else "float32",
+    }
 
 
 def environment_notes(runs: Sequence[RunResult]) -> list[str]:
@@ -197,6 +210,9 @@ def _compared(run: RunResult) -> dict[str, Any]:
     """What runs of a cell have in common; None where it is not known."""
     settings, info, paper = run.settings, run.info, run.info["paper"]
     compared = {key: settings.get(key) for key in _ALIKE}
+    agent = settings["agent"]
+    network = {key: each for key, each in agent["config"].items() if key != _PRECISION}
+    compared["agent"] = {**agent, "config": network}
     schedule = settings["schedule"]
     compared["schedule"] = {key: each for key, each in schedule.items() if key not in _SPREAD}
     compared["environment"] = info.get("environment")
@@ -204,7 +220,9 @@ def _compared(run: RunResult) -> dict[str, Any]:
     compared["validation episodes"] = info["snapshots"][str(info["selected"])]["n_episodes"]
     if settings.get("validate"):
         compared["validation episodes in training"] = settings.get("validate")
-        compared["further ones that confirm"] = schedule.get("confirm", 0)
+        if any(each["n_success"] == each["n_episodes"] for each in info["snapshots"].values()):
+            # only what solves all is confirmed
+            compared["further ones that confirm"] = schedule.get("confirm", 0)
     if paper is not None:
         compared["who chooses the lift by the paper's protocol"] = paper["stage_rule"]
     return compared

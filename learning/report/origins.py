@@ -1,7 +1,9 @@
-"""Where the runs of a report come from: steps, CPU time, versions and revisions of the code."""
+"""The runs of a report one by one: where each comes from, and what it came to by itself."""
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,10 +12,12 @@ from warp_deform.support.revision import Revision
 
 from .cells import RunResult
 
-__all__ = ["origin", "origins"]
+__all__ = ["origin", "origins", "runs_csv"]
 
 _HEAD = ["task", "agent", "demos", "variant", "seed", "steps", "training, CPU", "trained by",
          "evaluated by"]  # fmt: skip
+_RESULT = ("n_success", "n_episodes", "mean_score", "mean_actions")
+"""What is said of the test episodes of one run."""
 
 
 def origin(run: RunResult) -> dict[str, Any]:
@@ -33,9 +37,21 @@ def origin(run: RunResult) -> dict[str, Any]:
         "steps": info["trained_steps"],
         "labels": settings.get("labels"),
         "training_cpu_seconds": info.get("training_cpu_seconds") or None,
+        **{key: info["test"][key] for key in _RESULT},
         "trained_by": settings.get("revisions"),
         "evaluated_by": info.get("revision"),
     }
+
+
+def runs_csv(origins_of_runs: Sequence[Mapping[str, Any]]) -> str:
+    """A row a run: all that `origin` says but for its folder and revisions."""
+    left_out = ("run", "trained_by", "evaluated_by")
+    text = io.StringIO()
+    names = [name for name in origins_of_runs[0] if name not in left_out]
+    writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(origins_of_runs)
+    return text.getvalue()
 
 
 def origins(origins_of_runs: Sequence[Mapping[str, Any]]) -> list[list[str]]:

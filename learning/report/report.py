@@ -12,7 +12,7 @@ from warp_deform.errors import InputError
 from ..evaluation.paper_results import read_paper
 from .cells import environment_notes, pool, version_notes
 from .curves import draw_curves
-from .origins import origin
+from .origins import origin, runs_csv
 from .read import read_runs
 from .tables import csv_text, latex_text, markdown_text
 
@@ -53,6 +53,7 @@ def write_report(paths: Sequence[Path], out: Path | None) -> Report:
         texts = {
             "report.md": markdown_text(cells, paper, notes, pictures, made=made),
             "report.csv": csv_text(cells),
+            "runs.csv": runs_csv(made),
             "report.tex": latex_text(cells, paper),
         }
         for name, content in texts.items():

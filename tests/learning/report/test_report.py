@@ -27,6 +27,7 @@ from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import TASKS
 
 LINE, RING = "cable-line-notarget", "cable-ring"
+AGENT = {"task": LINE, "agent": "goal-stack", "config": {}}
 SCHEDULE = {"steps": 4000, "batch": 1, "lr": 1e-3, "snapshots": 2}
 
 
@@ -236,7 +237,7 @@ def test_steps_are_told_where_they_are_not_the_presets(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("trained", "info", "difference"),
     [
-        ({"device": "cuda"}, {}, "device"),
+        ({"agent": {**AGENT, "config": {"exact": True}}}, {}, "agent"),
         ({"augment": False}, {}, "augment"),
         ({}, {"environment": "WarpDeform/CableLineNotarget-v1"}, "environment"),
         ({}, {"test": result(LINE, [1.0] * 5)}, "test episodes"),
@@ -254,15 +255,47 @@ def test_runs_of_a_cell_are_alike(
         cells(tmp_path)
 
 
-def test_other_versions_are_noted(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("trained", "said"),
+    [
+        ({"versions": {"warp-deform": "1.0.0", "torch": "9.9.9"}}, "torch, 2.13.0, 9.9.9"),
+        ({"device": "cuda"}, "devices, cpu, cuda"),
+        ({"agent": {**AGENT, "config": {"bfloat16": True}}}, "precisions, bfloat16, float32"),
+    ],
+)
+def test_runs_that_were_computed_differently_are_pooled_and_noted(
+    tmp_path: Path, trained: dict[str, Any], said: str
+) -> None:
     write_run(tmp_path / "a")
-    newer = {"warp-deform": "1.0.0", "torch": "9.9.9"}
-    write_run(tmp_path / "b", seed=1, trained={"versions": newer})
-    write_run(tmp_path / "c", demos=100, trained={"versions": newer})
+    write_run(tmp_path / "b", seed=1, trained=trained)
+    write_run(tmp_path / "c", demos=100, trained=trained)
+    assert [cell.seeds for cell in cells(tmp_path)] == [(0, 1), (0,)]
     (note,) = version_notes(read_runs([tmp_path])[0])
-    assert "torch, 2.13.0, 9.9.9" in note and "10 demonstrations" in note
+    assert said in note and "10 demonstrations" in note
     report = write_report([tmp_path], None)
     assert report.data["notes"] == [note] and note in report.text
+
+
+def test_a_rule_of_stopping_counts_where_it_could_stop_a_training(tmp_path: Path) -> None:
+    """Two rules of what has to be solved, and no snapshot that solved anything near it."""
+    for name, seed, confirm in (("a", 0, 0), ("b", 1, 40)):
+        write_run(
+            tmp_path / name,
+            seed=seed,
+            trained={"validate": 20},
+            schedule={**SCHEDULE, "confirm": confirm},
+        )
+    assert [cell.seeds for cell in cells(tmp_path)] == [(0, 1)]
+    for name, seed, confirm in (("c", 0, 0), ("d", 1, 40)):
+        write_run(
+            tmp_path / "solved" / name,
+            seed=seed,
+            trained={"validate": 20},
+            schedule={**SCHEDULE, "confirm": confirm},
+            snapshots={"4000": result(LINE, [1.0] * 4)},
+        )
+    with pytest.raises(InputError, match="further ones that confirm"):
+        cells(tmp_path / "solved")
 
 
 def test_a_result_of_an_earlier_version_of_the_task_is_noted(tmp_path: Path) -> None:
@@ -334,6 +367,9 @@ def test_the_command_writes_tables_and_curves(
     assert [row["task"] for row in rows] == [RING, LINE, LINE]
     assert rows[1]["paper_percent"] == "91.0" and rows[1]["table_percent"] == "75.0"
     assert rows[1]["seeds"] == "0 1" and rows[1]["failures_other"] == "4"
+    runs = list(csv.DictReader((out / "runs.csv").read_text().splitlines()))
+    assert [(row["task"], row["seed"]) for row in runs].count((LINE, "1")) == 2
+    assert {(row["n_success"], row["n_episodes"]) for row in runs} == {("2", "4")}
     tex = (out / "report.tex").read_text()
     assert tex.count(r"\begin{tabular}") == tex.count(r"\end{tabular}") == 2
     assert r"success \%" in tex
