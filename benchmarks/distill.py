@@ -50,9 +50,9 @@ def row_of(report: Mapping[str, Any]) -> dict[str, Any]:
     """The numbers of a report, flat; rounds stand under correction_1 and so on."""
     kept = ("task", "agent", "teacher", "seed", "minutes", "cpu_minutes", "test_cpu_minutes")
     counted = ("demos", "corrected", "labels")
-    test, plan = report["test"], report["plan"]
+    test = report["test"]
     row = {key: report[key] for key in (*kept, *counted)}
-    row["steps"] = sum(plan["round_steps"]) + plan["last_steps"]
+    row["steps"] = sum(each["steps"] for each in report["stages"] if "training" in each["stage"])
     for key in ("n_success", "n_episodes", "mean_score", "standard_error", "mean_actions"):
         row[key] = test[key]
     rounds = [each for each in report["stages"] if each["stage"].startswith("correction")]

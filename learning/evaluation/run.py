@@ -27,7 +27,7 @@ from ..runs.folder import RunFolder, write_json
 from ..runs.log import cpu_seconds, read_log
 from .paper_results import PARTIAL_SCORE, SUCCESS, partial_credit, read_paper
 from .protocol import FIRST_SEED, Protocol, check_splits
-from .snapshot import evaluate_snapshot, trained_steps
+from .snapshot import confirmed, evaluate_snapshot, trained_steps
 from .summary import Evaluation, PlayedEpisode, best
 
 __all__ = ["evaluate_run"]
@@ -155,7 +155,8 @@ def evaluate_run(
         raise InputError(f"{video} is no folder; name one for the videos")
     earlier = _earlier(run)
     validated = evaluate("validation", steps, validation)
-    chosen = best([each for each in validated if each.step], task=task)
+    further = {step: confirmed(run, step, validation) for step in steps}
+    chosen = best([each for each in validated if each.step], task=task, confirmed=further)
     (result,) = evaluate("test", [chosen.step], test)
     paper_table = read_paper()
     demos, agent = len(settings["demonstrations"]), settings["agent"]["agent"]

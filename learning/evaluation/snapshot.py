@@ -27,6 +27,7 @@ from .protocol import Protocol, goals_for, goals_of
 from .summary import Evaluation, PlayedEpisode, summarise
 
 __all__ = [
+    "confirmed",
     "evaluate_snapshot",
     "is_evaluated",
     "read_played",
@@ -87,6 +88,21 @@ def evaluate_snapshot(
 def is_evaluated(run: RunFolder, step: int, protocol: Protocol) -> bool:
     """Whether a snapshot has played all of a protocol."""
     return _Results(run, step, protocol).whole
+
+
+def confirmed(run: RunFolder, step: int, protocol: Protocol) -> float:
+    """Share solved of the further validation episodes that training asks of a good snapshot.
+
+    Those are asked of one that solved all of `protocol`; 0 where they were not played, and where
+    `protocol` is not what training plays.
+    """
+    settings = run.read_settings()
+    confirm, n = settings["schedule"].get("confirm", 0), protocol.episodes
+    if not confirm or n != settings.get("validate"):
+        return 0.0
+    played = _Results(run, step, protocol).played
+    further = (played.get(seed) for seed in replace(protocol, episodes=n + confirm).seeds[n:])
+    return sum(each is not None and each.success for each in further) / confirm
 
 
 def stopped_early(run: RunFolder) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,11 +54,22 @@ class Evaluation:
     summary: dict[str, Any]
 
 
-def best(evaluations: Sequence[Evaluation], *, task: str) -> Evaluation:
-    """The evaluation with the best result; of equals that with fewer actions, then the latest."""
+def best(
+    evaluations: Sequence[Evaluation], *, task: str, confirmed: Mapping[int, float] | None = None
+) -> Evaluation:
+    """The evaluation with the best result; of equals the best confirmed one.
 
-    def rank(each: Evaluation) -> tuple[float, float, int]:
-        return each.summary[measure(task)], -each.summary["mean_actions"], each.step
+    Of those the one with fewer actions, then the latest.
+
+    Args:
+        confirmed: by step, share of further episodes that were solved
+    """
+    further = confirmed or {}
+
+    def rank(each: Evaluation) -> tuple[float, float, float, int]:
+        summary = each.summary
+        share = further.get(each.step, 0.0)
+        return summary[measure(task)], share, -summary["mean_actions"], each.step
 
     return max(evaluations, key=rank)
 

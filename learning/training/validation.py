@@ -53,10 +53,11 @@ class Validation:
         self.results: dict[int, dict[str, Any]] = {}
         """`n_success`, `n_episodes` and `mean_score` of snapshots by step, over all they played."""
         self.chosen: int | None = None
-        """Step of the snapshot that did best in the episodes that all played, see
-        `evaluation.summary.best`."""
+        """Step of the snapshot that did best in the episodes that all played, and of equals in
+        those that confirm, see `evaluation.summary.best`."""
         self._task = task
         self._evaluations: dict[int, Evaluation] = {}
+        self._confirmed: dict[int, float] = {}
         if episodes:
             from ..evaluation.protocol import Protocol, check_splits  # loads the simulator
 
@@ -68,7 +69,7 @@ class Validation:
         """Evaluate the snapshots of these steps; returns whether training ends with the last."""
         if self._protocol is None:
             return False
-        from ..evaluation.snapshot import evaluate_snapshot, stopped_early
+        from ..evaluation.snapshot import confirmed, evaluate_snapshot, stopped_early
         from ..evaluation.summary import best
 
         for step in steps if self._process.rank == 0 else ():
@@ -76,7 +77,10 @@ class Validation:
             self._evaluations[step], summary = evaluation, evaluation.summary
             if summary["n_success"] == summary["n_episodes"]:
                 summary = evaluate_snapshot(self._run, step, self._longer).summary
-            self.chosen = best(list(self._evaluations.values()), task=self._task).step
+                self._confirmed[step] = confirmed(self._run, step, self._protocol)
+            self.chosen = best(
+                list(self._evaluations.values()), task=self._task, confirmed=self._confirmed
+            ).step
             self.results[step] = {name: summary[name] for name in _REPORTED}
             self.note = (
                 f"validation {summary['n_success']} of {summary['n_episodes']} solved, "

@@ -75,11 +75,12 @@ def test_a_distillation_is_a_row_once(trained: Path, tmp_path: Path) -> None:
     report = {
         "task": "t", "agent": "a", "teacher": "mpc", "seed": 0, "minutes": 5, "cpu_minutes": 6.0,
         "test_cpu_minutes": 1.0, "demos": 2, "corrected": 3, "labels": 30, "run": str(trained),
-        "plan": {"round_steps": [3, 4], "last_steps": 5},
+        "plan": {"round_steps": [7], "last_steps": 9},
         "test": {"n_success": 1, "n_episodes": 2, "mean_score": 0.5, "standard_error": 0.1,
                  "mean_actions": 3.0},
-        "stages": [stage("training 1"), stage("correction 1", solved=1, corrected=2, labels=9),
-                   stage("last training"), stage("test")],
+        "stages": [stage("training 1", steps=7),
+                   stage("correction 1", solved=1, corrected=2, labels=9),
+                   stage("last training", steps=5), stage("test")],
     }  # fmt: skip
     row = distill.row_of(report)
     assert row["steps"] == 12 and row["round_1_solved"] == 1 and row["training_cpu_minutes"] == 2
