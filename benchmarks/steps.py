@@ -6,8 +6,8 @@ CPU time of one thread, batch 1, random pictures, medians. A step is losses, gra
 optimiser and the average of the weights; acting weighs up to five picks. "plain" computes network
 by network (`Attention` and `Transport`), with torch's Adam and average tensor by tensor; "together"
 is what `train` does. The kinds take turns in one run, so that other programs slow them alike, and
-ratios are medians over turns. bfloat16 is measured where the processor multiplies it natively, or
-with --bfloat16.
+ratios are medians over turns. bfloat16 is measured where the processor has AMX, or with
+--bfloat16.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from learning.models.batch import Batch
-from learning.models.precision import has_bfloat16_units
+from learning.models.precision import has_bfloat16_tiles
 from learning.models.transporter import PRESETS, GoalSplit, GoalStack, Transporter
 from learning.runs.folder import RunFolder
 from learning.training.schedules import SCHEDULES
@@ -106,10 +106,10 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     kinds = ["plain", "together"]
-    if arguments.bfloat16 or has_bfloat16_units():
+    if arguments.bfloat16 or has_bfloat16_tiles():
         kinds.append("bfloat16")
     name_of_cpu = torch.cpu.get_capabilities().get("cpu_name", "unknown")
-    print(f"{name_of_cpu}, bfloat16 units: {has_bfloat16_units()}")
+    print(f"{name_of_cpu}, AMX: {has_bfloat16_tiles()}")
     rows = []
     for agent in arguments.agents:
         with tempfile.TemporaryDirectory() as folder:

@@ -2,7 +2,7 @@
 
     python benchmarks/teacher_labels.py TASK RUN [--teacher mpc] [--episodes 12] [--out FILE]
 
-The policy plays seeds that it did not learn from, and the teacher is asked in every state, as by
+The policy plays seeds from 9,000 up, and the teacher is asked in every state, as by
 `warp-deform correct`. A policy cannot do what no picture shows, so labels that lie far away in most
 states of a policy that solves its task are a sign that the teacher goes by something hidden. A row
 has medians over states; rows are appended, with the commit that measured.
@@ -64,6 +64,8 @@ def measured(task: str, run: Path, teacher: str, episodes: int) -> dict[str, Any
 
     seeds = range(FIRST_SEED, FIRST_SEED + episodes)
     ends = [each.ended for _, each in play(worlds, seeds, act=act, look=observe)]
+    if not apart:
+        raise SystemExit(f"{teacher} has nothing to say of {task}; choose another --teacher")
     picks, places = np.median(apart, axis=0)
     return {
         "task": task,

@@ -93,16 +93,18 @@ def is_evaluated(run: RunFolder, step: int, protocol: Protocol) -> bool:
 def confirmed(run: RunFolder, step: int, protocol: Protocol) -> float:
     """Share solved of the further validation episodes that training asks of a good snapshot.
 
-    Those are asked of one that solved all of `protocol`; 0 where they were not played, and where
-    `protocol` is not what training plays.
+    0 for one that did not solve all of `protocol`, where the further ones were not all played, and
+    where `protocol` is not what training plays.
     """
     settings = run.read_settings()
     confirm, n = settings["schedule"].get("confirm", 0), protocol.episodes
     if not confirm or n != settings.get("validate"):
         return 0.0
     played = _Results(run, step, protocol).played
-    further = (played.get(seed) for seed in replace(protocol, episodes=n + confirm).seeds[n:])
-    return sum(each is not None and each.success for each in further) / confirm
+    every = [played.get(seed) for seed in replace(protocol, episodes=n + confirm).seeds]
+    if None in every or not all(each is not None and each.success for each in every[:n]):
+        return 0.0
+    return sum(each is not None and each.success for each in every[n:]) / confirm
 
 
 def stopped_early(run: RunFolder) -> bool:

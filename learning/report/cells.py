@@ -1,11 +1,11 @@
-"""Runs that differ in their seed alone, taken together, with the paper's number beside ours.
+"""Runs that were trained alike but for their seed, together, with the paper's number beside ours.
 
 A cell is a task, an agent, a number of demonstrations and a variant: preset, steps where they are
 not the preset's, who chooses the lift, whose goals, which arm, who demonstrated. Runs of a cell
-differ in their seed alone. Their test episodes are counted together for the share of successes and
-its Wilson interval; standard errors are those between runs where there are several, else those
-between episodes. Training runs share their test seeds, so the interval speaks of the runs that were
-made and not of training again.
+differ in their seed, and in what computed them at most. Their test episodes are counted together
+for the share of successes and its Wilson interval. The standard error is the greater one of that
+between runs and that between episodes. Training runs share their test seeds, so the interval speaks
+of the runs that were made and not of training again.
 
 Source: Wilson, JASA 1927; numbers of Seita et al., ICRA 2021, in `paper_results.json`.
 """
@@ -120,7 +120,7 @@ def pool(runs: Sequence[RunResult], paper: PaperResults) -> list[Cell]:
     """Cells of runs, ordered by variant, task, agent and number of demonstrations.
 
     Raises:
-        InputError: two runs of a cell have the same seed, or differ in more than the seed.
+        InputError: two runs of a cell have the same seed, or were trained or tested differently.
     """
     groups = _grouped(runs)
     for members in groups.values():
@@ -147,14 +147,14 @@ def version_notes(runs: Sequence[RunResult]) -> list[str]:
                 first = members[0]
                 notes.append(
                     f"{first.task}, {first.agent}, {first.demos} demonstrations ({first.variant}): "
-                    f"trained by different {name}, {', '.join(sorted(values))}, and taken together "
-                    "all the same"
+                    f"trained with different {name}, {', '.join(sorted(values))}, and taken "
+                    "together all the same"
                 )
     return notes
 
 
 def _computed_by(run: RunResult) -> dict[str, str]:
-    """What changes how numbers are rounded, and not what is trained."""
+    """By what a run was computed, which seeds of a cell may differ in."""
     settings = run.settings
     versions, network = settings.get("versions", {}), settings["agent"]["config"]
     return {
@@ -188,8 +188,8 @@ def _grouped(
 
 
 def _check_alike(members: Sequence[RunResult]) -> None:
-    first = members[0]
     seen: dict[int, Path] = {}
+    known: dict[str, tuple[Path, Any]] = {}
     for run in members:
         if run.seed in seen:
             raise InputError(
@@ -197,11 +197,13 @@ def _check_alike(members: Sequence[RunResult]) -> None:
                 f"{run.agent} and {run.demos} demonstrations; name one of them"
             )
         seen[run.seed] = run.path
-        mine, theirs = _compared(run), _compared(first)
-        for key, value in mine.items():
-            if value is not None and theirs.get(key) is not None and value != theirs[key]:
+        for key, value in _compared(run).items():
+            if value is None:
+                continue
+            path, other = known.setdefault(key, (run.path, value))
+            if value != other:
                 raise InputError(
-                    f"{first.path} and {run.path} differ in {key}, so their results are not one; "
+                    f"{path} and {run.path} differ in {key}, so their results are not one; "
                     "report them apart"
                 )
 
@@ -220,8 +222,10 @@ def _compared(run: RunResult) -> dict[str, Any]:
     compared["validation episodes"] = info["snapshots"][str(info["selected"])]["n_episodes"]
     if settings.get("validate"):
         compared["validation episodes in training"] = settings.get("validate")
-        if any(each["n_success"] == each["n_episodes"] for each in info["snapshots"].values()):
-            # only what solves all is confirmed
+        played = [each for step, each in info["snapshots"].items() if int(step)]
+        solved_all = any(each["n_success"] == each["n_episodes"] for each in played)
+        if solved_all or int(info["trained_steps"]) < int(schedule["steps"]):
+            # else the rule never came into play
             compared["further ones that confirm"] = schedule.get("confirm", 0)
     if paper is not None:
         compared["who chooses the lift by the paper's protocol"] = paper["stage_rule"]
@@ -290,12 +294,18 @@ def _value(summary: Mapping[str, Any], task: str) -> tuple[float, float | None, 
 def _together(
     results: Sequence[tuple[float, float | None, int]],
 ) -> tuple[float, float | None]:
-    """Mean over all episodes of several runs, and its standard error (see the module)."""
+    """Mean over all episodes of several runs, and its standard error (see the module).
+
+    Two or three runs that happen to agree say little of the spread between runs.
+    """
     values = [value for value, _, _ in results]
     mean = float(np.average(values, weights=[n for _, _, n in results]))
     if len(results) == 1:
         return mean, results[0][1]
-    return mean, float(np.std(values, ddof=1) / math.sqrt(len(values)))
+    between = float(np.std(values, ddof=1) / math.sqrt(len(values)))
+    errors = [error for _, error, _ in results if error is not None]
+    within = math.sqrt(sum(error**2 for error in errors)) / len(values)
+    return mean, max(between, within)
 
 
 def _curve(

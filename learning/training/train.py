@@ -35,7 +35,7 @@ from warp_deform.tasks.ground_truth import yaw_columns
 from ..data.batches import check_lifts, check_view, image_batch, state_batch, task_lifts
 from ..data.dataset import Demonstrations
 from ..models.gt_state import GtStateConfig
-from ..models.precision import has_bfloat16_units
+from ..models.precision import has_bfloat16_tiles
 from ..models.transporter import PRESETS, Transporter
 from ..policy.policy import AGENTS, Agent, AgentDescription
 from ..runs.folder import RunFolder
@@ -283,7 +283,7 @@ def _bfloat16(config: TrainConfig) -> bool:
     """Whether to convolve in bfloat16; `paper` does so only when asked to, as it is a reference."""
     if config.precision == "auto":
         fast = config.preset == "fast" and not config.exact
-        return fast and config.device == "cpu" and has_bfloat16_units()
+        return fast and config.device == "cpu" and has_bfloat16_tiles()
     return config.precision == "bfloat16"
 
 

@@ -22,5 +22,5 @@ def test_a_teacher_that_goes_by_what_is_hidden_asks_for_far_places(
     seen = teacher_labels.measured("cable-ring-notarget", POLICY, "mpc", 1)
     monkeypatch.setattr(CableRingNotarget, "aims", CableRing.aims)
     hidden = teacher_labels.measured("cable-ring-notarget", POLICY, "mpc", 1)
-    assert seen["solved"] == 1 and seen["states"] == hidden["states"] > 1
+    assert seen["states"] == hidden["states"] > 1
     assert hidden["place_mm"] > 2 * seen["place_mm"] > 0

@@ -129,13 +129,13 @@ class CableRing(Task):
         particle_q: Tensor,
         body_q: Tensor,
     ) -> Tensor:
-        """Mean distances [m] of the beads from their aims under the best of 64 maps."""
+        """Mean distances [m] of the beads from their targets under the best of 64 maps."""
         maps = ring_maps(self.cable.beads, reversals=True)
-        aims = np.stack([self.aims(*each) for each in zip(layouts, snapshots, strict=True)])
-        return mean_distance(particle_q[..., :2], aims, maps)
+        targets = np.stack([layout.targets for layout in layouts])
+        return mean_distance(particle_q[..., :2], targets, maps)
 
     def aims(self, layout: Layout, snapshot: Snapshot) -> np.ndarray:
-        """Where who plans wants the beads (32, 2) [m], one for each: the marks."""
+        """Where a planner wants the beads (32, 2) [m], one for each: the marks."""
         return layout.targets
 
     def _mapped(self, targets: np.ndarray, snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +203,8 @@ class CableRingNotarget(CableRing):
         """The circle (32, 2) [m] that the beads are nearest to, wherever on the table it lies.
 
         Nobody who looks can tell where the circle of the start was. A teacher that led there would
-        teach what no picture shows, as the scripted demonstrator does.
+        teach what no picture shows, as the scripted demonstrator does. The loss, and with it dense
+        rewards, still go by that circle: another reward would be another version of the task.
         """
         beads = snapshot.particle_q[:, :2].astype(float)
         middle, reach = layout.targets.mean(axis=0), self.cable.ring_radius + self.cable.radius

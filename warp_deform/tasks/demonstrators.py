@@ -124,7 +124,7 @@ def nearest_shift(
 
 
 def _rounded(offsets: np.ndarray) -> np.ndarray:
-    """Lengths as `losses.lengths` has them, so that the shift is of the loss's minimum too."""
+    """Lengths that are never 0, as those of `losses.lengths`."""
     return np.sqrt((offsets**2).sum(axis=-1) + 1e-8)
 
 

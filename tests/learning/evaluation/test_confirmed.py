@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from learning.evaluation.protocol import Protocol
 from learning.evaluation.run import evaluate_run
 from learning.evaluation.snapshot import confirmed, evaluate_snapshot
 from learning.evaluation.summary import Evaluation, PlayedEpisode, best, summarise
 from learning.runs.folder import RunFolder
+from learning.training.processes import Process
+from learning.training.validation import Validation
 
 EVERY = Protocol(split="validation", episodes=2)
 FURTHER = 4
@@ -48,6 +51,34 @@ def test_eval_takes_the_snapshot_that_was_confirmed(run: RunFolder) -> None:
     assert [report["snapshots"][step]["pc_success"] for step in ("1", "2")] == [100.0, 100.0]
     assert report["selected"] == 2
     assert [confirmed(run, step, EVERY) for step in (1, 2)] == [0.25, 1.0]
+
+
+def test_training_takes_the_same_snapshot(run: RunFolder) -> None:
+    alone = Process(0, 1, torch.device("cpu"))
+    validation = Validation(
+        run, episodes=2, confirm=FURTHER, process=alone, trained=(), task="block-notarget"
+    )
+    validation.evaluate([1])
+    assert validation.chosen == 1
+    validation.evaluate([2])
+    assert validation.chosen == 2
+    assert [each["n_success"] for each in validation.results.values()] == [3, 6]
+
+
+def test_what_was_played_in_part_or_for_nothing_confirms_nothing(run: RunFolder) -> None:
+    for name, change in (("part", lambda rows: rows[:-1]), ("failed", spoil_first)):
+        (path,) = run.evaluations.glob("step_00000002-validation-*.json")
+        record = json.loads(path.read_text())
+        (run.path / name).write_text(path.read_text())
+        path.write_text(json.dumps({**record, "episodes": change(record["episodes"])}))
+        assert confirmed(run, 2, EVERY) == 0.0
+        path.write_text((run.path / name).read_text())
+    assert confirmed(run, 2, EVERY) == 1.0
+
+
+def spoil_first(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Results of which the first one failed."""
+    return [{**rows[0], "success": False, "failure": "other"}, *rows[1:]]
 
 
 def test_what_training_does_not_play_confirms_nothing(run: RunFolder) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from learning.models.adam import KerasAdam
 from learning.models.batch import Batch
 from learning.models.grouped import GroupedNetworks, Window
-from learning.models.precision import has_bfloat16_units
+from learning.models.precision import has_bfloat16_tiles
 from learning.models.transporter import PRESETS, GoalSplit, GoalStack, Transporter
 from learning.training.config import TrainConfig
 from learning.training.train import _bfloat16
@@ -182,7 +182,7 @@ def test_auto_takes_bfloat16_where_the_processor_has_tiles_of_it(
     units: str, changes: dict[str, Any], expected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {units: True})
-    assert has_bfloat16_units() == (units == "amx_bf16")
+    assert has_bfloat16_tiles() == (units == "amx_bf16")
     settings = {"preset": "fast", "task": "cable-ring", "agent": "transporter"} | changes
     config = TrainConfig(data=Path("none"), out=Path("none"), **settings)
     assert _bfloat16(config) is expected

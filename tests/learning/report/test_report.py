@@ -133,6 +133,15 @@ def test_seeds_are_pooled(tmp_path: Path) -> None:
     assert cell.failures == {"other": 4}
 
 
+def test_runs_that_happen_to_agree_are_as_uncertain_as_their_episodes(tmp_path: Path) -> None:
+    scores = (1.0, 0.8, 0.6, 0.2)
+    for seed in (0, 1):
+        write_run(tmp_path / str(seed), seed=seed, scores=scores)
+    (cell,) = cells(tmp_path)
+    of_one = np.std(scores, ddof=1) / math.sqrt(4)
+    assert cell.standard_error == pytest.approx(of_one / math.sqrt(2))
+
+
 def test_one_run_keeps_its_own_error_and_curve(tmp_path: Path) -> None:
     (cell,) = cells(write_run(tmp_path / "a", task=RING, agent="transporter"))
     assert cell.measure == "success" and cell.value == 50.0
@@ -296,6 +305,23 @@ def test_a_rule_of_stopping_counts_where_it_could_stop_a_training(tmp_path: Path
         )
     with pytest.raises(InputError, match="further ones that confirm"):
         cells(tmp_path / "solved")
+    write_run(  # the first one that is read, to which the rule never came, changes nothing
+        tmp_path / "solved" / "a", seed=2, trained={"validate": 20}, schedule=SCHEDULE
+    )
+    with pytest.raises(InputError, match="further ones that confirm"):
+        cells(tmp_path / "solved")
+    write_run(
+        tmp_path / "early" / "a", trained={"validate": 20}, schedule=SCHEDULE, trained_steps=2000
+    )
+    write_run(
+        tmp_path / "early" / "b",
+        seed=1,
+        trained={"validate": 20},
+        schedule={**SCHEDULE, "confirm": 40},
+        trained_steps=2000,
+    )
+    with pytest.raises(InputError, match="further ones that confirm"):
+        cells(tmp_path / "early")
 
 
 def test_a_result_of_an_earlier_version_of_the_task_is_noted(tmp_path: Path) -> None:
