@@ -2,7 +2,7 @@
 
     python benchmarks/refine_then_train.py [--tasks T...] [--ways W...] [--demos N...]
                                            [--seeds S...] [--steps N] [--work FOLDER]
-                                           [--out FILE] [--list]
+                                           [--out FILE] [--list] [--costs FILE]
 
 A cell is a task, a way, a number of demonstrations and a seed of training. Agent, steps and test
 are the same in all, and the last snapshot is tested, so that nothing is chosen by luck; so are the
@@ -10,6 +10,9 @@ starts, where all ways solve them. `cem` and `gradient` are
 what `warp-deform refine --accept solved` makes of the scripted demonstrations; `mpc` and `planner`
 demonstrate themselves. Each finished cell is a line of OUT, and a cell with a line is left out: the
 command goes on after an interruption. Two processes may share WORK and OUT, with different tasks.
+With `--costs` demonstrations are only made, in a folder that is thrown away, and their CPU seconds
+are added to FILE; those of a refined way are of its scripted demonstrations too. One demonstration
+before, not timed, loads the kernels.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
@@ -54,7 +59,14 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("refine-then-train"))
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--list", action="store_true", help="only name what is left")
+    parser.add_argument("--costs", type=Path, help="file for CPU seconds of demonstrations alone")
     options = parser.parse_args()
+    if options.costs is not None:
+        for demos, task, way in product(options.demos, options.tasks, options.ways):
+            if way != "gradient" or find_task(task).has_loss():
+                with options.costs.open("a") as file:
+                    file.write(json.dumps(cost_of(task, way, demos)) + "\n")
+        return
     grid = product(options.seeds, options.demos, options.tasks, options.ways)
     left = missing(
         [(task, way, demos, seed) for seed, demos, task, way in grid], options.steps, options.out
@@ -124,15 +136,28 @@ def demonstrate(task: str, way: str, demos: int, root: Path) -> Path:
     """A folder of the task's demonstrations made in this way; what is there is kept."""
     made = root / (way if way not in REFINED else "scripted") / str(demos) / task
     by: Any = "scripted" if way in REFINED else way
-    collected = collect(CollectConfig(task=task, episodes=demos, out=made, demonstrator=by))
+    collected = collect(
+        CollectConfig(task=task, episodes=demos, out=made, demonstrator=by, workers=1)
+    )
     if collected.successes < demos:
         raise WarpDeformError(f"{by} solves {task} too seldom for {demos} demonstrations")
     if way not in REFINED:
         return made
     refined = root / way / str(demos) / task
     search = SearchConfig(method=way)
-    refine(RefineConfig(source=made, out=refined, accept="solved", search=search))
+    refine(RefineConfig(source=made, out=refined, accept="solved", search=search, workers=1))
     return refined
+
+
+def cost_of(task: str, way: str, demos: int) -> dict[str, Any]:
+    """CPU seconds that so many demonstrations take in this process."""
+    with tempfile.TemporaryDirectory() as root:
+        demonstrate(task, way, 1, Path(root))
+        began = time.process_time()
+        demonstrate(task, way, demos, Path(root))
+        spent = time.process_time() - began
+    return {"task": task, "way": way, "demos": demos, "cpu_s": spent,
+            "commit": running_revision().commit}  # fmt: skip
 
 
 def row_of(cell: Cell, steps: int, folder: Path, runs: Path) -> dict[str, Any]:

@@ -68,6 +68,16 @@ def test_cells_have_one_line_each_and_no_gradient_where_there_is_none(
     assert grids[1].evaluation.episodes == 200
 
 
+def test_demonstrations_have_a_cost(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    out = tmp_path / "costs.jsonl"
+    arguments = ["--costs", str(out), "--tasks", "cable-ring", "--ways", "scripted", "mpc"]
+    monkeypatch.setattr(sys, "argv", ["refine_then_train.py", *arguments, "--demos", "2"])
+    benchmark.main()
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [(row["way"], row["demos"]) for row in rows] == [("scripted", 2), ("mpc", 2)]
+    assert rows[1]["cpu_s"] > 1.5 * rows[0]["cpu_s"] > 0
+
+
 def test_a_distillation_is_a_row_once(trained: Path, tmp_path: Path) -> None:
     def stage(name: str, **more: object) -> dict[str, Any]:
         return {"stage": name, "cpu_seconds": 60.0, **more}
