@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from fixtures.evaluated_runs import AGENT, LINE, PLAYED_TOO, RING, SCHEDULE, result, write_run
 from matplotlib.axes import Axes
 
 from learning.evaluation.paper_results import read_paper
-from learning.evaluation.summary import PlayedEpisode, summarise
 from learning.policy.policy import AGENTS
 from learning.report.cells import CurvePoint, pool, version_notes
 from learning.report.curves import draw_curves
@@ -25,77 +25,6 @@ from warp_deform.command.main import main
 from warp_deform.errors import InputError
 from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import TASKS
-
-LINE, RING = "cable-line-notarget", "cable-ring"
-AGENT = {"task": LINE, "agent": "goal-stack", "config": {}}
-SCHEDULE = {"steps": 4000, "batch": 1, "lr": 1e-3, "snapshots": 2}
-
-
-def result(task: str, scores: list[float], *, failure: str = "other") -> dict[str, Any]:
-    """A summary of episodes with these scores; those of 1 are solved."""
-    played = [
-        PlayedEpisode(n, score == 1.0, score, 3, "", None if score == 1.0 else failure)
-        for n, score in enumerate(scores)
-    ]
-    return summarise(played, task=task)
-
-
-PLAYED_TOO = {"snapshots": {"4000": result(LINE, [1.0] * 4)}}
-"""A second result, by the paper's protocol."""
-
-
-def write_run(
-    path: Path,
-    *,
-    task: str = LINE,
-    agent: str = "goal-stack",
-    demos: int = 10,
-    seed: int = 0,
-    scores: tuple[float, ...] = (1.0, 1.0, 0.5, 0.5),
-    schedule: dict[str, Any] | None = None,
-    trained: dict[str, Any] | None = None,
-    **info: Any,
-) -> Path:
-    """A run's folder as training and evaluation leave it, without weights.
-
-    trained: other settings of `run.json`; info: of `eval_info.json`
-    """
-    path.mkdir(parents=True)
-    settings = {
-        "agent": {"task": task, "agent": agent, "config": {}},
-        "preset": "fast",
-        "schedule": schedule or SCHEDULE,
-        "seed": seed,
-        "demonstrations": {str(number): "seal" for number in range(demos)},
-        "augment": True,
-        "patience": None,
-        "validate": 0,
-        "processes": 1,
-        "device": "cpu",
-        "versions": {"warp-deform": "1.0.0", "torch": "2.13.0"},
-        "demonstrators": ["scripted"],
-    } | (trained or {})
-    (path / "run.json").write_text(json.dumps(settings))
-    snapshots = {"0": [0.0] * 4, "2000": [0.5] * 4, "4000": [1.0, 1.0, 0.5, 0.5]}
-    report = {
-        "task": task,
-        "environment": env_id(task),
-        "agent": agent,
-        "preset": "fast",
-        "demos": demos,
-        "seed": seed,
-        "stage_rule": "action",
-        "retry": True,
-        "goals": "constructed",
-        "robot": "ur5",
-        "trained_steps": 4000,
-        "snapshots": {step: result(task, values) for step, values in snapshots.items()},
-        "selected": 4000,
-        "test": result(task, list(scores)),
-        "paper": None,
-    }
-    (path / "eval_info.json").write_text(json.dumps(report | info))
-    return path
 
 
 def cells(*paths: Path) -> list[Any]:
