@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,17 +29,31 @@ def test_stop_reaches_a_program_that_was_started_deaf_to_interrupts():
         assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.fixture
-def person(monkeypatch):
-    """Answers at the page of whatever command is started, from a list; keeps what was asked."""
-    answers: list[str] = []
-    asked: list[str] = []
-    threads: list[threading.Thread] = []
+class Person:
+    """Answers at the page of whatever command is started, from a list."""
 
-    def attend(operator):
+    def __init__(self) -> None:
+        self._answers: list[str] = []
+        self._asked: list[str] = []
+        self._threads: list[threading.Thread] = []
+
+    def answers(self, *says: str) -> None:
+        """What will be said next."""
+        self._answers, self._asked = list(says), []
+
+    def heard(self) -> list[str]:
+        """What was asked and how it ended; a command may end before its last word is read."""
+        while self._threads:
+            self._threads[-1].join(30)
+            assert not self._threads.pop().is_alive()
+        return self._asked
+
+    def attend(self, operator: PageOperator) -> None:
+        """Sit down at the page of this operator."""
         server = PageServer(operator._session, operator._served)
+        answers, asked = self._answers, self._asked
 
-        def act():
+        def act() -> None:
             with server.tab() as tab:
                 for says in answers:
                     now = question(tab)
@@ -46,34 +61,38 @@ def person(monkeypatch):
                     answer(tab, now, says)
                 asked.append(hear(tab, "over")["text"])
 
-        threads.append(threading.Thread(target=act, daemon=True))
-        threads[-1].start()
+        self._threads.append(threading.Thread(target=act, daemon=True))
+        self._threads[-1].start()
 
-    monkeypatch.setattr(PageOperator, "announce", attend)
-    yield answers, asked
-    for thread in threads:
-        thread.join(10)
-        assert not thread.is_alive()
+
+@pytest.fixture
+def person(monkeypatch: pytest.MonkeyPatch) -> Iterator[Person]:
+    somebody = Person()
+    monkeypatch.setattr(PageOperator, "announce", lambda operator: somebody.attend(operator))
+    yield somebody
+    somebody.heard()
 
 
 def test_a_plan_and_a_goal_are_asked_for_at_the_page(
-    person, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    person: Person, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    answers, asked = person
-    answers += ["another", "yes"]
+    person.answers("another", "yes")
     out = tmp_path / "episode"
     words = ["run", "--agent", "random", "--seed", "3", "--out", str(out), "--page", "--json"]
     assert main(["franka", *words]) == 0
     assert json.loads(capfd.readouterr().out.splitlines()[-1])["actions"] == 1
+    asked = person.heard()
     assert asked[:2] == ["plan", "plan"] and "recorded in" in asked[2]
 
-    answers[:], asked[:] = ["another", "stop"], []
+    person.answers("another", "stop")
     goal = tmp_path / "goal.png"
     words = ["capture-goal", "--robot", "sim", "--seed", "5", "--out", str(goal), "--page"]
     assert main(["franka", *words]) == 2
     assert "nothing was written" in capfd.readouterr().err and not goal.exists()
-    answers[:], asked[:] = ["yes"], []
+    assert person.heard()[:2] == ["keep", "keep"]
+    person.answers("yes")
     assert main(["franka", *words]) == 0 and goal.is_file()
+    asked = person.heard()
     assert asked[0] == "keep" and "px of cable" in asked[1]
 
 
