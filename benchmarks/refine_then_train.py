@@ -2,7 +2,7 @@
 
     python benchmarks/refine_then_train.py [--tasks T...] [--ways W...] [--demos N...]
                                            [--seeds S...] [--steps N] [--work FOLDER]
-                                           [--out FILE] [--list] [--costs FILE]
+                                           [--out FILE] [--list] [--costs FILE] [--picks FILE]
 
 A cell is a task, a way, a number of demonstrations and a seed of training. Agent, steps and test
 are the same in all, and the last snapshot is tested, so that nothing is chosen by luck; so are the
@@ -12,7 +12,8 @@ demonstrate themselves. Each finished cell is a line of OUT, and a cell with a l
 command goes on after an interruption. Two processes may share WORK and OUT, with different tasks.
 With `--costs` demonstrations are only made, in a folder that is thrown away, and their CPU seconds
 are added to FILE; those of a refined way are of its scripted demonstrations too. One demonstration
-before, not timed, loads the kernels.
+before, not timed, loads the kernels. With `--picks` the demonstrations in WORK are read, and how
+visible the reason of their actions is is written to FILE.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from table import tested_by
 
 from learning.refinement.refine import RefineConfig, refine
@@ -35,6 +37,7 @@ from learning.report.read import read_runs
 from learning.sweep import Collecting, SweepConfig, run_sweep
 from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.collecting.inspection import statistics
+from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import WarpDeformError
 from warp_deform.planning import SearchConfig
 from warp_deform.support.revision import running_revision
@@ -60,7 +63,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--list", action="store_true", help="only name what is left")
     parser.add_argument("--costs", type=Path, help="file for CPU seconds of demonstrations alone")
+    parser.add_argument("--picks", type=Path, help="file for what demonstrations pick and place")
     options = parser.parse_args()
+    if options.picks is not None:
+        with options.picks.open("w") as file:
+            for demos, task, way in product(options.demos, options.tasks, options.ways):
+                folder = options.work / "demos" / way / str(demos) / task
+                if folder.exists():
+                    row = {"task": task, "way": way, "demos": demos, **picks_of(folder)}
+                    file.write(json.dumps(row) + "\n")
+        return
     if options.costs is not None:
         for demos, task, way in product(options.demos, options.tasks, options.ways):
             if way != "gradient" or find_task(task).has_loss():
@@ -158,6 +170,32 @@ def cost_of(task: str, way: str, demos: int) -> dict[str, Any]:
         spent = time.process_time() - began
     return {"task": task, "way": way, "demos": demos, "cpu_s": spent,
             "commit": running_revision().commit}  # fmt: skip
+
+
+def picks_of(folder: Path) -> dict[str, Any]:
+    """Medians over the actions of demonstrations.
+
+    `farther`: share of the beads or nodes that are farther from where they lie in the end than the
+    picked one; 0 where the action begins with what is most out of place, as a picture shows.
+    `place_mm`: how far the place is from where the picked one lies in the end [mm].
+    """
+    farther, off = [], []
+    reader = EpisodeReader(folder)
+    for seed in reader.seeds:
+        *steps, last = reader.read(seed).steps
+        end = np.asarray(last.particle_q)[:, :2]
+        for step in steps:
+            action, q = np.asarray(step.action), np.asarray(step.particle_q)[:, :2]
+            picked = int(np.argmin(np.linalg.norm(q - action[:2], axis=1)))
+            distances = np.linalg.norm(q - end, axis=1)
+            farther.append(float((distances > distances[picked]).mean()))
+            off.append(1000 * float(np.linalg.norm(action[3:5] - end[picked])))
+    return {
+        "actions": len(off),
+        "farther": float(np.median(farther)),
+        "place_mm": float(np.median(off)),
+        "place_mm_p90": float(np.percentile(off, 90)),
+    }
 
 
 def row_of(cell: Cell, steps: int, folder: Path, runs: Path) -> dict[str, Any]:

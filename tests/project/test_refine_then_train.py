@@ -30,6 +30,9 @@ def test_ways_start_alike_and_differ_in_their_actions(tmp_path: Path) -> None:
         "scripted": ["scripted"], "cem": ["refined"], "mpc": ["mpc"],
     }  # fmt: skip
     assert shown["cem"]["steps"] < shown["scripted"]["steps"]
+    picks = benchmark.picks_of(folders["scripted"])  # the farthest bead, onto its own mark
+    assert picks["actions"] == shown["scripted"]["steps"]
+    assert picks["farther"] < 0.15 and picks["place_mm"] < 25
     assert {path.name for folder in folders.values() for path in folder.glob("*.parquet")} == {
         "episode_000000000.parquet"
     }
