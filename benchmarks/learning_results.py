@@ -1,10 +1,9 @@
-"""Checks in what training runs came to: settings, results, tables and curves; of some the policy.
+"""Checks in what training runs came to: settings, results, tables and curves.
 
-    python benchmarks/learning_results.py RUNS... [--share RUN...] [--out FOLDER]
+    python benchmarks/learning_results.py RUNS... [--out FOLDER]
 
-RUNS are evaluated runs, or folders that hold some. `warp-deform report
-benchmarks/results/learning/runs --out OUT` makes the tables again from what is written here.
-Policies of --share are written as by `warp-deform eval RUN --share`, under policies/.
+RUNS are evaluated runs, or folders that hold some. From what is written here, under OUT/runs,
+`warp-deform report OUT/runs` makes the tables again.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from learning.evaluation.share import share_run
 from learning.report.read import read_runs
 from learning.report.report import write_report
 from learning.runs.folder import RunFolder, read_json, write_json
@@ -26,13 +24,10 @@ from learning.training.schedules import preset_schedule
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("runs", nargs="+", type=Path)
-    parser.add_argument("--share", nargs="+", type=Path, default=[], help="runs to hand on")
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/learning"))
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/table"))
     options = parser.parse_args()
     for note in check_in(options.runs, options.out):
         print(note)
-    for path in options.share:
-        share_run(path, options.out / "policies" / path.name)
     report = write_report([options.out / "runs"], options.out)
     print(report.text)
 

@@ -41,6 +41,7 @@ from learning.training.schedules import SCHEDULES
 from learning.training.train import train
 from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.quiet import quiet_warp
+from warp_deform.support.progress import progress_bar
 from warp_deform.support.revision import running_revision
 from warp_deform.tasks.registry import task as find_task
 
@@ -130,7 +131,10 @@ def play(run: RunFolder, step: int, task: str, network: str, options: argparse.N
     if any(all(row[key] == value for key, value in what.items()) for row in rows):
         return
     protocol = Protocol(split="test", episodes=options.episodes)
-    shown = evaluate_snapshot(run, step, protocol).summary
+    bar = progress_bar(f"play {task}, {network}, step {step}", options.episodes, unit="episodes")
+    with bar as advance:
+        played = evaluate_snapshot(run, step, protocol, on_episode=lambda _: advance())
+    shown = played.summary
     row = {
         **what,
         "agent": agent_of(task),

@@ -16,8 +16,8 @@ import documented_values as values
 
 from learning.evaluation.clustered import clustered_mean, clustered_rate
 
-REPORT = "benchmarks/results/learning/report.csv"
-CELL = f"{REPORT}[task=cable-shape,agent=transporter,demos=100,variant=fast]"
+REPORT = "benchmarks/results/table/report.csv"
+CELL = f"{REPORT}[task=cable-shape,agent=transporter,demos=100,variant~patience]"
 PERCENT = "table_percent 1.96*table_percent_standard_error"
 
 
@@ -104,9 +104,9 @@ def test_a_command_speaks_for_its_section_and_a_comment_for_its_paragraph() -> N
     assert kinds("3 ms, see `warp-deform bench`.") == ["command"]
     assert kinds("3 ms, `benchmarks/physics.py`.\n\n## Next\n\n4 ms") == ["command", "bare"]
     source = f"<!-- from: {CELL} n_success n_episodes -->"
-    assert kinds(f"142 / 200\n{source}") == ["compared"]
-    assert kinds(f"142 / 200\n{source}\n\n142 / 200") == ["compared", "bare"]
-    assert kinds(f"Of 20 %, 142 of 200\n<!-- from: -setting {CELL} n_success n_episodes -->") == [
+    assert kinds(f"122 / 200\n{source}") == ["compared"]
+    assert kinds(f"122 / 200\n{source}\n\n122 / 200") == ["compared", "bare"]
+    assert kinds(f"Of 20 %, 122 of 200\n<!-- from: -setting {CELL} n_success n_episodes -->") == [
         "setting",
         "compared",
     ]
@@ -115,17 +115,17 @@ def test_a_command_speaks_for_its_section_and_a_comment_for_its_paragraph() -> N
 @pytest.mark.parametrize(
     ("text", "expressions"),
     [
-        ("142 / 201", "n_success n_episodes"),
-        ("141 / 200", "n_success n_episodes"),
-        ("200 of 142", "n_success n_episodes"),
-        ("90.3 ± 2.7", PERCENT),
-        ("90.4 ± 2.6", PERCENT),
-        ("90.3 ± 2.6", f"{PERCENT}+0.1"),
-        ("90.3 ± 2.6", "table_percent"),
-        ("90.3 ± 2.6", f"{PERCENT} n_success"),
-        ("90.3 ± 2.6", "table_percent nothing"),
-        ("90.3 ± 2.6", "table_percent failures_physics/failures_physics"),
-        ("90.3 ± 2.6", "table_percent __import__('os')"),
+        ("122 / 201", "n_success n_episodes"),
+        ("121 / 200", "n_success n_episodes"),
+        ("200 of 122", "n_success n_episodes"),
+        ("87.5 ± 2.8", PERCENT),
+        ("87.6 ± 2.7", PERCENT),
+        ("87.5 ± 2.7", f"{PERCENT}+0.1"),
+        ("87.5 ± 2.7", "table_percent"),
+        ("87.5 ± 2.7", f"{PERCENT} n_success"),
+        ("87.5 ± 2.7", "table_percent nothing"),
+        ("87.5 ± 2.7", "table_percent failures_physics/failures_physics"),
+        ("87.5 ± 2.7", "table_percent __import__('os')"),
     ],
 )
 def test_what_a_file_does_not_say_is_found(text: str, expressions: str) -> None:
