@@ -1,11 +1,11 @@
 """What a distillation came to: a row of numbers for the documentation.
 
-    python benchmarks/distill.py TASK --minutes M --work FOLDER [--episodes N] [--seed S]
-                                 [--out FILE]
+    python benchmarks/distill.py TASK --minutes M --work FOLDER [--teacher T] [--episodes N]
+                                 [--seed S] [--out FILE]
 
 Distills into FOLDER as `warp-deform distill` does, or goes on there, and adds a row to FILE unless
-it holds one of the same task, budget, seed and number of test episodes. The commit is that of the
-code that trained.
+it holds one of the same task, teacher, budget, seed and number of test episodes. The commit is that
+of the code that trained.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from learning.distillation.distill import DistillConfig, distill
 from learning.runs.folder import RunFolder
 
 RESULTS = Path("benchmarks/results/distill.jsonl")
-_ASKED = ("task", "minutes", "seed", "n_episodes")
+_ASKED = ("task", "teacher", "minutes", "seed", "n_episodes")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("task")
     parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--teacher", default="mpc")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--work", type=Path, required=True)
@@ -36,6 +37,7 @@ def main() -> None:
         DistillConfig(
             task=options.task,
             minutes=options.minutes,
+            teacher=options.teacher,
             seed=options.seed,
             episodes=options.episodes,
             out=options.work,
