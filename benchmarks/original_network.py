@@ -9,9 +9,9 @@ rotation in training, as the tasks have one when acting: all rotations cost more
 that is asked. `fast` is the preset of that name for all of its 4,000 steps. Data are those of
 `demo TASK -n 100`, in DATA/TASK; where they are missing, they are made.
 
-Training goes on where it was and is broken off, at a stored state, after so many CPU minutes of
-this call. Then every snapshot without a line in OUT plays the same test episodes; none is chosen.
-A line has the CPU time of training that led there, a fresh row for every snapshot. With --plot
+Training goes on from its last stored state (one every 100 steps), and is interrupted after so many
+CPU minutes of this call. Then every snapshot without a line in OUT plays the same test episodes;
+none is chosen. A line has the CPU time of the training that led to its snapshot. With --plot
 nothing is trained or played, and OUT is drawn.
 """
 
