@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,9 +51,22 @@ def test_the_original_is_the_papers_and_begins_as_a_whole_training_would() -> No
     assert plan.snapshot_steps() == benchmark.ORIGINAL_STEPS
 
 
+def test_ctrl_c_ends_the_program_and_not_only_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pressed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(benchmark, "collect", lambda _: None)
+    monkeypatch.setattr(benchmark, "train", pressed)
+    options = Namespace(data=tmp_path, demos=1, steps=None, work=tmp_path, minutes=1.0)
+    with pytest.raises(KeyboardInterrupt):
+        benchmark.trained("cable-shape", "fast", options)
+
+
 def test_an_interrupt_comes_after_cpu_time_and_only_within() -> None:
     began = time.process_time()
-    with pytest.raises(KeyboardInterrupt), benchmark.interrupted_after(0.1):
+    with pytest.raises(benchmark.TimeIsUp), benchmark.interrupted_after(0.1):
         while time.process_time() < began + 30:
             pass
     assert time.process_time() < began + 20
