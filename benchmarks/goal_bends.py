@@ -85,7 +85,7 @@ def main() -> None:
         solved[name] = demonstrated(name, goals)
     for who, outcome in solved.items():
         for row in quarters(turns, outcome):
-            line = json.dumps({"by": who, **row, "commit": running_revision()})
+            line = json.dumps({"by": who, **row, "commit": running_revision().commit})
             print(line, flush=True)
             if arguments.out is not None:
                 with arguments.out.open("a") as file:
