@@ -74,8 +74,11 @@ def main() -> None:
     arguments = parser.parse_args()
     quiet_warp()
     run, protocol = RunFolder(arguments.run), Protocol(split="test", episodes=arguments.episodes)
+    task = run.read_settings()["agent"]["task"]
+    if task != TASK:
+        parser.error(f"{run.path} is a run of {task}; give one of {TASK}")
     folder = goals_for(run, TASK, protocol)
-    assert folder is not None
+    assert folder is not None  # the task is goal-conditioned
     goals = goals_of(folder, protocol, protocol.seeds)
     turns = {seed: turn_deg(np.asarray(goal.targets)) for seed, goal in goals.items()}
     step = int(run.chosen_snapshot().stem.rpartition("_")[2])
