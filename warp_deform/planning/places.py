@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..rendering.pixels import BOUNDS
 from ..robots.primitive import LIFT
 from ..tasks.task import Action, Task
 from .gradients import PLACE, PlaceGradient
@@ -15,7 +14,6 @@ __all__ = ["MOST_GROWTH", "Places"]
 
 MOST_GROWTH = 1e5
 """A gradient whose rollout is more chaotic than that is not used."""
-_LOW, _HIGH = np.array(BOUNDS[:2]).T
 _INSIDE = 1e-3
 """A moved lift stays so far from that at which the next stage begins [m]."""
 
@@ -38,7 +36,7 @@ class Places:
     lifts: bool
 
     def drawn(self, action: Action, rng: np.random.Generator, scale: float = 1.0) -> Action:
-        """The same pick, placed near by; on the table."""
+        """The same pick, placed near by, in view."""
         near = action.copy()
         near[3:5] += rng.normal(0.0, self.spread * scale, 2)
         if near[5] != 0.0:
@@ -48,9 +46,12 @@ class Places:
         return self.limited(near, action)
 
     def limited(self, action: Action, like: Action) -> Action:
-        """`action` with its place on the table and its lift within the stage of `like`."""
+        """`action` with its place in view and its lift within the stage of `like`.
+
+        Where the picture ends, a policy could not be taught to place.
+        """
         inside = action.copy()
-        inside[3:5] = np.clip(inside[3:5], _LOW, _HIGH)
+        inside[3:5] = self.task.grid.in_view(inside[3:5])
         if self.lifts:
             inside[6] = np.clip(inside[6], *self._lifts(float(like[6])))
         return inside

@@ -17,12 +17,14 @@ from warp_deform.planning.follow import Follow
 from warp_deform.planning.gradients import ActionGradients, loss_and_gradients
 from warp_deform.planning.places import Places
 from warp_deform.planning.waypoints import WaypointConfig, Waypoints, _Bend
+from warp_deform.rendering.pixels import SHAPE
 from warp_deform.robots.primitive import Outcome
 from warp_deform.tasks.registry import task
 from warp_deform.worlds import Worlds
 from warp_deform.worlds.loop import play
 
 LINE = "cable-line-notarget"
+FAR = [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)]
 
 
 @pytest.fixture(scope="module")
@@ -351,3 +353,18 @@ def test_waypoints_chain_through_positions_and_times(started):
     assert (
         _Bend.of(replace(base, positions=base.positions * [0, 0, 1]), float(action[6]), 3) is None
     )
+
+
+@pytest.mark.parametrize("name", ["bag-items-1", "cable-ring", "cable-mask-goal"])
+def test_no_place_is_drawn_or_moved_out_of_the_picture(name):
+    """An agent over pictures can be taught no place beyond them: `train` refuses such data."""
+    moves = Places(task=task(name), spread=0.05, turn_spread=0.0, lift_spread=0.0, lifts=False)
+    lift, rng = moves.task.stages[0].lift, np.random.default_rng(0)
+    low, high = moves.task.grid.to_world(np.zeros(2)), moves.task.grid.to_world(np.array(SHAPE) - 1)
+    for corner in (low, high):
+        action = np.array([*corner, 0.0, *corner, 0.0, lift])
+        near = [moves.drawn(action, rng) for _ in range(50)]
+        far = [moves.moved(action, np.array([dx, dy, 0.0, 0.0]), action) for dx, dy in FAR]
+        pixels = moves.task.grid.to_pixel(np.array([each[3:5] for each in near + far]))
+        assert ((pixels >= 0) & (pixels < SHAPE)).all()
+        assert len(np.unique(pixels, axis=0)) > 10, "and not all at the corner"
