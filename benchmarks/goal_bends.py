@@ -5,14 +5,14 @@
 The snapshot of RUN that `eval` chose, or its last one, plays N test episodes; those that it has
 played are not played again. Demonstrators play the same episodes for the same goals. Goals are
 ordered by how far their chain turns: the greatest less the least angle of its tangent, of pieces
-of three beads. A line of FILE is a quarter of them and who played.
+of three beads. A line of FILE is a quarter of them and who played; who plays again has new lines.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from warp_deform.episodes import Goal
 from warp_deform.planning.demonstrators import DEMONSTRATORS, demonstrator
 from warp_deform.quiet import quiet_warp
 from warp_deform.support.revision import running_revision
+from warp_deform.support.whole_file import whole_file
 from warp_deform.worlds.loop import SOLVED, play
 from warp_deform.worlds.worlds import Worlds
 
@@ -61,6 +62,15 @@ def demonstrated(name: str, goals: Mapping[int, Goal]) -> dict[int, bool]:
     return {run.seed: run.ended == SOLVED for _, run in runs}
 
 
+def keep(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows to a file, in place of what it had by the same players."""
+    there = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    players = {row["by"] for row in rows}
+    kept = [row for row in there if row["by"] not in players]
+    with whole_file(path) as file:
+        file.write_text("".join(json.dumps(row) + "\n" for row in [*kept, *rows]))
+
+
 def _nothing(worlds: Worlds, slot: int) -> None:
     return None
 
@@ -86,13 +96,16 @@ def main() -> None:
     solved = {arguments.run.name: {each.seed: each.success for each in played}}
     for name in arguments.demonstrators:
         solved[name] = demonstrated(name, goals)
-    for who, outcome in solved.items():
-        for row in quarters(turns, outcome):
-            line = json.dumps({"by": who, **row, "commit": running_revision().commit})
-            print(line, flush=True)
-            if arguments.out is not None:
-                with arguments.out.open("a") as file:
-                    file.write(line + "\n")
+    commit = running_revision().commit
+    rows = [
+        {"by": who, **row, "commit": commit}
+        for who, outcome in solved.items()
+        for row in quarters(turns, outcome)
+    ]
+    for each in rows:
+        print(json.dumps(each))
+    if arguments.out is not None:
+        keep(arguments.out, rows)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from warp_deform.collecting.workers import single_threaded
 from warp_deform.planning.demonstrators import DEMONSTRATORS, demonstrator
 from warp_deform.quiet import quiet_warp
 from warp_deform.tasks.bag_opening import BagTask
-from warp_deform.tasks.registry import TASKS
+from warp_deform.tasks.registry import FURTHER_TASKS, TASKS
 from warp_deform.tasks.task import Task
 from warp_deform.worlds import Worlds
 from warp_deform.worlds.loop import SLOTS, SOLVED, play
@@ -65,7 +65,7 @@ class Row:
 
 def changed(name: str, settings: dict[str, Any]) -> Task:
     """A task by its name, with attributes, or fields of its configs, changed."""
-    kind = TASKS[name]
+    kind = (TASKS | FURTHER_TASKS)[name]
     values: dict[str, Any] = {}
     for key, value in settings.items():
         first, _, rest = key.partition(".")
@@ -132,7 +132,7 @@ def measure(name: str, by: str, settings: dict[str, Any], first: int, count: int
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("tasks", nargs="*", choices=list(TASKS))
+    parser.add_argument("tasks", nargs="*", choices=[*TASKS, *FURTHER_TASKS])
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", dest="settings")
     parser.add_argument("--by", default="scripted", choices=list(DEMONSTRATORS))
     parser.add_argument("--seeds", type=int, default=48)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from fixtures.places import ROOT
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
-from goal_bends import TASK, demonstrated, quarters, turn_deg
+from goal_bends import TASK, demonstrated, keep, quarters, turn_deg
 
 from warp_deform.collecting.goals import load_goal
 from warp_deform.collecting.make_goals import make_goals
@@ -38,6 +39,16 @@ def test_quarters_hold_every_episode_once_and_the_most_bent_come_last() -> None:
     assert [row["n_success"] for row in rows] == [3, 2, 0, 0]
     edges = [edge for row in rows for edge in (row["least_deg"], row["most_deg"])]
     assert edges == sorted(edges)
+
+
+def test_who_plays_again_has_new_rows_and_others_keep_theirs(tmp_path: Path) -> None:
+    file = tmp_path / "bends.jsonl"
+    for by, solved in (("mpc", 1), ("scripted", 2), ("mpc", 3)):
+        keep(file, [{"by": by, "quarter": k, "n_success": solved} for k in (1, 2)])
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [(row["by"], row["n_success"]) for row in rows] == [("scripted", 2)] * 2 + [
+        ("mpc", 3)
+    ] * 2
 
 
 def test_a_demonstrator_plays_for_the_goals_that_it_is_given(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from fixtures.evaluated_runs import AGENT, LINE, PLAYED_TOO, RING, SCHEDULE, result, write_run
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from learning.evaluation.paper_results import read_paper
 from learning.policy.policy import AGENTS
@@ -280,6 +282,26 @@ def test_every_variant_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(Axes, "errorbar", lambda axes, *_, label, **__: drawn.append(label))
     draw_curves(cells(tmp_path), read_paper(), tmp_path)
     assert len(set(drawn)) == 9
+
+
+def test_the_legend_covers_no_curve_and_tells_all_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    long = "goals that were given by hand, a long name"
+    for number, (goals, demos) in enumerate(product(("end", long, "own", "none"), (1, 10, 100))):
+        write_run(tmp_path / str(number), goals=goals, demos=demos)
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    draw_curves(cells(tmp_path), read_paper(), tmp_path)
+    assert len(figures) == 2
+    for figure in figures:
+        figure.draw_without_rendering()
+        (axes,), (legend,) = figure.axes, figure.legends
+        box = legend.get_window_extent()
+        assert box.y1 <= axes.get_tightbbox().y0
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.x1
+    lines = figures[0].axes[0].lines
+    assert len({(str(each.get_color()), each.get_marker()) for each in lines}) == 12
 
 
 def test_folders_without_results(tmp_path: Path) -> None:
