@@ -2,11 +2,14 @@
 
     python benchmarks/hardness.py fabric-flat --set overshoot=0.03 fabric.structural_stiffness=100
     python benchmarks/hardness.py bag-items-1 --set pushes=4 bag.ring_stiffness=60 --out F
+    python benchmarks/hardness.py cable-mask-goal --misplace 4
 
 Every --set changes an attribute of the task, one of its frozen configs after a dot; none measures
-the task as it is. Several tasks get the same changes. Plays whole episodes, eight side by side, on
-training seeds from 20,000 up, and prints a line a task: the success, the actions of the successes,
-how the starts score, and for bags how far they are open at the start and what the actions were for.
+the task as it is. Several tasks get the same changes. With --misplace, every place is off by a
+Gaussian in x and in y: how exactly a policy has to place. Plays whole episodes, eight side by
+side, on training seeds from 20,000 up, and prints a line a task: the success, the actions of the
+successes, how the starts score, and for bags how far they are open at the start and what the
+actions were for.
 With --out, rows are added to a file of JSON lines, and settings that are in it are not measured
 again.
 """
@@ -16,6 +19,7 @@ from __future__ import annotations
 import argparse
 import ast
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,9 +32,9 @@ from warp_deform.planning.demonstrators import DEMONSTRATORS, demonstrator
 from warp_deform.quiet import quiet_warp
 from warp_deform.tasks.bag_opening import BagTask
 from warp_deform.tasks.registry import FURTHER_TASKS, TASKS
-from warp_deform.tasks.task import Task
+from warp_deform.tasks.task import Action, Task
 from warp_deform.worlds import Worlds
-from warp_deform.worlds.loop import SLOTS, SOLVED, play
+from warp_deform.worlds.loop import SLOTS, SOLVED, Act, EpisodeRun, play
 
 FIRST = 20_000
 """First of the training seeds on which settings are chosen."""
@@ -61,6 +65,8 @@ class Row:
     """Mean actions of each stage in the successes; None where a task has one stage."""
     ends: dict[str, int]
     """How episodes ended."""
+    misplace_mm: float = 0.0
+    """Standard deviation of the places' errors in x and in y [mm]."""
 
 
 def changed(name: str, settings: dict[str, Any]) -> Task:
@@ -85,7 +91,25 @@ def words(settings: dict[str, Any]) -> str:
     return "; ".join(f"{name}={text}" for name, text in texts.items()) or "nothing"
 
 
-def measure(name: str, by: str, settings: dict[str, Any], first: int, count: int) -> Row:
+def misplacing(act: Act[Any], misplace_mm: float) -> Act[Any]:
+    """Who acts as `act`, but places beside where it meant to, within view."""
+
+    def beside(worlds: Worlds, runs: Mapping[int, EpisodeRun[Any]]) -> dict[int, Action | None]:
+        actions = act(worlds, runs)
+        for slot, action in actions.items():
+            if action is not None:
+                error = runs[slot].rng.normal(0.0, misplace_mm / 1000, 2)
+                moved = action.copy()
+                moved[3:5] = worlds.task.grid.in_view(action[3:5] + error)
+                actions[slot] = moved
+        return actions
+
+    return beside if misplace_mm else act
+
+
+def measure(
+    name: str, by: str, settings: dict[str, Any], first: int, count: int, misplace_mm: float = 0.0
+) -> Row:
     """Play every seed once."""
     with single_threaded():
         task = changed(name, settings)
@@ -100,7 +124,8 @@ def measure(name: str, by: str, settings: dict[str, Any], first: int, count: int
                     openings.append(task.opening(episode.snapshot))
             return observe(worlds, slot)
 
-        for slot, run in play(worlds, range(first, first + count), act=demonstrator(by), look=look):
+        act = misplacing(demonstrator(by), misplace_mm)
+        for slot, run in play(worlds, range(first, first + count), act=act, look=look):
             runs.append(run)
             inside = worlds.enclosed(slot) if run.rows else None
             enclosed.append(None if inside is None else inside and run.ended == SOLVED)
@@ -127,6 +152,7 @@ def measure(name: str, by: str, settings: dict[str, Any], first: int, count: int
         opening=float(np.median(openings)) if openings else None,
         stages_solved=stages,
         ends={end: ends.count(end) for end in sorted(set(ends))},
+        misplace_mm=misplace_mm,
     )
 
 
@@ -137,6 +163,7 @@ def main() -> None:
     parser.add_argument("--by", default="scripted", choices=list(DEMONSTRATORS))
     parser.add_argument("--seeds", type=int, default=48)
     parser.add_argument("--first", type=int, default=FIRST, help="first seed")
+    parser.add_argument("--misplace", type=float, default=0.0, metavar="MM")
     parser.add_argument("--out", type=Path, help="file of JSON lines to which rows are added")
     options = parser.parse_args()
     quiet_warp()
@@ -146,8 +173,12 @@ def main() -> None:
     if options.out and options.out.exists():
         known = [Row(**json.loads(line)) for line in options.out.read_text().splitlines()]
     for name in options.tasks:
-        key = (name, options.by, settings, options.first, options.seeds)
-        old = [r for r in known if (r.task, r.by, r.settings, r.first_seed, r.attempts) == key]
+        key = (name, options.by, settings, options.first, options.seeds, options.misplace)
+        old = [
+            r
+            for r in known
+            if (r.task, r.by, r.settings, r.first_seed, r.attempts, r.misplace_mm) == key
+        ]
         row = old[0] if old else measure(*key)
         print(_line(row), flush=True)
         if options.out and not old:
@@ -157,7 +188,8 @@ def main() -> None:
 
 def _line(row: Row) -> str:
     rate = 100 * row.successes / row.attempts
-    line = f"{row.task} {row.by} {row.changed}: {row.successes}/{row.attempts} = {rate:.1f} %"
+    what = f"{row.changed}, places {row.misplace_mm:g} mm off" if row.misplace_mm else row.changed
+    line = f"{row.task} {row.by} {what}: {row.successes}/{row.attempts} = {rate:.1f} %"
     if row.mean_actions_solved is not None:
         line += f", {row.mean_actions_solved:.2f} +- {row.deviation_solved:.2f} actions"
         line += f" (median {row.median_actions_solved:g})"

@@ -209,6 +209,7 @@ def row_of(cell: Cell, steps: int, folder: Path, runs: Path) -> dict[str, Any]:
         "labels": shown["steps"],
         "demonstrated_score": shown["mean_score"],
         "n_success": test["n_success"],
+        "n_success_enclosed": test["n_success_enclosed"],
         "n_episodes": test["n_episodes"],
         "score": test["mean_score"],
         "score_error": test["standard_error"],

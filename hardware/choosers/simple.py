@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -117,7 +118,8 @@ class RandomChooser:
 class ScriptedChooser:
     """The scripted demonstrator of the simulated task on the twin's true state.
 
-    It takes the bead farthest from its target, across the chain, and brings it there.
+    Of a few beads it takes the farthest from its target, across the chain, and brings it there;
+    others where those were missed.
 
     Args:
         look: tells the true state
@@ -140,7 +142,9 @@ class ScriptedChooser:
         beads = self._look().beads
         snapshot = still_chain(beads - [0.0, 0.0, float(beads[:, 2].min())])
         rng = np.random.default_rng(0)  # asked for by the protocol; this demonstrator draws nothing
-        for move in self._task.candidates(self._layout, snapshot, rng, len(beads)):
+        moves = self._task.demonstrated_moves(self._layout, snapshot)
+        others = self._task.candidates(self._layout, snapshot, rng, len(beads))
+        for move in chain(moves, others):
             action = to_action(move)
             if not self._failed_picks.includes(seen, action):
                 self._failed_picks.chose(action)

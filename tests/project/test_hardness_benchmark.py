@@ -37,8 +37,18 @@ def test_what_is_changed_is_what_is_played() -> None:
     assert row.changed == "position_tolerance=0" and row.ends == {"not solved": 4}
 
 
+def test_misplaced_things_lie_beside_their_places() -> None:
+    """The block may lie 1 cm off."""
+    rows = [hardness.measure("block-notarget", "scripted", {}, 20_000, 4, mm) for mm in (0.5, 60.0)]
+    assert [row.successes for row in rows] == [4, 0]
+    assert [row.misplace_mm for row in rows] == [0.5, 60.0] and rows[0].changed == "nothing"
+
+
 def test_rows_that_are_published_say_what_was_changed() -> None:
     rows = [hardness.Row(**json.loads(line)) for line in PUBLISHED.read_text().splitlines()]
     assert all(row.changed == hardness.words(row.settings) for row in rows)
-    keys = [(row.task, row.by, row.changed, row.first_seed, row.attempts) for row in rows]
+    keys = [
+        (row.task, row.by, row.changed, row.first_seed, row.attempts, row.misplace_mm)
+        for row in rows
+    ]
     assert len(set(keys)) == len(keys)

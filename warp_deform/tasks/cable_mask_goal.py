@@ -75,6 +75,8 @@ class CableMaskGoal(Task):
     grid = PixelGrid((0.335 + 0.001875 / 2, -0.30 + 0.001875 / 2), 0.001875)
     goal_bend: ClassVar[tuple[float, float]] = (0.0, 1.2)
     """Least and greatest bend of a goal, see `curved_chain`."""
+    grips: ClassVar[int] = 5
+    """Beads that the demonstrator takes, spread evenly over the chain."""
     randomised: ClassVar[bool] = True
     """Whether masks and physics differ between episodes."""
 
@@ -147,19 +149,24 @@ class CableMaskGoal(Task):
     def demonstrate(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator
     ) -> Action | None:
-        """Take the bead farthest from its target, across the chain, and bring it there.
+        """Take of `grips` beads the farthest from its target, across the chain, and bring it there.
 
         Beads that the open fingers cannot come down on without touching other parts of the chain
         are left for later, unless there are no others.
         """
-        return next(self._moves(layout, snapshot))
+        return next(self.demonstrated_moves(layout, snapshot))
+
+    def demonstrated_moves(self, layout: Layout, snapshot: Snapshot) -> Iterator[Action]:
+        """What `demonstrate` would do, and what in its place where that cannot be done."""
+        spread = np.linspace(_ENDS, self.cable.beads - 1 - _ENDS, self.grips)
+        return self._moves(layout, snapshot, np.round(spread).astype(int))
 
     def candidates(
         self, layout: Layout, snapshot: Snapshot, rng: np.random.Generator, count: int
     ) -> list[Action]:
-        """The moves that `demonstrate` would choose from, of beads well apart from each other."""
+        """Moves of any beads, well apart from each other, the farthest from its target first."""
         chosen: list[Action] = []
-        for move in self._moves(layout, snapshot):
+        for move in self._moves(layout, snapshot, np.arange(self.cable.beads)):
             gaps = [np.linalg.norm(move[:2] - other[:2]) for other in chosen]
             if all(gap > _APART for gap in gaps):
                 chosen.append(move)
@@ -167,13 +174,17 @@ class CableMaskGoal(Task):
                 break
         return chosen
 
-    def _moves(self, layout: Layout, snapshot: Snapshot) -> Iterator[Action]:
-        """Moves of graspable beads, then of the others; of either the farthest from its target."""
+    def _moves(self, layout: Layout, snapshot: Snapshot, beads: np.ndarray) -> Iterator[Action]:
+        """Moves of graspable beads, then of the others; of either the farthest from its target.
+
+        Args:
+            beads: which may be taken (n,) int
+        """
         q = snapshot.particle_q[:, :2].astype(float)
         ways = (layout.targets, layout.targets[::-1])
         distances = [np.linalg.norm(q - way, axis=1) for way in ways]
         better = int(np.argmin([d.mean() for d in distances]))
-        order = np.argsort(-distances[better], kind="stable")
+        order = beads[np.argsort(-distances[better][beads], kind="stable")]
         moves = [self.action(q, ways[better], int(bead)) for bead in order]
         free = [self.graspable(snapshot.particle_q, move) for move in moves]
         for wanted in (True, False):
