@@ -75,8 +75,6 @@ class CableMaskGoal(Task):
     grid = PixelGrid((0.335 + 0.001875 / 2, -0.30 + 0.001875 / 2), 0.001875)
     goal_bend: ClassVar[tuple[float, float]] = (0.0, 1.2)
     """Least and greatest bend of a goal, see `curved_chain`."""
-    grips: ClassVar[int] = 5
-    """Beads that the demonstrator takes, spread evenly over the chain."""
     randomised: ClassVar[bool] = True
     """Whether masks and physics differ between episodes."""
 
@@ -155,6 +153,11 @@ class CableMaskGoal(Task):
         are left for later, unless there are no others.
         """
         return next(self.demonstrated_moves(layout, snapshot))
+
+    @property
+    def grips(self) -> int:
+        """Beads that the demonstrator takes, spread evenly over the chain."""
+        return 5
 
     def demonstrated_moves(self, layout: Layout, snapshot: Snapshot) -> Iterator[Action]:
         """What `demonstrate` would do, and what in its place where that cannot be done."""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import warp_deform  # noqa: F401  registers the ids
 from learning.data.augmentation import RigidTransform, draw_transform, move_actions, move_states
-from warp_deform.collecting.recording import observe, record
+from warp_deform.collecting.recording import observe, record, task_config
 from warp_deform.episodes import EpisodeReader, EpisodeWriter
 from warp_deform.planning.demonstrators import demonstrator
 from warp_deform.rendering.pixels import SHAPE, TABLE_GRID
@@ -26,6 +26,7 @@ from warp_deform.tasks.metrics import mask_iou
 from warp_deform.tasks.registration import env_id
 from warp_deform.tasks.registry import FURTHER_TASKS, TASKS
 from warp_deform.tasks.registry import task as find_task
+from warp_deform.tasks.task import Snapshot
 from warp_deform.worlds import Worlds
 from warp_deform.worlds.loop import SOLVED, play
 from warp_deform.worlds.spaces import action_space, information, observation, observation_space
@@ -204,6 +205,22 @@ def test_the_demonstrator_solves_most_of_twenty_seeds(tmp_path: Path) -> None:
     assert 3.0 < np.mean([len(run.actions) for run in solved]) < 8.0
     outcomes = [outcome for run in runs.values() for outcome in run.outcomes]
     assert outcomes.count("placed") > 0.9 * len(outcomes)
+
+
+def test_the_demonstrator_takes_the_farthest_of_five_beads_and_candidates_any() -> None:
+    fewer = type("Fewer", (CableMaskGoal,), {"grips": 3})()
+    away = STRAIGHT[:, :2].copy()
+    away[:, 0] += np.interp(np.arange(90), [0, 30, 89], [0.01, 0.09, 0.01])
+    layout = replace(TASK.sample(np.random.default_rng(0), None), targets=away)
+    still = np.zeros_like(STRAIGHT), np.zeros((0, 7)), np.zeros((0, 6))
+    snapshot = Snapshot(STRAIGHT, *still, (), lambda: None)
+    rng = np.random.default_rng(0)
+    taken = [task.demonstrate(layout, snapshot, rng) for task in (TASK, fewer)]
+    beads = [int(np.argmin(np.linalg.norm(STRAIGHT[:, :2] - a[:2], axis=1))) for a in taken]
+    assert beads == [23, 44] and "grips" not in task_config(TASK), "goals do not depend on it"
+    first = TASK.candidates(layout, snapshot, rng, 8)[0]
+    assert int(np.argmin(np.linalg.norm(STRAIGHT[:, :2] - first[:2], axis=1))) == 30
+    assert len(list(TASK.demonstrated_moves(layout, snapshot))) == 5
 
 
 def test_the_demonstrator_goes_across_the_chain_and_keeps_fingers_off_it() -> None:
