@@ -11,7 +11,7 @@ The score compares true masks.
 
 Source: Seita et al., ICRA 2021, section on physical experiments. The paper's demonstrations and
 goals were made by hand; here goals are smooth curves, and the scripted demonstrator is that of the
-simulated cable tasks.
+simulated cable tasks, but takes one of a few beads.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ class CableMaskGoal(Task):
         """Take of `grips` beads the farthest from its target, across the chain, and bring it there.
 
         Beads that the open fingers cannot come down on without touching other parts of the chain
-        are left for later, unless there are no others.
+        are left for later, unless all of these are such.
         """
         return next(self.demonstrated_moves(layout, snapshot))
 

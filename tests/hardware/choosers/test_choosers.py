@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -140,6 +141,20 @@ def test_the_scripted_and_the_planned_action_approach_the_goal(tmp_path: Path) -
         ways = [np.linalg.norm(after - targets[::way], axis=1).mean() for way in (1, -1)]
         assert min(ways) < 0.9 * 0.07
         assert replay_recording(folder).mismatches == 0
+
+
+def test_the_scripted_chooser_takes_the_demonstrators_beads_and_others_where_those_fail() -> None:
+    beads = chain(0.45)
+    beads[:, 2] -= beads[:, 2].min()
+    targets = beads[:, :2] + 0.05 * np.sin(np.linspace(0.3, 2.0, 90))[:, None] * [1.0, 0.0]
+    chooser = ScriptedChooser(lambda: SimpleNamespace(beads=beads), targets)
+    mask = TASK.mask(beads)
+    still = Observation(0, np.zeros((320, 160, 3), np.uint8), mask, None, None, ())
+    asked = [chooser.choose(still) for _ in range(8)]
+    layout = Layout(np.zeros((0, 3)), np.zeros((0, 7)), targets)
+    moves = TASK.demonstrated_moves(layout, still_chain(beads))
+    assert asked[:5] == [to_action(move) for move in moves]
+    assert None not in asked and len({each.pick_xy for each in asked}) == 8
 
 
 def test_an_environments_action_loses_its_lift() -> None:
