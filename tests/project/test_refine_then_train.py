@@ -53,7 +53,7 @@ def test_cells_have_one_line_each_and_no_gradient_where_there_is_none(
         return {"failed": [{"run": "x", "error": "y"}] if len(grids) == 1 else []}
 
     test = {"n_success": 3, "n_episodes": 4, "mean_score": 0.7, "standard_error": 0.1,
-            "paper_value": 75.0, "mean_actions": 5.0}  # fmt: skip
+            "n_success_enclosed": None, "paper_value": 75.0, "mean_actions": 5.0}  # fmt: skip
     run = Namespace(agent="transporter", info={"test": test, "training_cpu_seconds": 1.0})
     demos = write_demonstrations(tmp_path / "demos" / "cable-ring", 2)
     monkeypatch.setattr(benchmark, "demonstrate", lambda *_: demos)
