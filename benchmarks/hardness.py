@@ -166,6 +166,8 @@ def main() -> None:
     parser.add_argument("--misplace", type=float, default=0.0, metavar="MM")
     parser.add_argument("--out", type=Path, help="file of JSON lines to which rows are added")
     options = parser.parse_args()
+    if not 0 <= options.misplace < np.inf:
+        parser.error(f"--misplace is {options.misplace}; give 0 mm or more")
     quiet_warp()
     pairs = (pair.partition("=") for pair in options.settings)
     settings = {name: ast.literal_eval(value) for name, _, value in pairs}
