@@ -1,12 +1,14 @@
 """Where a chain's beads lie, estimated from a mask alone.
 
 The mask is thinned to a line one pixel wide, which is cut where strands meet; the pieces are then
-linked end to end into one open chain, each time the link that is shortest and turns least. Beads
-are spread evenly along it. So of two strands that cross, each goes straight on. What a mask does
-not show, which strand lies on top and what is hidden where strands lie side by side, is a guess.
+linked end to end into one open chain, in the order whose links together are shortest and turn
+least. A link over the mask, where another strand may hide this one, counts less than one over bare
+ground. Beads are spread evenly along the chain. So of two strands that cross, each goes straight
+on. What a mask does not show, which strand lies on top and what is hidden where strands lie side by
+side, is a guess.
 
-Source of the thinning: Zhang and Suen, "A fast parallel algorithm for thinning digital patterns",
-1984.
+Sources: of the thinning, Zhang and Suen, "A fast parallel algorithm for thinning digital patterns",
+1984; of the order, Held and Karp, "A dynamic programming approach to sequencing problems", 1962.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ from .top_down_view import TopDownView
 __all__ = ["estimate_chain"]
 
 _REACH = 7  # [px] of a piece that tell where its end points
-_SHORT = 5  # [px]: a shorter piece with a free end is a spur of the thinning
+_SHORT = 5  # [px]: a shorter piece, a spur of the thinning or a speck, has no direction
+_MOST = 10  # pieces that are put in order, the longest: the time doubles with each
+_COVERED = 0.2  # of the length of a link that lies on the mask
 _TURN = 12.0  # [px] that a link turning back costs more than one going straight on
 _WIDE = 2  # [px] of a thin line across, at its corners
 _EATEN = 8  # [px] of an end at most
@@ -36,7 +40,7 @@ def estimate_chain(mask: np.ndarray, view: TopDownView, beads: int) -> np.ndarra
     pieces = _pieces(_thinned(mask))
     if not pieces:
         return None
-    line = _joined(pieces)
+    line = _joined(pieces, mask)
     if len(line) < 2:
         return None
     for _ in range(2):
@@ -89,14 +93,7 @@ def _pieces(thin: np.ndarray) -> list[np.ndarray]:
     lone = thin & ~cv2.dilate(meeting, np.ones((3, 3), np.uint8)).astype(bool)
     number, labels = cv2.connectedComponents(lone.astype(np.uint8), connectivity=8)
     pieces = [_walked(np.argwhere(labels == i)) for i in range(1, number)]
-    near = cv2.dilate(meeting, np.ones((7, 7), np.uint8)).astype(bool)
-
-    def spur(piece: np.ndarray) -> bool:
-        ends = near[tuple(piece[0])], near[tuple(piece[-1])]
-        return len(piece) < _SHORT and not all(ends)
-
-    without_spurs = [piece for piece in pieces if not spur(piece)]
-    return without_spurs or pieces
+    return [piece for piece in pieces if len(piece) >= _SHORT] or pieces
 
 
 def _walked(pixels: np.ndarray) -> np.ndarray:
@@ -121,28 +118,42 @@ def _steps(neighbours: np.ndarray, start: int) -> np.ndarray:
     return steps
 
 
-def _joined(pieces: list[np.ndarray]) -> np.ndarray:
-    """One line (n, 2) through all pieces, smoothed."""
-    lines = [piece.astype(float) for piece in pieces]
-    while len(lines) > 1:
-        best = min(
-            (
-                (_cost(lines[i][:: 1 if a else -1], lines[j][:: 1 if b else -1]), i, a, j, b)
-                for i, j in itertools.combinations(range(len(lines)), 2)
-                for a in (True, False)
-                for b in (True, False)
-            ),
-            key=lambda link: link[0],
-        )
-        _, i, a, j, b = best
-        whole = np.concatenate([lines[i][:: 1 if a else -1], lines[j][:: 1 if b else -1]])
-        lines = [line for k, line in enumerate(lines) if k not in (i, j)] + [whole]
-    line = lines[0]
+def _joined(pieces: list[np.ndarray], mask: np.ndarray) -> np.ndarray:
+    """One line (n, 2) through the pieces, smoothed."""
+    longest = sorted(pieces, key=len)[-_MOST:]
+    line = np.concatenate(_in_order([piece.astype(float) for piece in longest], mask))
     padded = np.pad(line, ((_SMOOTH // 2, _SMOOTH // 2), (0, 0)), mode="edge")
     kernel = np.full(_SMOOTH, 1.0 / _SMOOTH)
     smooth = np.stack([np.convolve(padded[:, k], kernel, mode="valid") for k in range(2)], axis=1)
     smooth[[0, -1]] = line[[0, -1]]
     return smooth
+
+
+def _in_order(lines: list[np.ndarray], mask: np.ndarray) -> list[np.ndarray]:
+    """Lines in the order, each in the direction, in which linking them all costs least."""
+    ways = [(k, line[::sense]) for k, line in enumerate(lines) for sense in (1, -1)]
+    costs = np.full((len(ways), len(ways)), np.inf)
+    for (i, (k, first)), (j, (other, second)) in itertools.permutations(enumerate(ways), 2):
+        if k != other:
+            costs[i, j] = _cost(first, second, mask)
+    # by set of lines, as bits, and by the way that comes last: least cost and the way before it
+    bits = np.array([1 << k for k, _ in ways])
+    least = np.full((1 << len(lines), len(ways)), np.inf)
+    before = np.full(least.shape, -1)
+    least[bits, np.arange(len(ways))] = 0.0
+    for done in range(1, len(least)):
+        through = least[done][:, None] + costs
+        nearest = through.argmin(axis=0)
+        for way in np.flatnonzero((bits & done) == 0):
+            more, cost = done | bits[way], through[nearest[way], way]
+            if cost < least[more, way]:
+                least[more, way], before[more, way] = cost, nearest[way]
+    left, last = len(least) - 1, int(least[-1].argmin())
+    order = []
+    while last >= 0:
+        order.append(ways[last][1])
+        left, last = left ^ int(bits[last]), int(before[left, last])
+    return order[::-1]
 
 
 def _prolonged(line: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -159,7 +170,7 @@ def _prolonged(line: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.concatenate([line, further]) if further else line
 
 
-def _cost(first: np.ndarray, second: np.ndarray) -> float:
+def _cost(first: np.ndarray, second: np.ndarray, mask: np.ndarray) -> float:
     """What it costs [px] to go on from the end of one line to the beginning of another."""
     leaving = first[-1] - first[max(len(first) - 1 - _REACH, 0)]
     arriving = second[min(_REACH, len(second) - 1)] - second[0]
@@ -168,7 +179,15 @@ def _cost(first: np.ndarray, second: np.ndarray) -> float:
     turns = 1.0 - _cosine(leaving, arriving)
     # a short gap's own direction is that of the pixels' grid
     aside = (2.0 - _cosine(leaving, gap) - _cosine(gap, arriving)) * min(length / 6.0, 1.0)
-    return length + _TURN * (0.5 * turns + 0.5 * aside)
+    bare = 1.0 - (1.0 - _COVERED) * _covered(first[-1], second[0], mask)
+    return bare * length + _TURN * (0.5 * turns + 0.5 * aside)
+
+
+def _covered(start: np.ndarray, end: np.ndarray, mask: np.ndarray) -> float:
+    """What part of the straight line between two pixels lies on the mask."""
+    steps = max(int(np.linalg.norm(end - start)), 1)
+    pixels = np.rint(np.linspace(start, end, steps + 1)).astype(int)
+    return float(mask[tuple(pixels.T)].mean())
 
 
 def _cosine(a: np.ndarray, b: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""Who chooses: chance, the true state, a planner, a person; and the chain found in a mask."""
+"""Who chooses: chance, the true state, a planner, a person."""
 
 from __future__ import annotations
 
@@ -33,8 +33,6 @@ from hardware.recordings.replay import replay_recording
 from hardware.twin.camera import SimCamera
 from hardware.twin.robot import SimRobot
 from hardware.twin.twin import CableTwin
-from hardware.vision.chain_from_mask import estimate_chain
-from warp_deform.tasks.chain_shapes import curved_chain
 from warp_deform.tasks.task import Layout
 
 
@@ -76,45 +74,6 @@ def test_random_actions_pick_the_cable_and_stay_inside() -> None:
     assert allowed > 10
     empty = Observation(0, seen.view, np.zeros_like(mask), None, None)
     assert chooser.choose(empty) is None
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_a_chain_is_found_in_its_mask(seed: int) -> None:
-    """Lone strands; which end comes first is open."""
-    rng = np.random.default_rng(seed)
-    beads = curved_chain(rng, TWIN.chain, TASK.x, TASK.y, bend=4.0)[:, :2]
-    found = estimate_chain(TASK.mask(beads), TWIN.view, len(beads))
-    assert found is not None
-    errors = [np.linalg.norm(found[::way] - beads, axis=1).max() for way in (1, -1)]
-    assert min(errors) < 5e-3
-
-
-def test_crossing_strands_go_straight_on_and_a_ring_is_opened() -> None:
-    t = np.linspace(0.0, 1.0, 90)[:, None]
-    # a loop whose ends cross at a right angle
-    angle = (0.25 + 1.5 * t) * np.pi + np.pi
-    loop = np.array([0.48, 0.0]) + 0.05 * np.hstack([np.cos(angle), np.sin(angle)])
-    away = np.linspace(0.002, 0.1, 30)[:, None]
-    ends = [
-        loop[0] - away[::-1] * _unit(loop[1] - loop[0]),
-        loop[-1] + away * _unit(loop[-1] - loop[-2]),
-    ]
-    line = np.concatenate([ends[0], loop, ends[1]])
-    found = estimate_chain(TASK.mask(line), TWIN.view, 90)
-    assert found is not None
-    gaps = np.linalg.norm(np.diff(found, axis=0), axis=1)
-    assert gaps.max() < 1.6 * np.median(gaps), "no jump from strand to strand"
-    tips = {tuple(np.round(found[i], 2)) for i in (0, -1)}
-    assert tips == {tuple(np.round(line[i], 2)) for i in (0, -1)}
-    ring = np.array([0.48, 0.0]) + 0.06 * np.hstack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)])
-    found = estimate_chain(TASK.mask(ring), TWIN.view, 90)
-    assert found is not None
-    np.testing.assert_allclose(np.linalg.norm(found - [0.48, 0.0], axis=1), 0.06, atol=3e-3)
-    assert estimate_chain(np.zeros((320, 160), bool), TWIN.view, 90) is None
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.linalg.norm(v)
 
 
 def test_the_scripted_and_the_planned_action_approach_the_goal(tmp_path: Path) -> None:
