@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from learning.policy.policy import AGENTS
 from learning.report.read import read_runs
 from learning.report.report import write_report
 from learning.runs.folder import RunFolder, read_json, write_json
@@ -44,7 +45,7 @@ def check_in(paths: Sequence[Path], out: Path) -> list[str]:
             run.settings["preset"],
             task=run.task,
             demos=run.demos,
-            sees_state=run.agent.startswith("gt-"),
+            sees=AGENTS[run.agent].sees,
         )
         if steps != usual.steps:
             name += f"-{steps}-steps"

@@ -2,7 +2,7 @@
 
 It needs no demonstrations.
 
-From the mask comes where the beads lie (`chain_from_mask`). A simulated chain is laid there, and
+From the mask comes where the beads lie (`trace_strand`). A simulated chain is laid there, and
 the candidates of the task `cable-mask-goal`, and others around the best, are tried. What counts is
 the overlap with the goal's mask, the distance of the beads from where that mask puts them, and that
 the chain is not bent otherwise than there. Where strands cross the estimate is a guess, so the best
@@ -25,12 +25,12 @@ from warp_deform.planning.lookahead import Lookahead
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.free_space import FreeSpace
 from warp_deform.tasks.metrics import mask_iou
+from warp_deform.tasks.strand_trace import trace_strand
 from warp_deform.tasks.task import Layout, Snapshot
 from warp_deform.worlds.worlds import Worlds
 
 from ..arm.pick_place import PickPlaceAction
 from ..episodes.episode import Observation
-from ..vision.chain_from_mask import estimate_chain
 from ..vision.top_down_view import TopDownView
 from .simple import FailedPicks, to_action
 
@@ -139,10 +139,10 @@ class PlannerChooser:
         assert seen.goal is not None
         self._prepare(seen.goal)
         task = self._task
-        xy = estimate_chain(seen.mask, self._view, task.cable.beads)
-        if xy is None:
+        traced = trace_strand(seen.mask, task.cable.beads)
+        if traced is None:
             return []
-        task.start = stacked(xy, task.cable)
+        task.start = stacked(self._view.pixel_to_base(traced), task.cable)
         self._worlds.reset({0: seen.index}, goals={0: self._aim})
         rng = np.random.default_rng([self._seed, seen.index])
         config = SearchConfig(
@@ -156,14 +156,14 @@ class PlannerChooser:
         if self._goal is not None and np.array_equal(goal, self._goal):
             return
         task = SeenChain(goal, self._view)
-        targets = estimate_chain(goal, self._view, task.cable.beads)
-        if targets is None:
+        traced = trace_strand(goal, task.cable.beads)
+        if traced is None:
             raise InputError("the goal's mask shows no chain; capture it again")
         self._goal, self._task = goal, task
         self._aim = Goal(
             np.repeat(np.where(goal, 255, 0).astype(np.uint8)[..., None], 3, axis=2),
             np.zeros(goal.shape, np.float32),
-            targets,
+            self._view.pixel_to_base(traced),
             kind="demonstrated",
             seed=0,
         )

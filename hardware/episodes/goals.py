@@ -12,10 +12,10 @@ from warp_deform.errors import InputError
 from warp_deform.rendering.strand_mask import strand_mask
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.chain_shapes import curved_chain
+from warp_deform.tasks.strand_trace import trace_strand
 
 from ..cameras.camera import read_image
 from ..support.json_file import write_whole
-from ..vision.chain_from_mask import estimate_chain
 from ..vision.top_down_view import TopDownView
 
 __all__ = ["GoalMask", "read_goal", "sampled_goal", "write_goal", "write_picture"]
@@ -58,7 +58,8 @@ def read_goal(path: Path, view: TopDownView) -> GoalMask:
             f"the goal {path} has {mask.shape} pixels, {np.count_nonzero(mask)} of cable; needed "
             f"is a mask of {view.shape}: capture it with `warp-deform franka capture-goal`"
         )
-    return GoalMask(mask, estimate_chain(mask, view, CableMaskGoal.cable.beads))
+    traced = trace_strand(mask, CableMaskGoal.cable.beads)
+    return GoalMask(mask, None if traced is None else view.pixel_to_base(traced))
 
 
 def write_goal(path: Path, mask: np.ndarray, view: np.ndarray) -> Path:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,15 +15,37 @@ from warp_deform.rendering.pixels import SHAPE
 from warp_deform.tasks.task import Task
 
 from ..models.batch import Batch
-from ..models.gt_state import encode_action
+from ..models.gt_state import GtState, GtState2Step, encode_action
+from ..models.traced import (
+    LEVEL,
+    WAYS,
+    Traced,
+    TracedBatch,
+    TracedConfig,
+    features,
+    matched_traces,
+    turned_over,
+)
 from ..models.transporter import Transporter
 from .augmentation import draw_transform, draw_transforms, move_actions, move_picture, move_states
 from .dataset import Demonstrations
 
-__all__ = ["StateBatch", "check_lifts", "check_view", "image_batch", "state_batch", "task_lifts"]
+__all__ = [
+    "StateBatch",
+    "agent_batch",
+    "check_lifts",
+    "check_view",
+    "image_batch",
+    "state_batch",
+    "task_lifts",
+    "traced_batch",
+]
 
 _LIFT_GAP = 0.015
 """Lifts of one stage may differ by this [m]: a robot lifts 1 cm less to carry over short ways."""
+
+_TRACES = 50_000
+"""Transitions of which the traced cable is kept, 3 kB each."""
 
 StateBatch = tuple[Tensor, Tensor, Tensor]
 """States (B, D), encoded actions (B, 6), lift indices (B,)."""
@@ -60,6 +84,35 @@ def check_view(data: Demonstrations) -> None:
         for action in actions:
             pixels = data.task.grid.to_pixel(np.stack([action[:2], action[3:5]]))
             _check_pixels(pixels, action, what=name)
+
+
+def agent_batch(
+    data: Demonstrations,
+    agent: Transporter | Traced | GtState | GtState2Step,
+    *,
+    transitions: Iterable[tuple[int, int]],
+    rng: np.random.Generator,
+    augment: bool = True,
+    mirror: bool = False,
+    device: torch.device,
+) -> tuple[Any, ...]:
+    """Arguments of an agent's losses: transitions as it sees them, moved by `rng`.
+
+    Raises:
+        InputError: as of the batches below.
+    """
+    if isinstance(agent, Transporter):
+        batch = image_batch(
+            data, agent, transitions=transitions, rng=rng, augment=augment, mirror=mirror
+        )
+        return (batch._replace(image=batch.image.to(device)),)
+    if isinstance(agent, Traced):
+        traced = traced_batch(data, agent, transitions=transitions, rng=rng, augment=augment)
+        return (TracedBatch(*(each.to(device) for each in traced)),)
+    tensors = state_batch(
+        data, agent.config.lifts, transitions=transitions, rng=rng, augment=augment
+    )
+    return tuple(each.to(device) for each in tensors)
 
 
 def image_batch(
@@ -109,6 +162,45 @@ def image_batch(
         torch.tensor(thetas, dtype=torch.float32),
         torch.tensor(lifts),
     )
+
+
+def traced_batch(
+    data: Demonstrations,
+    agent: Traced,
+    *,
+    transitions: Iterable[tuple[int, int]],
+    rng: np.random.Generator,
+    augment: bool = True,
+) -> TracedBatch:
+    """Transitions, mirrored and read from either end by `rng`, as a Traced agent sees them.
+
+    The label is the grip nearest to where the demonstrator picked.
+
+    Raises:
+        InputError: a mask shows no cable.
+    """
+    seen, grips, last = [], [], agent.config.grips - 1
+    for transition in transitions:
+        shown, grip = _traced(data, agent.config, *transition)
+        mirror, back = WAYS[int(rng.integers(len(WAYS)))] if augment else WAYS[0]
+        seen.append(turned_over(torch.from_numpy(shown)[None], mirror, back)[0])
+        grips.append(last - grip if back else grip)
+    return TracedBatch(torch.stack(seen), torch.tensor(grips))
+
+
+@functools.lru_cache(maxsize=_TRACES)
+def _traced(
+    data: Demonstrations, config: TracedConfig, episode: int, t: int
+) -> tuple[np.ndarray, int]:
+    """Features of a transition, and the grip that was taken; tracing takes longer than learning."""
+    transition = data.transition(episode, t)
+    mask, goal = (each[..., 0] > LEVEL for each in (transition.color, transition.goal_color))
+    traces = matched_traces(mask, goal, config.points)
+    if traces is None:
+        raise InputError(f"demonstration {data.seeds[episode]} shows no cable in action {t + 1}")
+    pick = data.task.grid.fractional(transition.action[:2])
+    grip = int(np.linalg.norm(traces[0][config.taken] - pick, axis=1).argmin())
+    return features(*traces), grip
 
 
 def state_batch(

@@ -32,7 +32,7 @@ from warp_deform.tasks.registry import task as find_task
 from ..correction.correct import CorrectConfig, correct
 from ..data.dataset import remove_cache
 from ..evaluation.run import evaluate_run
-from ..policy.policy import AgentDescription
+from ..policy.policy import AGENTS, AgentDescription
 from ..refinement.refine import RefineConfig, refine
 from ..runs.folder import read_json, write_json
 from ..training.config import TrainConfig
@@ -242,7 +242,7 @@ def _training(
     start: Path | None = None,
 ) -> TrainConfig:
     """A training by the preset `fast` that takes all steps, unless all of validation is solved."""
-    usual = preset_schedule("fast", task=config.task, demos=0, sees_state=False)
+    usual = preset_schedule("fast", task=config.task, demos=0, sees=AGENTS[config.learner].sees)
     shares = np.linspace(_FIRST_SHARE, 1.0, snapshots) if snapshots > 1 else (1.0,)
     schedule = replace(
         usual,

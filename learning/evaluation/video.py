@@ -26,6 +26,7 @@ from warp_deform.tasks.registry import task as find_task
 from warp_deform.worlds.loop import EpisodeRun, worlds_for
 from warp_deform.worlds.worlds import Worlds
 
+from ..models.traced import LEVEL, Traced
 from ..policy.policy import ImagePolicy, load_policy
 from ..runs.folder import RunFolder
 from .play import Measures, play_policy
@@ -76,8 +77,12 @@ def heat_maps(
 
     What a `RetryingPolicy` avoids is not left out: this is what the network itself says.
     """
-    agent, config = policy.agent, policy.agent.config
-    goal = None
+    agent = policy.agent
+    if isinstance(agent, Traced):
+        seen = (np.asarray(observation[name]) for name in ("color", "goal_color"))
+        mask, aim = (each[..., 0] > LEVEL for each in seen)
+        return HeatMaps(*agent.heat(mask, aim))
+    config, goal = agent.config, None
     if agent.pictures == 2:
         goal = observation["goal_color"], observation["goal_height"]
     image = agent.image((observation["color"], observation["height"]), goal)[None]

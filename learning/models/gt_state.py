@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -186,6 +186,7 @@ class GtState(nn.Module):
     """
 
     name: ClassVar[str] = "gt-mlp"
+    sees: ClassVar[Literal["pictures", "traces", "state"]] = "state"
 
     def __init__(self, d_state: int, config: GtStateConfig, *, seed: int) -> None:
         super().__init__()
@@ -219,6 +220,7 @@ class GtState2Step(nn.Module):
     """
 
     name: ClassVar[str] = "gt-mlp-2step"
+    sees: ClassVar[Literal["pictures", "traces", "state"]] = "state"
 
     def __init__(self, d_state: int, config: GtStateConfig, *, seed: int) -> None:
         super().__init__()

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -202,6 +202,7 @@ class Transporter(nn.Module):
     """
 
     name: ClassVar[str] = "transporter"
+    sees: ClassVar[Literal["pictures", "traces", "state"]] = "pictures"
     pictures: ClassVar[int] = 1
     """1, or 2 where the goal is seen too."""
     goal_split: ClassVar[bool] = False

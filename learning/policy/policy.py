@@ -21,11 +21,13 @@ import torch
 
 from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE
+from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.metrics import wrap_angle
 from warp_deform.tasks.registry import task as find_task
 
 from ..data.batches import task_lifts
 from ..models.gt_state import GtState, GtState2Step, GtStateConfig
+from ..models.traced import Traced, TracedConfig
 from ..models.transporter import GoalSplit, GoalStack, Transporter, TransporterConfig
 from ..runs.folder import RunFolder, read_snapshot
 from .memory import Memory
@@ -42,14 +44,14 @@ __all__ = [
     "make_agent",
 ]
 
-Agent = Transporter | GtState | GtState2Step
+Agent = Transporter | Traced | GtState | GtState2Step
 
 _LEVELS, _PIXELS = 10, 4
 """A picture has changed if so many colour levels differ in more than so many pixels; a bead of 1 cm
 covers 8."""
 
-AGENTS: dict[str, type[Transporter] | type[GtState] | type[GtState2Step]] = {
-    cls.name: cls for cls in (Transporter, GoalSplit, GoalStack, GtState, GtState2Step)
+AGENTS: dict[str, type[Transporter] | type[Traced] | type[GtState] | type[GtState2Step]] = {
+    cls.name: cls for cls in (Transporter, GoalSplit, GoalStack, Traced, GtState, GtState2Step)
 }
 """The agents by the names of the command line."""
 
@@ -59,7 +61,7 @@ class AgentDescription:
     """All that it takes to build an agent but its weights.
 
     Attributes:
-        config: fields of its `TransporterConfig` or `GtStateConfig`
+        config: fields of its `TransporterConfig`, `TracedConfig` or `GtStateConfig`
         state_size: length of the ground truth, for agents that see it
     """
 
@@ -73,6 +75,11 @@ class AgentDescription:
         if self.agent not in AGENTS:
             raise InputError(f"there is no agent {self.agent!r}; there are: {', '.join(AGENTS)}")
         cls = AGENTS[self.agent]
+        if issubclass(cls, Traced) and not isinstance(find_task(self.task), CableMaskGoal):
+            raise InputError(
+                f"{self.agent} traces the cable of masks, and {self.task} shows none; use it on "
+                f"{CableMaskGoal.name}"
+            )
         if not issubclass(cls, Transporter):  # the ground truth contains the goal
             return
         sees_goal = cls.pictures == 2
@@ -94,17 +101,24 @@ def make_agent(description: AgentDescription, *, seed: int = 0) -> Agent:
         InputError: the configuration is not this agent's.
     """
     cls = AGENTS[description.agent]
-    kind = TransporterConfig if issubclass(cls, Transporter) else GtStateConfig
+    kind = _CONFIGS[cls.sees]
     unknown = description.config.keys() - {field.name for field in dataclasses.fields(kind)}
     if unknown:
         raise InputError(f"{description.agent} has no setting {min(unknown)!r}")
     values = {**description.config, "lifts": tuple(description.config["lifts"])}
     if issubclass(cls, Transporter):
         return cls(TransporterConfig(**values), seed=seed)
+    if issubclass(cls, Traced):
+        return cls(TracedConfig(**values), seed=seed)
     if description.state_size is None:
         raise InputError(f"{description.agent} needs the size of the state")
     choices = GtStateConfig(**{**values, "yaws": tuple(values.get("yaws", ()))})
     return cls(description.state_size, choices, seed=seed)
+
+
+_CONFIGS: dict[str, type] = {
+    "pictures": TransporterConfig, "traces": TracedConfig, "state": GtStateConfig,
+}  # fmt: skip
 
 
 class Policy(Protocol):
@@ -128,9 +142,9 @@ class Policy(Protocol):
 
 
 class ImagePolicy:
-    """A Transporter over pictures; the same observation gives the same action."""
+    """An agent over pictures; the same observation gives the same action."""
 
-    def __init__(self, agent: Transporter, description: AgentDescription) -> None:
+    def __init__(self, agent: Transporter | Traced, description: AgentDescription) -> None:
         self.agent, self.description = agent.eval(), description
         self._task = find_task(description.task)
 
@@ -263,7 +277,7 @@ def load_policy(path: str | Path, *, device: str = "cpu") -> ImagePolicy | State
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{file} is no snapshot of this release's agents: {reason}") from error
     agent.to(device)
-    if isinstance(agent, Transporter):
+    if isinstance(agent, Transporter | Traced):
         return ImagePolicy(agent, description)
     return StatePolicy(agent, description)
 

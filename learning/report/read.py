@@ -9,6 +9,7 @@ from typing import Any
 from warp_deform.episodes.corrected import is_corrected
 from warp_deform.errors import InputError
 
+from ..policy.policy import AGENTS
 from ..runs.folder import RunFolder
 from ..training.schedules import SCHEDULES, preset_schedule
 from .cells import RunResult, check_run
@@ -120,11 +121,11 @@ def _steps(info: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     if trained != planned:
         return [f"{trained} of {planned} steps"]
     usual = None
-    if info["preset"] in SCHEDULES:
+    if info["preset"] in SCHEDULES and info["agent"] in AGENTS:
         usual = preset_schedule(
             info["preset"],
             task=info["task"],
             demos=info["demos"],
-            sees_state=settings["agent"].get("state_size") is not None,
+            sees=AGENTS[info["agent"]].sees,
         )
     return [] if usual is not None and planned == usual.steps else [f"{planned} steps"]

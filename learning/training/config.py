@@ -9,7 +9,7 @@ from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
 
 from ..data.goal_name import GoalName
-from ..models.transporter import Transporter, TransporterConfig
+from ..models.transporter import TransporterConfig
 from ..policy.policy import AGENTS
 from .processes import DEVICES
 from .schedules import SCHEDULES, Schedule, preset_schedule
@@ -66,7 +66,7 @@ class TrainConfig(TrainSettings):
                 f"precision is {self.precision!r}; it must be one of {list(PRECISIONS)}"
             )
         for name, given in (("precision", self.precision != "auto"), ("network", self.network)):
-            if given and self._sees_state:
+            if given and AGENTS[self.agent].sees != "pictures":
                 raise InputError(f"{name} is for agents over pictures; {self.agent} has its own")
         if self.precision == "bfloat16" and self.exact:
             raise InputError(
@@ -76,7 +76,7 @@ class TrainConfig(TrainSettings):
     def plan(self, demos: int) -> Schedule:
         """The schedule in force with so many demonstrations."""
         plan = self.schedule or preset_schedule(
-            self.preset, task=self.task, demos=demos, sees_state=self._sees_state
+            self.preset, task=self.task, demos=demos, sees=AGENTS[self.agent].sees
         )
         changed = ("steps", "batch", "lr", "snapshots", "validate", "confirm")
         wanted: dict[str, Any] = {
@@ -91,7 +91,3 @@ class TrainConfig(TrainSettings):
             plan = replace(plan, confirm=0)
         patience = plan.patience if self.patience is None else self.patience
         return replace(plan, patience=(patience or None) if plan.validate else None)
-
-    @property
-    def _sees_state(self) -> bool:
-        return not issubclass(AGENTS[self.agent], Transporter)

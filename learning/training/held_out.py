@@ -14,9 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..data.batches import image_batch, state_batch
+from ..data.batches import agent_batch
 from ..data.dataset import Demonstrations
-from ..models.transporter import Transporter
 from ..policy.policy import Agent
 
 __all__ = ["HeldOut"]
@@ -50,12 +49,11 @@ class HeldOut:
 
     def _inputs(self, transition: tuple[int, int], device: torch.device) -> tuple[object, ...]:
         rng = np.random.default_rng(0)  # nothing is drawn
-        if isinstance(self._agent, Transporter):
-            batch = image_batch(
-                self._data, self._agent, transitions=[transition], rng=rng, augment=False
-            )
-            return (batch._replace(image=batch.image.to(device)),)
-        tensors = state_batch(
-            self._data, self._agent.config.lifts, transitions=[transition], rng=rng, augment=False
+        return agent_batch(
+            self._data,
+            self._agent,
+            transitions=[transition],
+            rng=rng,
+            augment=False,
+            device=device,
         )
-        return tuple(each.to(device) for each in tensors)

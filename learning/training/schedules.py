@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from warp_deform.errors import InputError
 
-__all__ = ["SCHEDULES", "STATE_SCHEDULES", "Schedule", "preset_schedule"]
+__all__ = ["SCHEDULES", "STATE_SCHEDULES", "TRACED_SCHEDULE", "Schedule", "preset_schedule"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,18 +120,40 @@ STATE_SCHEDULES = {
 }
 """The same for the ground-truth baselines."""
 
+TRACED_SCHEDULE = Schedule(
+    steps=3000,
+    batch=32,
+    lr=2e-3,
+    warmup=100,
+    decay=True,
+    ema=0.99,
+    snapshots=3,
+    validate=20,
+    confirm=40,
+)
+"""Of agents that trace the cable, by the preset `fast`; the paper has none."""
+
 _LONGER = Schedule(steps=40_000, batch=1, lr=1e-4)
 _LONGER_TASK, _LONGER_FROM = "bag-color-goal", 100
 
 
-def preset_schedule(preset: str, *, task: str, demos: int, sees_state: bool) -> Schedule:
-    """A preset's schedule for a task and a number of demonstrations.
+def preset_schedule(
+    preset: str, *, task: str, demos: int, sees: Literal["pictures", "traces", "state"]
+) -> Schedule:
+    """A preset's schedule for a task, a number of demonstrations, and what an agent sees.
 
     The paper's agents over pictures train for twice as long on bag-color-goal with 100
     demonstrations or more.
+
+    Raises:
+        InputError: the preset has no such agent.
     """
-    if sees_state:
+    if sees == "state":
         return STATE_SCHEDULES[preset]
+    if sees == "traces":
+        if preset != "fast":
+            raise InputError(f"preset {preset} has no agent that traces cables; use --preset fast")
+        return TRACED_SCHEDULE
     if preset == "paper" and task == _LONGER_TASK and demos >= _LONGER_FROM:
         return _LONGER
     return SCHEDULES[preset]

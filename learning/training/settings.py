@@ -18,7 +18,7 @@ from ..data.goal_name import GoalName
 
 __all__ = ["AgentName", "PrecisionName", "PresetName", "TrainMethod", "TrainSettings"]
 
-AgentName = Literal["transporter", "goal-split", "goal-stack", "gt-mlp", "gt-mlp-2step"]
+AgentName = Literal["transporter", "goal-split", "goal-stack", "traced", "gt-mlp", "gt-mlp-2step"]
 PresetName = Literal["paper", "fast"]
 PrecisionName = Literal["auto", "float32", "bfloat16"]
 
@@ -30,8 +30,8 @@ class _Trained:
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """Name of the task, see `warp-deform list`."""
     agent: AgentName
-    """Transporters see pictures; goal-split and goal-stack also see the goal's picture. The others
-    see the simulator's state."""
+    """Transporters see pictures; goal-split and goal-stack also see the goal's picture. traced
+    follows the cable in both masks of cable-mask-goal. The others see the simulator's state."""
     data: Annotated[Path, arg(metavar="DIR")]
     """Folder of demonstrations, see `warp-deform demo`."""
     demos: Annotated[int | None, arg(metavar="N"), COUNT] = None

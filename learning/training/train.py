@@ -30,12 +30,14 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from warp_deform.support.progress import progress_bar
+from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.ground_truth import yaw_columns
 
-from ..data.batches import check_lifts, check_view, image_batch, state_batch, task_lifts
+from ..data.batches import agent_batch, check_lifts, check_view, task_lifts
 from ..data.dataset import Demonstrations
 from ..models.gt_state import GtStateConfig
 from ..models.precision import has_bfloat16_tiles
+from ..models.traced import Traced, TracedConfig
 from ..models.transporter import PRESETS, Transporter
 from ..policy.policy import AGENTS, Agent, AgentDescription
 from ..runs.folder import RunFolder
@@ -264,6 +266,11 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
             bfloat16=chosen.bfloat16 or _bfloat16(config),
         )
         return AgentDescription(task=config.task, agent=config.agent, config=asdict(sizes))
+    if issubclass(AGENTS[config.agent], Traced):
+        traced = AgentDescription(task=config.task, agent=config.agent, config={})
+        assert isinstance(data.task, CableMaskGoal)  # a description of another task is refused
+        points = data.task.cable.beads
+        return replace(traced, config=asdict(TracedConfig(points=points, lifts=lifts)))
     choices = GtStateConfig(
         lifts=lifts,
         one_rotation=yaws == 1,
@@ -312,16 +319,15 @@ def _batch(
     device: torch.device,
 ) -> tuple[Any, ...]:
     """Arguments of the agent's losses."""
-    transitions = data.drawn(plan.batch, rng)
-    if isinstance(agent, Transporter):
-        batch = image_batch(
-            data, agent, transitions=transitions, rng=rng, augment=augment, mirror=plan.mirror
-        )
-        return (batch._replace(image=batch.image.to(device)),)
-    tensors = state_batch(
-        data, agent.config.lifts, transitions=transitions, rng=rng, augment=augment
+    return agent_batch(
+        data,
+        agent,
+        transitions=data.drawn(plan.batch, rng),
+        rng=rng,
+        augment=augment,
+        mirror=plan.mirror,
+        device=device,
     )
-    return tuple(each.to(device) for each in tensors)
 
 
 def _hash(path: Path) -> str:

@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from learning.policy.policy import AGENTS
 from learning.training.config import TrainConfig
 from learning.training.schedules import SCHEDULES, STATE_SCHEDULES, Schedule, preset_schedule
+from learning.training.settings import AgentName
 from warp_deform.errors import InputError
 
 
@@ -23,27 +25,26 @@ def test_presets_are_the_papers_and_ours() -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "demos", "preset", "sees_state", "steps"),
+    ("task", "demos", "preset", "agent", "steps"),
     [
-        ("bag-color-goal", 100, "paper", False, 40_000),
-        ("bag-color-goal", 1000, "paper", False, 40_000),
-        ("bag-color-goal", 10, "paper", False, 20_000),
-        ("bag-color-goal", 100, "fast", False, 4000),
-        ("bag-color-goal", 100, "paper", True, 20_000),
-        ("bag-items-1", 1000, "paper", False, 20_000),
+        ("bag-color-goal", 100, "paper", "goal-split", 40_000),
+        ("bag-color-goal", 1000, "paper", "goal-split", 40_000),
+        ("bag-color-goal", 10, "paper", "goal-split", 20_000),
+        ("bag-color-goal", 100, "fast", "goal-split", 4000),
+        ("bag-color-goal", 100, "paper", "gt-mlp", 20_000),
+        ("bag-items-1", 1000, "paper", "transporter", 20_000),
     ],
 )
 def test_bags_by_color_train_for_longer(
-    task: str, demos: int, preset: str, sees_state: bool, steps: int
+    task: str, demos: int, preset: str, agent: AgentName, steps: int
 ) -> None:
-    schedule = preset_schedule(preset, task=task, demos=demos, sees_state=sees_state)
+    schedule = preset_schedule(preset, task=task, demos=demos, sees=AGENTS[agent].sees)
     assert schedule.steps == steps
-    agent = "gt-mlp" if sees_state else "goal-split" if "goal" in task else "transporter"
     config = TrainConfig(
         task=task, agent=agent, data=Path("none"), out=Path("none"), demos=demos, preset=preset
     )
     assert config.plan(demos) == schedule
-    if sees_state:
+    if agent == "gt-mlp":
         assert schedule == STATE_SCHEDULES[preset]
 
 

@@ -1,11 +1,11 @@
-"""Where a chain's beads lie, estimated from a mask alone.
+"""Where a cable leads in a mask: points along it from one end to the other.
 
 The mask is thinned to a line one pixel wide, which is cut where strands meet; the pieces are then
-linked end to end into one open chain, in the order whose links together are shortest and turn
+linked end to end into one open line, in the order whose links together are shortest and turn
 least. A link over the mask, where another strand may hide this one, counts less than one over bare
-ground. Beads are spread evenly along the chain. So of two strands that cross, each goes straight
-on. What a mask does not show, which strand lies on top and what is hidden where strands lie side by
-side, is a guess.
+ground. The points are spread evenly along the line. So of two strands that cross, each goes
+straight on. What a mask does not show, which strand lies on top and what is hidden where strands
+lie side by side, is a guess.
 
 Sources: of the thinning, Zhang and Suen, "A fast parallel algorithm for thinning digital patterns",
 1984; of the order, Held and Karp, "A dynamic programming approach to sequencing problems", 1962.
@@ -18,9 +18,7 @@ import itertools
 import cv2
 import numpy as np
 
-from .top_down_view import TopDownView
-
-__all__ = ["estimate_chain"]
+__all__ = ["trace_strand"]
 
 _REACH = 7  # [px] of a piece that tell where its end points
 _SHORT = 5  # [px]: a shorter piece, a spur of the thinning or a speck, has no direction
@@ -32,10 +30,10 @@ _EATEN = 8  # [px] of an end at most
 _SMOOTH = 5  # points
 
 
-def estimate_chain(mask: np.ndarray, view: TopDownView, beads: int) -> np.ndarray | None:
-    """Return x, y [m] of `beads` beads along the chain of a mask (H, W) bool, (beads, 2).
+def trace_strand(mask: np.ndarray, points: int) -> np.ndarray | None:
+    """Return rows and columns [px] of so many points along the cable of a mask (H, W), (points, 2).
 
-    Which end comes first is arbitrary. None where the mask shows no chain.
+    Which end comes first is arbitrary. None where the mask shows no cable.
     """
     pieces = _pieces(_thinned(mask))
     if not pieces:
@@ -47,9 +45,8 @@ def estimate_chain(mask: np.ndarray, view: TopDownView, beads: int) -> np.ndarra
         line = _prolonged(line, mask)[::-1]
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    even_along = np.linspace(0.0, along[-1], beads)
-    even = np.stack([np.interp(even_along, along, line[:, k]) for k in range(2)], axis=1)
-    return view.pixel_to_base(even)
+    even = np.linspace(0.0, along[-1], points)
+    return np.stack([np.interp(even, along, line[:, k]) for k in range(2)], axis=1)
 
 
 def _thinned(mask: np.ndarray) -> np.ndarray:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fixtures.franka_episodes import TASK, TWIN
 
-from hardware.vision.chain_from_mask import estimate_chain
 from warp_deform.rendering.strand_mask import MaskLook
+from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.chain_shapes import curved_chain
+from warp_deform.tasks.strand_trace import trace_strand
+
+TASK = CableMaskGoal()
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_chain_is_found_in_its_mask(seed: int) -> None:
     """Lone strands; which end comes first is open."""
     rng = np.random.default_rng(seed)
-    beads = curved_chain(rng, TWIN.chain, TASK.x, TASK.y, bend=4.0)[:, :2]
+    beads = curved_chain(rng, TASK.cable, TASK.x, TASK.y, bend=4.0)[:, :2]
     assert _error(TASK.mask(beads), beads) < 5e-3
 
 
@@ -27,7 +29,7 @@ def test_gaps_do_not_tear_a_chain_apart() -> None:
     far = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        beads = curved_chain(rng, TWIN.chain, TASK.x, TASK.y, bend=1.0)[:, :2]
+        beads = curved_chain(rng, TASK.cable, TASK.x, TASK.y, bend=1.0)[:, :2]
         look = MaskLook(width=0.9, ragged=0.12, holes=3.0, hole_px=2.5, seed=seed)
         error = _error(TASK.mask(beads, look=look), beads)
         assert error < 0.04, f"seed {seed}: a bead is {1000 * error:.0f} mm off"
@@ -40,7 +42,7 @@ def test_chains_that_cross_themselves_are_followed_to_their_ends() -> None:
     astray = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        beads = curved_chain(rng, TWIN.chain, TASK.x, TASK.y, bend=7.0, lone=False)[:, :2]
+        beads = curved_chain(rng, TASK.cable, TASK.x, TASK.y, bend=7.0, lone=False)[:, :2]
         if _error(TASK.mask(beads), beads) > 0.02:
             astray.append(seed)
     assert len(astray) <= 3, astray
@@ -54,9 +56,9 @@ def test_more_pieces_than_are_put_in_order_leave_out_the_shortest() -> None:
     for length in lengths:
         mask[start : start + length, 80:83] = True
         start += length + 7
-    found = estimate_chain(mask, TWIN.view, 90)
+    found = trace_strand(mask, 90)
     assert found is not None
-    ends = sorted(TWIN.view.grid.to_pixel(found[[0, -1]])[:, 0].tolist())
+    ends = sorted(found[[0, -1], 0].tolist())
     assert abs(ends[0] - 10) <= 2 and abs(ends[1] - (start - 8)) <= 2
 
 
@@ -71,24 +73,28 @@ def test_crossing_strands_go_straight_on_and_a_ring_is_opened() -> None:
         loop[-1] + away * _unit(loop[-1] - loop[-2]),
     ]
     line = np.concatenate([ends[0], loop, ends[1]])
-    found = estimate_chain(TASK.mask(line), TWIN.view, 90)
-    assert found is not None
+    found = _traced(TASK.mask(line), 90)
     gaps = np.linalg.norm(np.diff(found, axis=0), axis=1)
     assert gaps.max() < 1.6 * np.median(gaps), "no jump from strand to strand"
     tips = {tuple(np.round(found[i], 2)) for i in (0, -1)}
     assert tips == {tuple(np.round(line[i], 2)) for i in (0, -1)}
     ring = np.array([0.48, 0.0]) + 0.06 * np.hstack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)])
-    found = estimate_chain(TASK.mask(ring), TWIN.view, 90)
-    assert found is not None
+    found = _traced(TASK.mask(ring), 90)
     np.testing.assert_allclose(np.linalg.norm(found - [0.48, 0.0], axis=1), 0.06, atol=3e-3)
-    assert estimate_chain(np.zeros((320, 160), bool), TWIN.view, 90) is None
+    assert trace_strand(np.zeros((320, 160), bool), 90) is None
 
 
 def _error(mask: np.ndarray, beads: np.ndarray) -> float:
     """How far the worst bead of a chain (n, 2) is from where its mask puts it [m]."""
-    found = estimate_chain(mask, TWIN.view, len(beads))
-    assert found is not None
+    found = _traced(mask, len(beads))
     return min(float(np.linalg.norm(found[::way] - beads, axis=1).max()) for way in (1, -1))
+
+
+def _traced(mask: np.ndarray, points: int) -> np.ndarray:
+    """Points x, y [m] along the cable of a mask."""
+    found = trace_strand(mask, points)
+    assert found is not None
+    return TASK.grid.to_world(found)
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
