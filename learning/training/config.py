@@ -68,6 +68,8 @@ class TrainConfig(TrainSettings):
         for name, given in (("precision", self.precision != "auto"), ("network", self.network)):
             if given and AGENTS[self.agent].sees != "pictures":
                 raise InputError(f"{name} is for agents over pictures; {self.agent} has its own")
+        if self.exact and AGENTS[self.agent].sees == "traces":
+            raise InputError(f"exact: the original has no {self.agent} agent; leave --exact out")
         if self.precision == "bfloat16" and self.exact:
             raise InputError(
                 "precision bfloat16 and exact exclude each other: the original computes in float32"

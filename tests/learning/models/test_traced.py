@@ -186,6 +186,8 @@ def config(tmp_path: Path, **changes: object) -> TrainConfig:
 def test_the_paper_has_no_such_agent(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="use --preset fast"):
         config(tmp_path, preset="paper")
+    with pytest.raises(InputError, match="leave --exact out"):
+        config(tmp_path, exact=True)
     with pytest.raises(InputError, match="traced has its own"):
         config(tmp_path, precision="bfloat16")
 
