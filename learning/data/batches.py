@@ -34,6 +34,7 @@ __all__ = [
     "StateBatch",
     "agent_batch",
     "check_lifts",
+    "check_traces",
     "check_view",
     "image_batch",
     "state_batch",
@@ -186,6 +187,17 @@ def traced_batch(
         seen.append(turned_over(torch.from_numpy(shown)[None], mirror, back)[0])
         grips.append(last - grip if back else grip)
     return TracedBatch(torch.stack(seen), torch.tensor(grips))
+
+
+def check_traces(data: Demonstrations, config: TracedConfig) -> None:
+    """Trace the cable of every transition.
+
+    Raises:
+        InputError: a mask shows none.
+    """
+    for episode, length in enumerate(data.lengths()):
+        for t in range(length):
+            _traced(data, config, episode, t)
 
 
 @functools.lru_cache(maxsize=_TRACES)

@@ -81,7 +81,8 @@ def heat_maps(
     if isinstance(agent, Traced):
         seen = (np.asarray(observation[name]) for name in ("color", "goal_color"))
         mask, aim = (each[..., 0] > LEVEL for each in seen)
-        return HeatMaps(*agent.heat(mask, aim))
+        pick = find_task(policy.description.task).grid.fractional(action[:2])
+        return HeatMaps(*agent.heat(mask, aim, pick))
     config, goal = agent.config, None
     if agent.pictures == 2:
         goal = observation["goal_color"], observation["goal_height"]
@@ -266,7 +267,8 @@ def _overlay(color: np.ndarray, probability: np.ndarray | None) -> np.ndarray:
     dimmed = color.astype(np.float32) * 0.6
     if probability is None:
         return dimmed.astype(np.uint8)
-    share = np.sqrt(_enlarge(probability, _SCALE) / probability.max())
+    # an agent that sees no cable says nothing
+    share = np.sqrt(_enlarge(probability, _SCALE) / max(float(probability.max()), 1e-12))
     levels = np.rint(share * 255).astype(np.uint8)
     warm = cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     weight = np.minimum(1.0, 1.5 * share)[..., None]

@@ -41,8 +41,9 @@ __all__ = [
 
 _UNIT = 50.0
 """Distances are seen in this unit [px], about 10 cm."""
-_GAP, _APART = 30.0, 6
-"""Strands beside a point are seen up to this distance [px]; nearer along the cable is no other."""
+_GAP, _APART = 30.0, 12
+"""Strands beside a point are seen up to this distance [px]; so many points along the cable, which
+are 32 px of it, are the same strand."""
 _ENDS = 2
 """Points from an end that are not taken: half a pad then holds the cable."""
 _DOT = 4.0
@@ -59,8 +60,8 @@ WAYS = ((False, False), (False, True), (True, False), (True, True))
 class TracedConfig:
     """Sizes of a Traced agent."""
 
-    points: int = 90
-    """Along the cable, as many as the task's has beads."""
+    points: int = 91
+    """Along the cable; odd, so that an odd number of grips is the same from either end."""
     grips: int = 15
     """Points that may be taken, spread evenly."""
     channels: int = 48
@@ -165,8 +166,16 @@ class Traced(nn.Module):
         ahead = [p.flip(0) if back else p for p, (_, back) in zip(each, WAYS, strict=True)]
         return np.asarray(torch.stack(ahead).double().mean(dim=0).cpu().numpy())
 
-    def heat(self, mask: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pictures (H, W) float32 of how probable picks are in masks (H, W), and of the place."""
+    def heat(
+        self, mask: np.ndarray, goal: np.ndarray, pick: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Pictures (H, W) float32 of how probable picks are in masks (H, W), and of a pick's place.
+
+        Both are 0 where a mask shows no cable.
+
+        Args:
+            pick: row and column [px]; the place is that of the grip next to it
+        """
         maps = np.zeros((2, *SHAPE), np.float32)
         traces = matched_traces(mask, goal, self.config.points)
         if traces is not None:
@@ -174,24 +183,27 @@ class Traced(nn.Module):
             probable = self.probabilities(*traces)
             for row, column, share in zip(*now.T, probable, strict=True):
                 _dot(maps[0], row, column, share)
-            row, column = wanted[probable.argmax()]
+            row, column = wanted[np.linalg.norm(now - pick, axis=1).argmin()]
             _dot(maps[1], row, column, 1.0)
         return maps[0], maps[1]
 
     def act(self, image: Tensor, *, avoid: Tensor | None = None) -> PixelActions:
         """The most probable pick and its place, for masks (B, 2, H, W).
 
-        Where a mask shows no cable both are the middle of the picture, where there is nothing.
+        What is too small to be traced is brought to the middle of the goal's cable.
 
         Args:
             avoid: (B, H, W) bool, pixels that are not to be picked, unless there is no other grip
+
+        Raises:
+            InputError: the goal's mask shows no cable.
         """
         picks, places = [], []
         for k, (mask, goal) in enumerate(image.cpu().numpy().astype(bool)):
             traces = matched_traces(mask, goal, self.config.points)
             if traces is None:
-                picks.append(np.array(SHAPE) / 2)
-                places.append(picks[-1])
+                picks.append(_middle(mask))
+                places.append(_middle_of_cable(goal, self.config.points))
                 continue
             now, wanted = (each[self.config.taken] for each in traces)
             probable = self.probabilities(*traces)
@@ -284,6 +296,20 @@ def turned_over(seen: Tensor, mirror: bool, back: bool) -> Tensor:
         sign[[_ALONG, _ACROSS]] *= -1
     shown = seen * sign[:, None]
     return shown.flip(2) if back else shown
+
+
+def _middle(mask: np.ndarray) -> np.ndarray:
+    """The middle one of a mask's pixels (2,), or the picture's where it has none."""
+    pixels = np.argwhere(mask)
+    return np.array(pixels[len(pixels) // 2] if len(pixels) else np.array(SHAPE) // 2, dtype=float)
+
+
+def _middle_of_cable(goal: np.ndarray, points: int) -> np.ndarray:
+    """The point (2,) [px] half way along the cable of a goal's mask."""
+    line = trace_strand(goal, points)
+    if line is None:
+        raise InputError("the goal's mask shows no cable; give a goal that does")
+    return np.asarray(line[points // 2])
 
 
 def _dot(canvas: np.ndarray, row: float, column: float, value: float) -> None:

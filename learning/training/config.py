@@ -68,6 +68,10 @@ class TrainConfig(TrainSettings):
         for name, given in (("precision", self.precision != "auto"), ("network", self.network)):
             if given and AGENTS[self.agent].sees != "pictures":
                 raise InputError(f"{name} is for agents over pictures; {self.agent} has its own")
+        if AGENTS[self.agent].sees == "traces" and self.preset != "fast":
+            raise InputError(
+                f"preset {self.preset} has no agent that traces cables; use --preset fast"
+            )
         if self.exact and AGENTS[self.agent].sees == "traces":
             raise InputError(f"exact: the original has no {self.agent} agent; leave --exact out")
         if self.precision == "bfloat16" and self.exact:

@@ -131,7 +131,7 @@ TRACED_SCHEDULE = Schedule(
     validate=20,
     confirm=40,
 )
-"""Of agents that trace the cable, by the preset `fast`; the paper has none."""
+"""Of agents that trace the cable, for the preset `fast`; the paper has none."""
 
 _LONGER = Schedule(steps=40_000, batch=1, lr=1e-4)
 _LONGER_TASK, _LONGER_FROM = "bag-color-goal", 100
@@ -144,15 +144,10 @@ def preset_schedule(
 
     The paper's agents over pictures train for twice as long on bag-color-goal with 100
     demonstrations or more.
-
-    Raises:
-        InputError: the preset has no such agent.
     """
     if sees == "state":
         return STATE_SCHEDULES[preset]
     if sees == "traces":
-        if preset != "fast":
-            raise InputError(f"preset {preset} has no agent that traces cables; use --preset fast")
         return TRACED_SCHEDULE
     if preset == "paper" and task == _LONGER_TASK and demos >= _LONGER_FROM:
         return _LONGER

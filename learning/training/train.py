@@ -30,10 +30,9 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from warp_deform.support.progress import progress_bar
-from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.ground_truth import yaw_columns
 
-from ..data.batches import agent_batch, check_lifts, check_view, task_lifts
+from ..data.batches import agent_batch, check_lifts, check_traces, check_view, task_lifts
 from ..data.dataset import Demonstrations
 from ..models.gt_state import GtStateConfig
 from ..models.precision import has_bfloat16_tiles
@@ -268,9 +267,7 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
         return AgentDescription(task=config.task, agent=config.agent, config=asdict(sizes))
     if issubclass(AGENTS[config.agent], Traced):
         traced = AgentDescription(task=config.task, agent=config.agent, config={})
-        assert isinstance(data.task, CableMaskGoal)  # a description of another task is refused
-        points = data.task.cable.beads
-        return replace(traced, config=asdict(TracedConfig(points=points, lifts=lifts)))
+        return replace(traced, config=asdict(TracedConfig(lifts=lifts)))
     choices = GtStateConfig(
         lifts=lifts,
         one_rotation=yaws == 1,
@@ -304,9 +301,11 @@ def _rehearse(
     """
     if config.tensorboard:
         load_tensorboard()
-    if isinstance(agent, Transporter):
-        for each in (data, data.spared(config.hold_out)) if config.hold_out else (data,):
+    for each in (data, data.spared(config.hold_out)) if config.hold_out else (data,):
+        if isinstance(agent, Transporter):
             check_view(each)
+        elif isinstance(agent, Traced):
+            check_traces(each, agent.config)
     _batch(data, agent, plan, config.augment, np.random.default_rng(config.seed), device)
 
 

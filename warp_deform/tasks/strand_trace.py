@@ -31,10 +31,13 @@ _SMOOTH = 5  # points
 
 
 def trace_strand(mask: np.ndarray, points: int) -> np.ndarray | None:
-    """Return rows and columns [px] of so many points along the cable of a mask (H, W), (points, 2).
+    """Return rows and columns [px] of so many points along the cable of a mask, (points, 2).
+
+    The mask (H, W) is bool, or 0 where there is no cable.
 
     Which end comes first is arbitrary. None where the mask shows no cable.
     """
+    mask = mask.astype(bool)
     pieces = _pieces(_thinned(mask))
     if not pieces:
         return None
@@ -51,7 +54,7 @@ def trace_strand(mask: np.ndarray, points: int) -> np.ndarray | None:
 
 def _thinned(mask: np.ndarray) -> np.ndarray:
     """The mask's middle lines, (H, W) bool."""
-    image = mask.astype(bool)
+    image = mask
     while True:
         before = np.count_nonzero(image)
         for first in (True, False):

@@ -31,21 +31,29 @@ from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.errors import InputError
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.chain_shapes import curved_chain, tossed_chain
+from warp_deform.tasks.strand_trace import trace_strand
 
 TASK = CableMaskGoal()
 SMALL = TracedConfig(channels=8, members=2)
 
 
 def lines(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A tossed cable and a goal, (90, 2) [px] each."""
+    """A tossed cable and a goal, (91, 2) [px] each."""
     rng = np.random.default_rng(seed)
     now = tossed_chain(rng, TASK.cable, TASK.x, TASK.y)
     goal = curved_chain(rng, TASK.cable, TASK.x, TASK.y, bend=1.0)
-    return TASK.grid.fractional(now[:, :2]), TASK.grid.fractional(goal[:, :2])
+    return _points(now), _points(goal)
+
+
+def _points(beads: np.ndarray) -> np.ndarray:
+    """As many points [px] as the agent sees, along beads [m]."""
+    at = np.linspace(0, len(beads) - 1, SMALL.points)
+    line = np.stack([np.interp(at, np.arange(len(beads)), beads[:, k]) for k in range(2)], axis=1)
+    return TASK.grid.fractional(line)
 
 
 def picture(line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colour and height of a cable (90, 2) [px]."""
+    """Colour and height of a cable (91, 2) [px]."""
     mask = TASK.mask(TASK.grid.to_world(line))
     color = np.repeat(np.where(mask, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
     return color, np.zeros(mask.shape, np.float32)
@@ -66,6 +74,7 @@ def test_neither_view_nor_end_nor_mirror_changes_what_it_says(seed: int) -> None
         np.testing.assert_allclose(agent.probabilities(here, there), said, atol=1e-5, err_msg=name)
     back = agent.probabilities(now[::-1], goal[::-1])
     np.testing.assert_allclose(back[::-1], said, atol=1e-5)
+    np.testing.assert_array_equal(SMALL.taken, SMALL.points - 1 - SMALL.taken[::-1])
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -87,7 +96,7 @@ def test_it_picks_on_the_cable_and_places_on_the_goal_where_that_point_belongs()
         image = agent.image(picture(now), picture(goal))[None]
         action = agent.act(image)
         (mask, aim) = image[0].numpy()
-        traces = matched_traces(mask, aim, 90)
+        traces = matched_traces(mask, aim, SMALL.points)
         assert traces is not None
         k = int(np.linalg.norm(traces[0] - action.pick[0], axis=1).argmin())
         assert k in SMALL.taken
@@ -114,16 +123,24 @@ def test_what_is_to_be_avoided_is_not_taken_unless_everything_is() -> None:
     assert tuple(everywhere.pick[0]) == taken[0], "all are barred: as if none were"
 
 
-def test_without_a_cable_it_picks_where_nothing_is_and_breaks_nothing() -> None:
+def test_without_a_cable_what_there_is_goes_to_the_middle_of_the_goal() -> None:
     agent = Traced(SMALL, seed=0)
     empty = np.zeros((320, 160, 3), np.uint8), np.zeros((320, 160), np.float32)
-    seen = picture(lines(0)[0])
-    for current, goal in ((empty, seen), (seen, empty), (empty, empty)):
+    speck = empty[0].copy(), empty[1]
+    speck[0][200, 30] = 255
+    goal = picture(lines(0)[1])
+    middle = trace_strand(goal[0][..., 0] > 127, SMALL.points)
+    assert middle is not None
+    for current, pick in ((empty, [160, 80]), (speck, [200, 30])):
         action = agent.act(agent.image(current, goal)[None])
-        np.testing.assert_array_equal(action.pick, action.place)
-        np.testing.assert_array_equal(action.pick[0], [160, 80])
-        heat = agent.heat(*(each[0][..., 0] > 127 for each in (current, goal)))
-        assert not np.any(heat)
+        np.testing.assert_array_equal(action.pick[0], pick)
+        np.testing.assert_array_equal(action.place[0], middle[SMALL.points // 2])
+        masks = (each[0][..., 0] > 127 for each in (current, goal))
+        assert not np.any(agent.heat(*masks, np.array(pick)))
+    seen = picture(lines(0)[0])
+    for current in (empty, seen):
+        with pytest.raises(InputError, match="the goal's mask shows no cable"):
+            agent.act(agent.image(current, empty)[None])
     with pytest.raises(InputError, match="goal picture"):
         agent.image(seen)
 
@@ -149,11 +166,21 @@ def test_a_rule_of_the_cable_is_learnt() -> None:
     assert right.float().mean() > 0.6
 
 
+def test_the_gap_is_that_to_another_strand() -> None:
+    straight = np.column_stack([np.linspace(10, 250, SMALL.points), np.full(SMALL.points, 80.0)])
+    assert features(straight, straight)[-1] == pytest.approx(np.ones(SMALL.points))
+    turn = SMALL.points // 2
+    hairpin = straight.copy()
+    hairpin[turn:] = straight[turn::-1] + np.array([0, 15])  # back, 15 px beside
+    gap = features(hairpin, hairpin)[-1]
+    assert gap[:30] == pytest.approx(0.5, abs=0.01) and gap[-30:] == pytest.approx(0.5, abs=0.01)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"grips": 1}, "grips: 2 to 86"),
-        ({"grips": 87}, "grips: 2 to 86"),
+        ({"grips": 1}, "grips: 2 to 87"),
+        ({"grips": 88}, "grips: 2 to 87"),
         ({"points": 8}, "points"),
         ({"members": 0}, "members"),
         ({"channels": 0}, "channels"),

@@ -11,6 +11,7 @@ import pytest
 from fixtures.short_runs import said
 from fixtures.training_samples import block_episode, write_demonstrations
 
+from learning.data import batches
 from learning.refinement.refine import RefineConfig, refine
 from learning.report.read import read_runs
 from learning.runs.folder import RunFolder
@@ -46,7 +47,7 @@ def failing_batch(patch: pytest.MonkeyPatch) -> dict[str, Any]:
     def fail(*_: Any, **__: Any) -> None:
         raise InputError("episode_000000000.parquet is damaged")
 
-    patch.setattr(training, "state_batch", fail)
+    patch.setattr(batches, "state_batch", fail)
     return {}
 
 
@@ -85,16 +86,16 @@ def test_a_folder_that_was_there_stays(data: Path, tmp_path: Path) -> None:
 def test_what_training_goes_on_from_stays(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    batches: list[int] = []
-    original = training.state_batch
+    counted: list[int] = []
+    original = batches.state_batch
 
     def late(*args: Any, **options: Any) -> Any:
-        batches.append(1)
-        if len(batches) == 150:
+        counted.append(1)
+        if len(counted) == 150:
             raise InputError("a disk was unplugged")
         return original(*args, **options)
 
-    monkeypatch.setattr(training, "state_batch", late)
+    monkeypatch.setattr(batches, "state_batch", late)
     with pytest.raises(InputError, match="unplugged"):
         train(config(data, tmp_path / "run"))
     run = RunFolder(tmp_path / "run")

@@ -18,6 +18,7 @@ import torch
 from fixtures.places import ROOT
 from fixtures.training_samples import write_demonstrations
 
+from learning.data import batches
 from learning.runs.folder import RunFolder, read_snapshot
 from learning.training import train as training
 from learning.training.config import TrainConfig
@@ -58,7 +59,7 @@ def test_two_processes_train_as_one_with_both_batches(
     alone = TrainConfig(
         task=TASK, agent="gt-mlp", data=folder, out=tmp_path / "one", preset="fast", schedule=plan
     )
-    original, drawn = training.state_batch, []
+    original, drawn = batches.state_batch, []
 
     def of_both(data: Any, lifts: Any, *, augment: bool, **_: Any) -> Any:
         drawn.append(1)
@@ -71,7 +72,7 @@ def test_two_processes_train_as_one_with_both_batches(
 
     train(replace(alone, out=tmp_path / "single"))
     monkeypatch.setattr(training, "_rehearse", lambda *_: None)  # it draws a batch, too
-    monkeypatch.setattr(training, "state_batch", of_both)
+    monkeypatch.setattr(batches, "state_batch", of_both)
     train(alone)
     two, one, single = (weights(tmp_path / name) for name in ("two", "one", "single"))
     # the mean of two means is that of all, to rounding; Adam's steps are as long as their rate

@@ -13,6 +13,7 @@ import torch
 from fixtures.training_samples import write_demonstrations
 from torch import nn
 
+from learning.data import batches
 from learning.evaluation import snapshot as evaluating
 from learning.runs import log
 from learning.runs.folder import RunFolder, read_json, write_json
@@ -43,7 +44,7 @@ def config(folder: Path, out: Path, **changes: Any) -> TrainConfig:
 def interrupt(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> list[int]:
     """Have the batch of that call interrupted; gives the calls so far."""
     calls: list[int] = []
-    original = getattr(training, name)
+    original = getattr(batches, name)
 
     def interrupted(*args: Any, **options: Any) -> Any:
         calls.append(1)
@@ -51,7 +52,7 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> list[int
             raise KeyboardInterrupt
         return original(*args, **options)
 
-    monkeypatch.setattr(training, name, interrupted)
+    monkeypatch.setattr(batches, name, interrupted)
     return calls
 
 
