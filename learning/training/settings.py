@@ -31,7 +31,8 @@ class _Trained:
     """Name of the task, see `warp-deform list`."""
     agent: AgentName
     """Transporters see pictures; goal-split and goal-stack also see the goal's picture. traced
-    follows the cable in both masks of cable-mask-goal. The others see the simulator's state."""
+    follows the cable in both masks of cable-mask-goal, and needs --preset fast. The others see the
+    simulator's state."""
     data: Annotated[Path, arg(metavar="DIR")]
     """Folder of demonstrations, see `warp-deform demo`."""
     demos: Annotated[int | None, arg(metavar="N"), COUNT] = None
@@ -59,7 +60,7 @@ class TrainMethod:
     """Learning rate of Adam. By default, the preset's."""
     snapshots: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Number of snapshots, evenly spread. By default, `paper` keeps 10, and `fast` keeps one after
-    7.5, 15, 30, 60 and 100 % of the steps."""
+    7.5, 15, 30, 60 and 100 % of the steps (4 of agents that see the state and 3 of traced)."""
     validate: Annotated[int | None, arg(metavar="N"), COUNT_OR_NONE] = None
     """Validation episodes that every snapshot plays. Training ends when a snapshot solves them all
     and those of --confirm, and `eval` does not play them again. By default, 20 for `fast` (0 with

@@ -1,4 +1,7 @@
-"""Every agent learns one demonstration by heart, through the whole of `train`."""
+"""Agents learn one demonstration by heart, through the whole of `train`.
+
+What a traced one learns, of cables alone, is in `models/test_traced.py`.
+"""
 
 from __future__ import annotations
 
