@@ -330,7 +330,7 @@ def test_the_command_writes_tables_and_curves(
     for seed in (0, 1):
         for demos in (1, 10):
             write_run(tmp_path / f"runs/{demos}-{seed}", seed=seed, demos=demos)
-    write_run(tmp_path / "runs/ring", task=RING, agent="gt-mlp")
+    write_run(tmp_path / "runs/ring", task=RING, agent="transporter")
     out = tmp_path / "out"
     assert main(["report", str(tmp_path / "runs"), "--out", str(out), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
