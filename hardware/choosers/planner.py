@@ -24,7 +24,7 @@ from warp_deform.planning import SearchConfig, search
 from warp_deform.planning.lookahead import Lookahead
 from warp_deform.tasks.cable_mask_goal import CableMaskGoal
 from warp_deform.tasks.free_space import FreeSpace
-from warp_deform.tasks.metrics import mask_iou
+from warp_deform.tasks.metrics import chord_error, mask_iou
 from warp_deform.tasks.strand_trace import trace_strand
 from warp_deform.tasks.task import Layout, Snapshot
 from warp_deform.worlds.worlds import Worlds
@@ -34,7 +34,7 @@ from ..episodes.episode import Observation
 from ..vision.top_down_view import TopDownView
 from .simple import FailedPicks, to_action
 
-__all__ = ["PlannerChooser", "PlannerConfig", "SeenChain", "chord_error"]
+__all__ = ["PlannerChooser", "PlannerConfig", "SeenChain"]
 
 _LANES = 8
 _CHORD_LINKS = 15
@@ -169,26 +169,6 @@ class PlannerChooser:
         )
         self._worlds = Worlds(task, 1, robot="panda", lanes=_LANES)
         self._lookahead = Lookahead(task, robot="panda", precision="float32", count=2 * _LANES)
-
-
-def chord_error(beads: np.ndarray, targets: np.ndarray, *, links: int, spacing: float) -> float:
-    """Return by how much chords of a chain differ in length from those of its targets.
-
-    A chord joins beads so many links apart. It says how bent the chain is there, not where it lies.
-
-    Args:
-        beads: along the chain [m], (n, 2)
-        targets: where they are to lie [m], (n, 2)
-        links: bridged by a chord
-        spacing: of the beads [m]
-
-    Returns:
-        the mean over all chords, relative to the length of a straight one
-    """
-    chords, wanted_chords = (
-        np.linalg.norm(points[links:] - points[:-links], axis=1) for points in (beads, targets)
-    )
-    return float(np.abs(chords - wanted_chords).mean()) / (links * spacing)
 
 
 def stacked(xy: np.ndarray, cable: CableConfig) -> np.ndarray:

@@ -12,20 +12,19 @@ from torch import Tensor
 
 from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE
+from warp_deform.tasks.strand_trace import trace_strand
 from warp_deform.tasks.task import Task
 
 from ..models.batch import Batch
-from ..models.gt_state import GtState, GtState2Step, encode_action
-from ..models.traced import (
-    LEVEL,
+from ..models.cable_model import (
     WAYS,
-    Traced,
-    TracedBatch,
-    TracedConfig,
-    features,
-    matched_traces,
+    moved_points,
+    seen_moves,
     turned_over,
+    turned_over_points,
 )
+from ..models.gt_state import GtState, GtState2Step, encode_action
+from ..models.traced import LEVEL, Traced, TracedBatch, TracedConfig, closer_way
 from ..models.transporter import Transporter
 from .augmentation import draw_transform, draw_transforms, move_actions, move_picture, move_states
 from .dataset import Demonstrations
@@ -46,7 +45,7 @@ _LIFT_GAP = 0.015
 """Lifts of one stage may differ by this [m]: a robot lifts 1 cm less to carry over short ways."""
 
 _TRACES = 50_000
-"""Transitions of which the traced cable is kept, 3 kB each."""
+"""States of which the traced cable is kept, 1 kB each."""
 
 StateBatch = tuple[Tensor, Tensor, Tensor]
 """States (B, D), encoded actions (B, 6), lift indices (B,)."""
@@ -173,46 +172,54 @@ def traced_batch(
     rng: np.random.Generator,
     augment: bool = True,
 ) -> TracedBatch:
-    """Transitions, mirrored and read from either end by `rng`, as a Traced agent sees them.
+    """What was carried and where it led, mirrored and read from either end by `rng`.
 
-    The label is the grip nearest to where the demonstrator picked.
+    Args:
+        data: `as_played`
 
     Raises:
         InputError: a mask shows no cable.
     """
-    seen, grips, last = [], [], agent.config.grips - 1
-    for transition in transitions:
-        shown, grip = _traced(data, agent.config, *transition)
-        mirror, back = WAYS[int(rng.integers(len(WAYS)))] if augment else WAYS[0]
-        seen.append(turned_over(torch.from_numpy(shown)[None], mirror, back)[0])
-        grips.append(last - grip if back else grip)
-    return TracedBatch(torch.stack(seen), torch.tensor(grips))
+    moves = [_traced_move(data, agent.config, *each) for each in transitions]
+    now, after, picks, places = (np.stack(each) for each in zip(*moves, strict=True))
+    seen = torch.from_numpy(seen_moves(now, picks, places))
+    moved = torch.from_numpy(moved_points(now, after, picks, places))
+    if augment:
+        ways = [WAYS[int(k)] for k in rng.integers(len(WAYS), size=len(moves))]
+        shown = [turned_over(seen[k : k + 1], *way) for k, way in enumerate(ways)]
+        went = [turned_over_points(moved[k : k + 1], *way) for k, way in enumerate(ways)]
+        seen, moved = torch.cat(shown), torch.cat(went)
+    return TracedBatch(seen, moved)
 
 
 def check_traces(data: Demonstrations, config: TracedConfig) -> None:
-    """Trace the cable of every transition.
+    """Trace the cable of every state.
 
     Raises:
         InputError: a mask shows none.
     """
     for episode, length in enumerate(data.lengths()):
-        for t in range(length):
-            _traced(data, config, episode, t)
+        for t in range(length + 1):
+            _traced(data, config.points, episode, t)
+
+
+def _traced_move(
+    data: Demonstrations, config: TracedConfig, episode: int, t: int
+) -> tuple[np.ndarray, ...]:
+    """The cable before and after an action (points, 2), its pick and its place (2,), all [px]."""
+    now, after = (_traced(data, config.points, episode, k) for k in (t, t + 1))
+    action = data.action(episode, t)
+    grid = data.task.grid
+    return now, closer_way(now, after), grid.fractional(action[:2]), grid.fractional(action[3:5])
 
 
 @functools.lru_cache(maxsize=_TRACES)
-def _traced(
-    data: Demonstrations, config: TracedConfig, episode: int, t: int
-) -> tuple[np.ndarray, int]:
-    """Features of a transition, and the grip that was taken; tracing takes longer than learning."""
-    transition = data.transition(episode, t)
-    mask, goal = (each[..., 0] > LEVEL for each in (transition.color, transition.goal_color))
-    traces = matched_traces(mask, goal, config.points)
-    if traces is None:
-        raise InputError(f"demonstration {data.seeds[episode]} shows no cable in action {t + 1}")
-    pick = data.task.grid.fractional(transition.action[:2])
-    grip = int(np.linalg.norm(traces[0][config.taken] - pick, axis=1).argmin())
-    return features(*traces), grip
+def _traced(data: Demonstrations, points: int, episode: int, t: int) -> np.ndarray:
+    """The cable of a state (points, 2) [px]; tracing takes longer than learning."""
+    line = trace_strand(data.color(episode, t)[..., 0] > LEVEL, points)
+    if line is None:
+        raise InputError(f"demonstration {data.seeds[episode]} shows no cable after {t} actions")
+    return line
 
 
 def state_batch(

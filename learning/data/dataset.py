@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from .goal_name import GoalName
 
 __all__ = ["Demonstrations", "Transition", "choose", "remove_cache"]
 
+_Kind = GoalName | Literal["played"]
 _FOLDER = "rows"
 _FORMAT = 1
 _COLUMNS = "color", "height", "action", "ground_truth"
@@ -103,7 +104,8 @@ class Demonstrations:
 
     Corrected episodes (`warp_deform.episodes.corrected`) count whether they are solved or not.
     Their transitions are the states that have a label, with the label for an action; their goal is
-    the one that the teacher went for, not their end.
+    the one that the teacher went for, not their end. `as_played` takes what the policy did instead,
+    in all states, of which `color` shows the next one, too.
 
     Args:
         folder: what `warp-deform demo` or `warp-deform correct` wrote
@@ -113,6 +115,7 @@ class Demonstrations:
         spare: how many others there have to be, see `spared`
         goal: of a demonstration; "end" takes how it ended (hindsight, the paper's), "own" the goal
             that it was recorded with
+        as_played: whether to learn what was done and where it led, of corrected episodes too
 
     Raises:
         InputError: no folder, another task's episodes, failures among them, or too few; a goal of
@@ -130,6 +133,7 @@ class Demonstrations:
         seed: int = 0,
         spare: int = 0,
         goal: GoalName = "end",
+        as_played: bool = False,
     ) -> None:
         self.task = find_task(task)
         reader = EpisodeReader(Path(folder))
@@ -161,16 +165,16 @@ class Demonstrations:
                 f"hold out {spare}; collect more"
             )
         self._reader, self._index, self._seed, self._rest = reader, index, seed, rest
-        self._goal = goal
+        self._kind: _Kind = "played" if as_played else goal
         self._take(chosen)
 
     def _take(self, seeds: tuple[int, ...]) -> None:
         self.seeds = seeds
         self.seals = tuple(self._index[episode_name(number)]["seal"] for number in seeds)
-        cache, kind = self._reader.folder / _FOLDER, "" if self._goal == "end" else "-own"
+        cache, kind = self._reader.folder / _FOLDER, "" if self._kind == "end" else f"-{self._kind}"
         self._episodes = [
             _open(
-                self._reader, number, cache / f"{number:09d}-{seal}-{_FORMAT}{kind}.npy", self._goal
+                self._reader, number, cache / f"{number:09d}-{seal}-{_FORMAT}{kind}.npy", self._kind
             )
             for number, seal in zip(self.seeds, self.seals, strict=True)
         ]
@@ -238,6 +242,15 @@ class Demonstrations:
             recorded.actions[t],
         )
 
+    def color(self, episode: int, t: int) -> np.ndarray:
+        """Colour picture (H, W, 3) uint8 of state t of a demonstration, its end the last."""
+        rows = np.load(self._episodes[episode].path, mmap_mode="r", allow_pickle=False)
+        return np.array(rows[t]["color"])
+
+    def action(self, episode: int, t: int) -> np.ndarray:
+        """Action (7,) of transition t."""
+        return np.array(self._episodes[episode].actions[t])
+
     def state(self, episode: int, t: int) -> tuple[np.ndarray, np.ndarray]:
         """Ground truth (D,) float32 before transition t, and its action (7,).
 
@@ -263,24 +276,26 @@ def _counts(entry: Mapping[str, Any]) -> bool:
     return least is None or entry["score"] > least
 
 
-def _open(reader: EpisodeReader, seed: int, path: Path, goal: GoalName) -> _Rows:
+def _open(reader: EpisodeReader, seed: int, path: Path, kind: _Kind) -> _Rows:
     """The cached rows of an episode, made first where they are missing or damaged."""
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
         if rows.dtype.names != _COLUMNS or rows.ndim != 1 or len(rows) < 2:
             raise ValueError("something else under this name")
     except (OSError, ValueError, EOFError):  # not made yet, or cut short by a full disk
-        _write(_rows(_learnt(reader.read(seed), goal, what=reader.path(seed))), path)
+        _write(_rows(_learnt(reader.read(seed), kind, what=reader.path(seed))), path)
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     return _Rows(path, np.array(rows["action"][:-1]), np.array(rows["ground_truth"]))
 
 
-def _learnt(episode: Episode, goal: GoalName, *, what: Path) -> Episode:
+def _learnt(episode: Episode, kind: _Kind, *, what: Path) -> Episode:
     """An episode as it is learnt from: states with what is to be done in them, then its goal.
 
     Raises:
         InputError: there is no label, or no goal of its own.
     """
+    if kind == "played":
+        return episode
     if is_corrected(episode.info.demonstrator):
         labels = labels_of(episode.info, what=what)
         steps = [
@@ -292,7 +307,7 @@ def _learnt(episode: Episode, goal: GoalName, *, what: Path) -> Episode:
             raise InputError(f"{what} holds no label; remove it")
         end = episode.steps[-1]
         return replace(episode, steps=(*steps, end if episode.goal is None else _aimed_at(episode)))
-    if goal == "end":
+    if kind == "end":
         return episode
     if episode.goal is None:
         raise InputError(f"{what} has no goal of its own; leave --goal out")

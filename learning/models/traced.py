@@ -1,14 +1,14 @@
-"""Traced: which part of a cable to bring to its place, by where the cable leads in both masks.
+"""Traced: foresees where a traced cable will lie, and takes the point that brings it closest.
 
 Both masks are traced from end to end (`warp_deform.tasks.strand_trace`), the goal's in the sense in
-which it lies closer. So every point of the cable has a place of its own, and what is left to learn
-is which of a few points to take next: the worst placed one is often not the best. A small network
-along the cable says so. It sees nothing that depends on where in the picture the cable lies or how
-it is turned, and what it says is the same for the mirror image, and whichever end comes first. The
-place is the point's own; nothing is learnt of it.
+which it lies closer. So every point of the cable has a place of its own. What is learnt is where
+the whole cable lies after a point was carried (`learning.models.cable_model`): from what was
+done and seen next, whoever did it, well or badly. To act, it foresees what becomes of the cable
+when each of a few points is brought to its place, and again from the best of these, and takes what
+leads to the greatest value: how far the masks overlap, how close every point is to its place, and
+that the cable is not bent otherwise than the goal's, for a cable that folded up hides how it lies.
 
-A network over pictures has to find which point belongs where, across the whole picture, before it
-can weigh the picks: docs/distillation.md has what the Goal-Split agent makes of the same task.
+Sources: model predictive control with a learnt model; of cables, see `learning.models.cable_model`.
 """
 
 from __future__ import annotations
@@ -19,61 +19,65 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from warp_deform.errors import InputError
 from warp_deform.rendering.pixels import SHAPE
+from warp_deform.tasks.cable_mask_goal import CableMaskGoal
+from warp_deform.tasks.metrics import chord_error, mask_iou
 from warp_deform.tasks.strand_trace import trace_strand
 
+from .cable_model import CableNetwork, after_moves
 from .transporter import Picture, PixelActions
 
 __all__ = [
     "LEVEL",
-    "WAYS",
     "Traced",
     "TracedBatch",
     "TracedConfig",
     "TracedLosses",
-    "features",
+    "closer_way",
     "matched_traces",
-    "turned_over",
 ]
 
-_UNIT = 50.0
-"""Distances are seen in this unit [px], about 10 cm."""
-_GAP, _APART = 30.0, 12
-"""Strands beside a point are seen up to this distance [px]; so many points along the cable, which
-are 32 px of it, are the same strand."""
-_ENDS = 2
+_ENDS = 1
 """Points from an end that are not taken: half a pad then holds the cable."""
+_CHORD = 0.075
+"""Of cable that a chord bridges, more than a kink [m]."""
+_SOLVED, _SURE = 0.6, 0.03
+"""What it is worth to be done, and by so much the overlap should exceed what is needed."""
+_LATER = 0.7
+"""How much of what a second move adds is counted."""
+_LINKS = 2.5
+"""Weight of errors in the steps from point to point, beside those of the points."""
+_SHARP = 0.1
+"""Values that differ by so much differ e times in a picture of them."""
 _DOT = 4.0
 """Radius of a pick in a picture [px]."""
-_DILATIONS = (1, 2, 4, 8, 8)
-_ALONG, _ACROSS, _SINE, _CHANNELS = 0, 1, 6, 9
 LEVEL = 127
 """Above it a level of a mask is cable."""
-WAYS = ((False, False), (False, True), (True, False), (True, True))
-"""What a cable may be shown as: mirrored or not, read from its other end or not."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TracedConfig:
     """Sizes of a Traced agent."""
 
-    points: int = 91
-    """Along the cable; odd, so that an odd number of grips is the same from either end."""
+    points: int = 45
+    """Along the cable."""
     grips: int = 15
     """Points that may be taken, spread evenly."""
-    channels: int = 48
-    """Of the network's features."""
-    members: int = 3
-    """Networks, which learn from the same batches and whose probabilities are averaged."""
+    channels: int = 64
+    """Of a network's features."""
+    members: int = 2
+    """Networks, which learn from the same batches and whose answers are averaged."""
+    beam: int = 5
+    """Moves from which a second one is foreseen, the best ones; 0 looks one move ahead."""
     lifts: tuple[float, ...] = (0.05,)
     """Lift of the task's stage [m]; several there must not be."""
 
     def __post_init__(self) -> None:
         for name, least, most in (("points", 16, 1000), ("grips", 2, self.points - 2 * _ENDS),
-                                  ("channels", 1, 1024), ("members", 1, 64)):  # fmt: skip
+                                  ("channels", 1, 1024), ("members", 1, 64),
+                                  ("beam", 0, self.grips)):  # fmt: skip
             if not least <= getattr(self, name) <= most:
                 raise InputError(
                     f"{name}: {least} to {most} are possible, got {getattr(self, name)}"
@@ -97,20 +101,21 @@ class TracedConfig:
 
 
 class TracedBatch(NamedTuple):
-    """Features (B, 9, points) float32 of traced cables, and which grip was taken, (B,) int64."""
+    """Moves as they are seen (B, 8, points) float32, and how far points went (B, 2, points)."""
 
-    features: Tensor
-    grip: Tensor
+    seen: Tensor
+    moved: Tensor
 
 
 class TracedLosses(NamedTuple):
-    """Cross entropy [nat] of the grips, the members' mean."""
+    """Mean errors of where points go, and of the steps between them, in units of 50 pixels."""
 
-    pick: Tensor
+    points: Tensor
+    links: Tensor
 
     def total(self) -> Tensor:
-        """The same."""
-        return self.pick
+        """Their weighted sum."""
+        return self.points + _LINKS * self.links
 
 
 class Traced(nn.Module):
@@ -128,9 +133,10 @@ class Traced(nn.Module):
     def __init__(self, config: TracedConfig, *, seed: int) -> None:
         super().__init__()
         self.config = config
+        self._task = CableMaskGoal()
         generator = torch.Generator().manual_seed(seed)
         self.members = nn.ModuleList(
-            [_Network(config.channels, generator) for _ in range(config.members)]
+            [CableNetwork(config.channels, generator) for _ in range(config.members)]
         )
 
     def image(self, current: Picture, goal: Picture | None = None) -> Tensor:
@@ -144,34 +150,47 @@ class Traced(nn.Module):
         return torch.from_numpy(np.stack([each[0][..., 0] > LEVEL for each in (current, goal)]))
 
     def forward(self, batch: TracedBatch) -> TracedLosses:
-        """Loss of a batch."""
-        losses = [
-            functional.cross_entropy(each, batch.grip) for each in self.logits(batch.features)
-        ]
-        return TracedLosses(torch.stack(losses).mean())
+        """Losses of a batch, the members' mean."""
+        wrong = torch.stack([member(batch.seen) for member in self.members]) - batch.moved
+        return TracedLosses(wrong.abs().mean(), wrong.diff(dim=3).abs().mean())
 
-    def logits(self, seen: Tensor) -> Tensor:
-        """What every member says of features (B, 9, points): (members, B, grips)."""
-        taken = torch.from_numpy(self.config.taken).to(seen.device)
-        return torch.stack([member(seen)[:, taken] for member in self.members])
+    def values(self, now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """How good it is to bring each grip to its place (grips,), for traces (points, 2) [px].
 
-    @torch.no_grad()
-    def probabilities(self, now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """How probable every grip is (grips,) float64, for matched traces (points, 2) [px].
-
-        The mean over members, and over the cable as it is, read from its other end, and mirrored.
+        The value of what is foreseen, two moves ahead for the best ones, which come before the
+        others.
         """
-        seen = torch.from_numpy(features(now, wanted))[None].to(next(self.parameters()).device)
-        each = [self.logits(turned_over(seen, *way)).softmax(dim=2).mean(dim=0)[0] for way in WAYS]
-        ahead = [p.flip(0) if back else p for p, (_, back) in zip(each, WAYS, strict=True)]
-        return np.asarray(torch.stack(ahead).double().mean(dim=0).cpu().numpy())
+        taken, beam = self.config.taken, self.config.beam
+        goal = self._drawn(wanted)
+        after = self.foreseen(now, wanted)
+        overlaps, values = self._judged(after, wanted, goal)
+        best = np.argsort(-values, kind="stable")[:beam]
+        for k in best:
+            if overlaps[k] <= self._task.success_score + 2 * _SURE:
+                later = self._judged(self.foreseen(after[k], wanted), wanted, goal)[1].max()
+                values[k] += _LATER * (later - values[k])
+        rest = np.setdiff1d(np.arange(len(taken)), best)
+        if beam and len(rest):
+            values[rest] -= max(0.0, float(values[rest].max() - values[best].min()))
+        return values
+
+    def foreseen(self, now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Where the cable lies after each grip was brought to its place, (grips, points, 2) [px].
+
+        Args:
+            now: points along the cable (points, 2) [px]
+            wanted: their places (points, 2) [px]
+        """
+        taken = self.config.taken
+        lines = np.broadcast_to(now, (len(taken), *now.shape))
+        return after_moves(self.members, lines, now[taken], wanted[taken])
 
     def heat(
         self, mask: np.ndarray, goal: np.ndarray, pick: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Pictures (H, W) float32 of how probable picks are in masks (H, W), and of a pick's place.
+        """Pictures (H, W) float32 of how good picks are in masks (H, W), and of a pick's place.
 
-        Both are 0 where a mask shows no cable.
+        The best one has 1. Both are 0 where a mask shows no cable.
 
         Args:
             pick: row and column [px]; the place is that of the grip next to it
@@ -180,15 +199,15 @@ class Traced(nn.Module):
         traces = matched_traces(mask, goal, self.config.points)
         if traces is not None:
             now, wanted = (each[self.config.taken] for each in traces)
-            probable = self.probabilities(*traces)
-            for row, column, share in zip(*now.T, probable, strict=True):
-                _dot(maps[0], row, column, share)
+            values = self.values(*traces)
+            for row, column, lead in zip(*now.T, values - values.max(), strict=True):
+                _dot(maps[0], row, column, np.exp(lead / _SHARP))
             row, column = wanted[np.linalg.norm(now - pick, axis=1).argmin()]
             _dot(maps[1], row, column, 1.0)
         return maps[0], maps[1]
 
     def act(self, image: Tensor, *, avoid: Tensor | None = None) -> PixelActions:
-        """The most probable pick and its place, for masks (B, 2, H, W).
+        """The best pick and its place, for masks (B, 2, H, W).
 
         What is too small to be traced is brought to the middle of the goal's cable.
 
@@ -206,12 +225,12 @@ class Traced(nn.Module):
                 places.append(_middle_of_cable(goal, self.config.points))
                 continue
             now, wanted = (each[self.config.taken] for each in traces)
-            probable = self.probabilities(*traces)
+            values = self.values(*traces)
             if avoid is not None:
                 rows, columns = np.clip(np.rint(now).astype(int), 0, np.array(SHAPE) - 1).T
                 barred = avoid[k].cpu().numpy()[rows, columns]
-                probable = np.where(barred & ~barred.all(), -1.0, probable)
-            grip = int(probable.argmax())
+                values = np.where(barred & ~barred.all(), -np.inf, values)
+            grip = int(values.argmax())
             picks.append(now[grip])
             places.append(wanted[grip])
         count = len(picks)
@@ -219,29 +238,29 @@ class Traced(nn.Module):
             np.array(picks), np.array(places), np.zeros(count), np.full(count, self.config.lifts[0])
         )
 
+    def _judged(
+        self, lines: np.ndarray, wanted: np.ndarray, goal: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """How far cables (K, points, 2) overlap a goal's mask, and their values, (K,) each."""
+        length = self._task.cable.length / self._task.grid.pixel_size
+        spacing = length / (self.config.points - 1)
+        links = max(1, round(_CHORD / self._task.cable.length * (self.config.points - 1)))
+        overlaps = np.array([mask_iou(self._drawn(line), goal) for line in lines])
+        costs = [
+            min(
+                float(np.linalg.norm(line - way, axis=1).mean()) / length
+                + chord_error(line, way, links=links, spacing=spacing)
+                for way in (wanted, wanted[::-1])
+            )
+            for line in lines
+        ]
+        short = (overlaps - self._task.success_score - _SURE) / _SURE
+        done = 1 / (1 + np.exp(-short))
+        return overlaps, overlaps - np.array(costs) + _SOLVED * done
 
-class _Network(nn.Module):
-    """Features (B, 9, points) -> a logit a point (B, points)."""
-
-    def __init__(self, channels: int, generator: torch.Generator) -> None:
-        super().__init__()
-        first = nn.Conv1d(_CHANNELS, channels, 5, padding=2)
-        wide = [nn.Conv1d(channels, channels, 5, padding=2 * k, dilation=k) for k in _DILATIONS]
-        self.layers = nn.ModuleList([first, *wide])
-        self.out = nn.Conv1d(2 * channels, 1, 1)
-        for layer in (*self.layers, self.out):
-            bound = (layer.in_channels * layer.kernel_size[0]) ** -0.5
-            nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
-            nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
-
-    def forward(self, seen: Tensor) -> Tensor:
-        first, *wide = self.layers
-        x = functional.relu(first(seen))
-        for layer in wide:
-            x = x + functional.relu(layer(x))
-        whole = x.mean(dim=2, keepdim=True).expand_as(x)
-        logits: Tensor = self.out(torch.cat([x, whole], dim=1))[:, 0]
-        return logits
+    def _drawn(self, line: np.ndarray) -> np.ndarray:
+        """Mask (H, W) of a cable (points, 2) [px], as thick as the task's."""
+        return self._task.mask(self._task.grid.to_world(line))
 
 
 def matched_traces(
@@ -255,47 +274,12 @@ def matched_traces(
     now, wanted = trace_strand(mask, points), trace_strand(goal, points)
     if now is None or wanted is None:
         return None
-    ways = (wanted, wanted[::-1])
-    return now, min(ways, key=lambda way: float(np.linalg.norm(now - way, axis=1).mean()))
+    return now, closer_way(now, wanted)
 
 
-def features(now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """What the network sees of points (n, 2) [px] and where they belong, (9, n) float32.
-
-    The way to its place along the cable and across it, the latter's size, its length, the mean
-    length; cosine and sine of the turn of the cable there; how far along; the gap to other strands.
-    """
-    tangent, turned = _tangents(now), _tangents(wanted)
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    way = (wanted - now) / _UNIT
-    along, across = (way * tangent).sum(axis=1), (way * normal).sum(axis=1)
-    length = np.linalg.norm(way, axis=1)
-    index = np.arange(len(now))
-    apart = np.linalg.norm(now[:, None] - now[None], axis=2)
-    apart[np.abs(index[:, None] - index) <= _APART] = np.inf
-    rows = [
-        along,
-        across,
-        np.abs(across),
-        length,
-        np.full(len(now), length.mean()),
-        (turned * tangent).sum(axis=1),
-        (turned * normal).sum(axis=1),
-        np.abs(np.linspace(-1.0, 1.0, len(now))),
-        np.minimum(apart.min(axis=1), _GAP) / _GAP,
-    ]
-    return np.stack(rows).astype(np.float32)
-
-
-def turned_over(seen: Tensor, mirror: bool, back: bool) -> Tensor:
-    """Features (B, 9, points) of the mirror image, or of the cable read from its other end."""
-    sign = seen.new_ones(_CHANNELS)
-    if mirror:
-        sign[[_ACROSS, _SINE]] *= -1
-    if back:
-        sign[[_ALONG, _ACROSS]] *= -1
-    shown = seen * sign[:, None]
-    return shown.flip(2) if back else shown
+def closer_way(now: np.ndarray, then: np.ndarray) -> np.ndarray:
+    """A line (points, 2), read from the end that brings its points closer to another's."""
+    return min((then, then[::-1]), key=lambda way: float(np.linalg.norm(now - way, axis=1).mean()))
 
 
 def _middle(mask: np.ndarray) -> np.ndarray:
@@ -317,10 +301,3 @@ def _dot(canvas: np.ndarray, row: float, column: float, value: float) -> None:
     rows, columns = np.ogrid[: canvas.shape[0], : canvas.shape[1]]
     near = np.hypot(rows - row, columns - column) < _DOT
     canvas[near] = np.maximum(canvas[near], value)
-
-
-def _tangents(line: np.ndarray) -> np.ndarray:
-    """Unit vectors along a line (n, 2) of two points or more; the mean of two steps either way."""
-    index = np.arange(len(line))
-    ahead = line[np.minimum(index + 2, len(line) - 1)] - line[np.maximum(index - 2, 0)]
-    return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)

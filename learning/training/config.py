@@ -43,6 +43,11 @@ class TrainConfig(TrainSettings):
             raise InputError(f"goal is {self.goal!r}; it must be one of {list(GOALS)}")
         if self.goal == "own" and not find_task(self.task).goal_conditioned:
             raise InputError(f"goal is 'own', and {self.task} has no goals; leave --goal out")
+        if self.goal == "own" and AGENTS[self.agent].sees == "traces":
+            raise InputError(
+                f"goal is 'own', and {self.agent} learns what actions lead to, whatever the goal; "
+                "leave --goal out"
+            )
         if self.device not in DEVICES:
             raise InputError(f"device is {self.device!r}; it must be 'cpu' or 'cuda'")
         for name, least in (("seed", 0), ("threads", 1), ("hold_out", 0)):

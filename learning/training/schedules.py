@@ -121,8 +121,8 @@ STATE_SCHEDULES = {
 """The same for the ground-truth baselines."""
 
 TRACED_SCHEDULE = Schedule(
-    steps=3000,
-    batch=32,
+    steps=4000,
+    batch=64,
     lr=2e-3,
     warmup=100,
     decay=True,

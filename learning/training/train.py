@@ -121,6 +121,7 @@ def train(config: TrainConfig) -> TrainReport:
             seed=config.seed,
             spare=config.hold_out,
             goal=config.goal,
+            as_played=AGENTS[config.agent].sees == "traces",
         )
         check_lifts(data)
         plan = config.plan(len(data))

@@ -7,7 +7,15 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["coverage", "hull_area", "mask_iou", "pose_error", "share_in_zone", "wrap_angle"]
+__all__ = [
+    "chord_error",
+    "coverage",
+    "hull_area",
+    "mask_iou",
+    "pose_error",
+    "share_in_zone",
+    "wrap_angle",
+]
 
 
 def wrap_angle(angle: float) -> float:
@@ -104,3 +112,23 @@ def pose_error(pose: np.ndarray, target: np.ndarray) -> tuple[float, float]:
     """
     x, y, yaw = np.subtract(pose, target)
     return float(np.hypot(x, y)), abs(wrap_angle(yaw))
+
+
+def chord_error(beads: np.ndarray, targets: np.ndarray, *, links: int, spacing: float) -> float:
+    """Return by how much chords of a chain differ in length from those of its targets.
+
+    A chord joins beads so many links apart. It says how bent the chain is there, not where it lies.
+
+    Args:
+        beads: along the chain [m], (n, 2)
+        targets: where they are to lie [m], (n, 2)
+        links: bridged by a chord
+        spacing: of the beads [m]
+
+    Returns:
+        the mean over all chords, relative to the length of a straight one
+    """
+    chords, wanted_chords = (
+        np.linalg.norm(points[links:] - points[:-links], axis=1) for points in (beads, targets)
+    )
+    return float(np.abs(chords - wanted_chords).mean()) / (links * spacing)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from fixtures.franka_arm import Arm
 from fixtures.franka_episodes import (
     CALIBRATION,
@@ -25,7 +23,7 @@ from hardware.arm.pick_place import PickPlaceAction, PickPlaceConfig, refusal
 from hardware.arm.safe_robot import SafeRobot
 from hardware.choosers.finger_clearance import has_finger_clearance
 from hardware.choosers.human import HumanChooser
-from hardware.choosers.planner import PlannerChooser, PlannerConfig, SeenChain, chord_error
+from hardware.choosers.planner import PlannerChooser, PlannerConfig, SeenChain
 from hardware.choosers.simple import RandomChooser, ScriptedChooser, still_chain, to_action
 from hardware.episodes.episode import EpisodeConfig, Observation, run_episode
 from hardware.recordings.recording import Recording
@@ -119,18 +117,6 @@ def test_the_scripted_chooser_takes_the_demonstrators_beads_and_others_where_tho
 def test_an_environments_action_loses_its_lift() -> None:
     action = to_action(np.array([0.4, 0.1, 0.2, 0.5, -0.1, 0.3, 0.05]))
     assert action == PickPlaceAction((0.4, 0.1), 0.2, (0.5, -0.1), 0.3)
-
-
-def test_chords_tell_how_a_chain_is_bent_wherever_it_lies() -> None:
-    straight = np.column_stack([np.zeros(90), np.arange(90) * 5e-3])
-    error = functools.partial(chord_error, links=15, spacing=5e-3)
-    assert error(straight[:, ::-1] + 0.1, straight) == pytest.approx(0.0, abs=1e-12)
-    kinked = straight.copy()
-    kinked[45:] -= [0.0, 0.075]  # the second half lies back by as long as a chord
-    assert error(kinked, straight) == pytest.approx(15 / 75), "15 of 75 chords bridge the kink"
-    arc = np.linspace(0.0, np.pi, 90)
-    bow = np.column_stack([np.cos(arc), np.sin(arc)]) * 89 * 5e-3 / np.pi
-    assert error(bow, straight) > 0.01 and error(straight, bow) == error(bow, straight)
 
 
 def test_a_planner_prefers_a_straight_chain_beside_its_goal_to_a_kinked_one_on_it() -> None:

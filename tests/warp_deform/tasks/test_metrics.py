@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import functools
 import math
 
 import numpy as np
@@ -110,3 +111,15 @@ def test_pose_error_is_symmetric_and_periodic(pose, target, turns) -> None:
     again = metrics.pose_error(pose + np.array([0, 0, 2 * np.pi * turns]), target)
     assert again == pytest.approx((distance, turn), abs=1e-9)
     assert metrics.pose_error(pose, pose) == (0, 0)
+
+
+def test_chords_tell_how_a_chain_is_bent_wherever_it_lies() -> None:
+    straight = np.column_stack([np.zeros(90), np.arange(90) * 5e-3])
+    error = functools.partial(metrics.chord_error, links=15, spacing=5e-3)
+    assert error(straight[:, ::-1] + 0.1, straight) == pytest.approx(0.0, abs=1e-12)
+    kinked = straight.copy()
+    kinked[45:] -= [0.0, 0.075]  # the second half lies back by as long as a chord
+    assert error(kinked, straight) == pytest.approx(15 / 75), "15 of 75 chords bridge the kink"
+    arc = np.linspace(0.0, np.pi, 90)
+    bow = np.column_stack([np.cos(arc), np.sin(arc)]) * 89 * 5e-3 / np.pi
+    assert error(bow, straight) > 0.01 and error(straight, bow) == error(bow, straight)
