@@ -11,6 +11,7 @@ that end in another error count as failed, after 10 actions. Mean actions are gi
 episodes and over the solved ones, as the paper's. With --out, episodes already in that file are not
 played again. Intervals are 95 % and know that tosses at one goal are alike, see
 `learning.evaluation.clustered`.
+Goals are drawn by their number and nobody chose them; `--first-goal 10 --goals 20` plays others.
 The paper's protocol is `--tosses 1` with a policy of 24 demonstrations and 6 held out.
 """
 
@@ -72,6 +73,7 @@ def main() -> None:
     parser.add_argument("--policy", type=Path, help="training run of cable-mask-goal")
     parser.add_argument("--budget", type=int, help="of the planner")
     parser.add_argument("--goals", type=int, default=10)
+    parser.add_argument("--first-goal", type=int, default=0, help="number of the first of them")
     parser.add_argument("--tosses", type=int, default=10, help="for each goal")
     parser.add_argument("--out", type=Path, help="file of JSON lines to which episodes are added")
     parser.add_argument("--plot", type=Path, help="PNG of the overlaps")
@@ -80,7 +82,8 @@ def main() -> None:
     rows = _read(options.out)
     with single_threaded():
         for agent in options.agents:
-            for goal, toss in itertools.product(range(options.goals), range(options.tosses)):
+            goals = range(options.first_goal, options.first_goal + options.goals)
+            for goal, toss in itertools.product(goals, range(options.tosses)):
                 if any((r.agent, r.goal, r.toss) == (agent, goal, toss) for r in rows):
                     continue
                 rows.append(play(agent, goal, toss, policy=options.policy, budget=options.budget))

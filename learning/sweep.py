@@ -139,6 +139,8 @@ class SweepConfig(TrainMethod):
         method = {each.name: getattr(self, each.name) for each in fields(TrainMethod)}
         if not issubclass(AGENTS[agent], Transporter):
             method["precision"] = "auto"
+        if AGENTS[agent].sees == "traces":
+            method["goal"] = "end"  # it learns of no goal
         return TrainConfig(
             task=task,
             agent=agent,

@@ -16,8 +16,9 @@ __all__ = ["CorrectOptions", "correct"]
 class CorrectOptions(CorrectSettings, CommandOptions):
     """Let a policy play while a teacher says in every state what it would have done (DAgger).
 
-    `train` on the new folder learns from the teacher's labels and the demonstrations. The same
-    command goes on where it was stopped.
+    `train` on the new folder learns from the teacher's labels and the demonstrations, or, of an
+    agent that learns what actions lead to, from what the policy did. The same command goes on where
+    it was stopped.
     """
 
 

@@ -23,6 +23,9 @@ def interrupted(step: int, *, unit: str = "step") -> str:
 def trained(report: Mapping[str, Any], *, out: Path) -> str:
     """What `train` came to: the fields of `train.TrainReport` and the folder."""
     steps, planned = report["steps"], report["planned_steps"]
+    outcomes = report["agent"] == "traced"  # it learns from what was done, and errs by distances
+    unit = "" if outcomes else " nat"
+    learnt = f"{report['labels']} {'actions' if outcomes else 'labels'} in all"
     lines = {
         "run": str(out),
         "agent": f"{report['agent']} for {report['task']}, preset {report['preset']}, seed "
@@ -33,7 +36,7 @@ def trained(report: Mapping[str, Any], *, out: Path) -> str:
     if report["corrected"]:
         lines["learnt from"] = (
             f"{_count(report['demos'] - report['corrected'], 'demonstration')} and "
-            f"{_count(report['corrected'], 'corrected episode')}, {report['labels']} labels in all"
+            f"{_count(report['corrected'], 'corrected episode')}, {learnt}"
         )
     if report["left_out"]:
         lines["learnt from"] += f"; {_count(report['left_out'], 'recording')} left out as none"
@@ -53,9 +56,9 @@ def trained(report: Mapping[str, Any], *, out: Path) -> str:
     if report["chosen"] is not None:
         lines["chosen"] = f"step {report['chosen']}, by validation"
     for step, loss in report["held_out"].items():
-        lines[f"step {step}"] = f"loss {loss:.3f} nat on demonstrations that were held out"
+        lines[f"step {step}"] = f"loss {loss:.3f}{unit} on demonstrations that were held out"
     if report["loss"] is not None:
-        lines["loss"] = f"{report['loss']:.3f} nat over the last logged steps"
+        lines["loss"] = f"{report['loss']:.3f}{unit} over the last logged steps"
     lines["time"] = (
         f"{duration(report['cpu_seconds'])} of CPU for the steps, this call "
         f"{duration(report['seconds'])}"

@@ -19,12 +19,13 @@ from ..models.batch import Batch
 from ..models.cable_model import (
     WAYS,
     moved_points,
+    same_way,
     seen_moves,
     turned_over,
     turned_over_points,
 )
 from ..models.gt_state import GtState, GtState2Step, encode_action
-from ..models.traced import LEVEL, Traced, TracedBatch, TracedConfig, closer_way
+from ..models.traced import LEVEL, Traced, TracedBatch, TracedConfig
 from ..models.transporter import Transporter
 from .augmentation import draw_transform, draw_transforms, move_actions, move_picture, move_states
 from .dataset import Demonstrations
@@ -208,9 +209,9 @@ def _traced_move(
 ) -> tuple[np.ndarray, ...]:
     """The cable before and after an action (points, 2), its pick and its place (2,), all [px]."""
     now, after = (_traced(data, config.points, episode, k) for k in (t, t + 1))
-    action = data.action(episode, t)
-    grid = data.task.grid
-    return now, closer_way(now, after), grid.fractional(action[:2]), grid.fractional(action[3:5])
+    action, grid = data.action(episode, t), data.task.grid
+    pick, place = grid.fractional(action[:2]), grid.fractional(action[3:5])
+    return now, same_way(now, after, pick, place), pick, place
 
 
 @functools.lru_cache(maxsize=_TRACES)
@@ -218,7 +219,9 @@ def _traced(data: Demonstrations, points: int, episode: int, t: int) -> np.ndarr
     """The cable of a state (points, 2) [px]; tracing takes longer than learning."""
     line = trace_strand(data.color(episode, t)[..., 0] > LEVEL, points)
     if line is None:
-        raise InputError(f"demonstration {data.seeds[episode]} shows no cable after {t} actions")
+        raise InputError(
+            f"episode {data.seeds[episode]} shows no cable after {t} actions; remove its file"
+        )
     return line
 
 

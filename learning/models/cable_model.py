@@ -23,6 +23,7 @@ __all__ = [
     "CableNetwork",
     "after_moves",
     "moved_points",
+    "same_way",
     "seen_moves",
     "turned_over",
     "turned_over_points",
@@ -31,7 +32,8 @@ __all__ = [
 _UNIT = 50.0
 """Distances are seen and said in this unit [px], about 10 cm."""
 _DILATIONS = (1, 2, 4, 8, 4)
-_ACROSS, _SINE, _BACK = (1, 3), 3, 7
+_MIRRORED, _REVERSED = [1, 3], [2, 3, 7]
+"""Channels that change their sign in the mirror image, and when read from the other end."""
 _CHANNELS = 8
 WAYS = ((False, False), (False, True), (True, False), (True, True))
 """What a cable may be shown as: mirrored or not, read from its other end or not."""
@@ -108,9 +110,9 @@ def turned_over(seen: Tensor, mirror: bool, back: bool) -> Tensor:
     """Moves (B, 8, points) as seen of the mirror image, or of the cable read from its other end."""
     sign = seen.new_ones(_CHANNELS)
     if mirror:
-        sign[list(_ACROSS)] *= -1
+        sign[_MIRRORED] *= -1
     if back:
-        sign[[_SINE - 1, _SINE, _BACK]] *= -1
+        sign[_REVERSED] *= -1
     shown = seen * sign[:, None]
     return shown.flip(2) if back else shown
 
@@ -127,6 +129,21 @@ def moved_points(
     """How far points went, from lines to others (K, points, 2) [px], as said, (K, 2, points)."""
     moved = np.einsum("kij,knj->kin", _axes(picks, places), after - lines) / _UNIT
     return np.asarray(moved, np.float32)
+
+
+def same_way(now: np.ndarray, after: np.ndarray, pick: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """The line (points, 2) after a move, read from the end from which the one before is.
+
+    Points lie closer to where they lay, and the picked one to its place: an end that is carried
+    beyond the other end would fit either way without the latter.
+    """
+    taken = int(np.linalg.norm(now - pick, axis=1).argmin())
+
+    def far(way: np.ndarray) -> float:
+        rest = float(np.linalg.norm(way - now, axis=1).mean())
+        return rest + float(np.linalg.norm(way[taken] - place))
+
+    return min((after, after[::-1]), key=far)
 
 
 @torch.no_grad()

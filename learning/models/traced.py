@@ -4,9 +4,9 @@ Both masks are traced from end to end (`warp_deform.tasks.strand_trace`), the go
 which it lies closer. So every point of the cable has a place of its own. What is learnt is where
 the whole cable lies after a point was carried (`learning.models.cable_model`): from what was
 done and seen next, whoever did it, well or badly. To act, it foresees what becomes of the cable
-when each of a few points is brought to its place, and again from the best of these, and takes what
-leads to the greatest value: how far the masks overlap, how close every point is to its place, and
-that the cable is not bent otherwise than the goal's, for a cable that folded up hides how it lies.
+when each of a few points is brought to its place, and takes what leads to the greatest value: how
+far the masks overlap, how close every point is to its place, and that the cable is not bent
+otherwise than the goal's, for a cable that folded up hides how it lies.
 
 Sources: model predictive control with a learnt model; of cables, see `learning.models.cable_model`.
 """
@@ -45,8 +45,6 @@ _CHORD = 0.075
 """Of cable that a chord bridges, more than a kink [m]."""
 _SOLVED, _SURE = 0.6, 0.03
 """What it is worth to be done, and by so much the overlap should exceed what is needed."""
-_LATER = 0.7
-"""How much of what a second move adds is counted."""
 _LINKS = 2.5
 """Weight of errors in the steps from point to point, beside those of the points."""
 _SHARP = 0.1
@@ -69,15 +67,12 @@ class TracedConfig:
     """Of a network's features."""
     members: int = 2
     """Networks, which learn from the same batches and whose answers are averaged."""
-    beam: int = 5
-    """Moves from which a second one is foreseen, the best ones; 0 looks one move ahead."""
     lifts: tuple[float, ...] = (0.05,)
     """Lift of the task's stage [m]; several there must not be."""
 
     def __post_init__(self) -> None:
         for name, least, most in (("points", 16, 1000), ("grips", 2, self.points - 2 * _ENDS),
-                                  ("channels", 1, 1024), ("members", 1, 64),
-                                  ("beam", 0, self.grips)):  # fmt: skip
+                                  ("channels", 1, 1024), ("members", 1, 64)):  # fmt: skip
             if not least <= getattr(self, name) <= most:
                 raise InputError(
                     f"{name}: {least} to {most} are possible, got {getattr(self, name)}"
@@ -155,24 +150,9 @@ class Traced(nn.Module):
         return TracedLosses(wrong.abs().mean(), wrong.diff(dim=3).abs().mean())
 
     def values(self, now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """How good it is to bring each grip to its place (grips,), for traces (points, 2) [px].
-
-        The value of what is foreseen, two moves ahead for the best ones, which come before the
-        others.
-        """
-        taken, beam = self.config.taken, self.config.beam
+        """How good it is to bring each grip to its place (grips,), for traces (points, 2) [px]."""
         goal = self._drawn(wanted)
-        after = self.foreseen(now, wanted)
-        overlaps, values = self._judged(after, wanted, goal)
-        best = np.argsort(-values, kind="stable")[:beam]
-        for k in best:
-            if overlaps[k] <= self._task.success_score + 2 * _SURE:
-                later = self._judged(self.foreseen(after[k], wanted), wanted, goal)[1].max()
-                values[k] += _LATER * (later - values[k])
-        rest = np.setdiff1d(np.arange(len(taken)), best)
-        if beam and len(rest):
-            values[rest] -= max(0.0, float(values[rest].max() - values[best].min()))
-        return values
+        return np.array([self._value(line, wanted, goal) for line in self.foreseen(now, wanted)])
 
     def foreseen(self, now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """Where the cable lies after each grip was brought to its place, (grips, points, 2) [px].
@@ -238,25 +218,19 @@ class Traced(nn.Module):
             np.array(picks), np.array(places), np.zeros(count), np.full(count, self.config.lifts[0])
         )
 
-    def _judged(
-        self, lines: np.ndarray, wanted: np.ndarray, goal: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """How far cables (K, points, 2) overlap a goal's mask, and their values, (K,) each."""
+    def _value(self, line: np.ndarray, wanted: np.ndarray, goal: np.ndarray) -> float:
+        """How good it is that a cable lies at (points, 2) [px], for a goal and its mask."""
         length = self._task.cable.length / self._task.grid.pixel_size
-        spacing = length / (self.config.points - 1)
-        links = max(1, round(_CHORD / self._task.cable.length * (self.config.points - 1)))
-        overlaps = np.array([mask_iou(self._drawn(line), goal) for line in lines])
-        costs = [
-            min(
-                float(np.linalg.norm(line - way, axis=1).mean()) / length
-                + chord_error(line, way, links=links, spacing=spacing)
-                for way in (wanted, wanted[::-1])
-            )
-            for line in lines
-        ]
-        short = (overlaps - self._task.success_score - _SURE) / _SURE
-        done = 1 / (1 + np.exp(-short))
-        return overlaps, overlaps - np.array(costs) + _SOLVED * done
+        steps = self.config.points - 1
+        links = max(1, round(_CHORD / self._task.cable.length * steps))
+        overlap = mask_iou(self._drawn(line), goal)
+        cost = min(
+            float(np.linalg.norm(line - way, axis=1).mean()) / length
+            + chord_error(line, way, links=links, spacing=length / steps)
+            for way in (wanted, wanted[::-1])
+        )
+        solved = 1 / (1 + np.exp((self._task.success_score + _SURE - overlap) / _SURE))
+        return overlap - cost + _SOLVED * float(solved)
 
     def _drawn(self, line: np.ndarray) -> np.ndarray:
         """Mask (H, W) of a cable (points, 2) [px], as thick as the task's."""

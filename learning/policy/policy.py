@@ -44,6 +44,8 @@ __all__ = [
     "make_agent",
 ]
 
+_REASON = 200
+"""So much of what is wrong with a snapshot's weights is said [characters]."""
 Agent = Transporter | Traced | GtState | GtState2Step
 
 _LEVELS, _PIXELS = 10, 4
@@ -274,7 +276,7 @@ def load_policy(path: str | Path, *, device: str = "cpu") -> ImagePolicy | State
         if not all(bool(each.isfinite().all()) for each in agent.parameters()):
             raise ValueError("its weights are not finite")
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = " ".join(str(error).split())[:_REASON] or type(error).__name__
         raise InputError(f"{file} is no snapshot of this release's agents: {reason}") from error
     agent.to(device)
     if isinstance(agent, Transporter | Traced):

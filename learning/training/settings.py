@@ -31,8 +31,8 @@ class _Trained:
     """Name of the task, see `warp-deform list`."""
     agent: AgentName
     """Transporters see pictures; goal-split and goal-stack also see the goal's picture. traced
-    follows the cable in both masks of cable-mask-goal, and needs --preset fast. The others see the
-    simulator's state."""
+    follows the cable in both masks of cable-mask-goal, learns what actions lead to, and needs
+    --preset fast. The others see the simulator's state."""
     data: Annotated[Path, arg(metavar="DIR")]
     """Folder of demonstrations, see `warp-deform demo`."""
     demos: Annotated[int | None, arg(metavar="N"), COUNT] = None
@@ -51,7 +51,8 @@ class TrainMethod:
     """The paper's network and schedule, or one for two CPU cores."""
     goal: GoalName = "end"
     """What is the goal of a demonstration: its end, as in the paper, or the goal of its own that it
-    was recorded with, which other objects can surround; see `demo --goals`."""
+    was recorded with, which other objects can surround; see `demo --goals`. traced learns of no
+    goal."""
     steps: Annotated[int | None, arg(metavar="N"), COUNT] = None
     """Number of training steps. By default, the preset's."""
     batch: Annotated[int | None, arg(metavar="N"), COUNT] = None

@@ -63,14 +63,15 @@ class TrainReport:
     Attributes:
         demos: episodes that were learned from
         corrected: how many of these are corrected episodes
-        labels: actions of demonstrations, and labels of corrected episodes, that were learned from
+        labels: actions of demonstrations, and labels of corrected episodes, that were learned from;
+            of an agent that learns outcomes the actions of both
         left_out: recordings of the folder that are no demonstrations, see `dataset.Demonstrations`
         steps: taken in all, of planned_steps
         snapshots: the steps of which there are snapshots
         validation: of snapshots on validation episodes, `n_success`, `n_episodes`, `mean_score` by
             step; one that solved all that every snapshot plays has played more, see `confirm`
         chosen: the step whose snapshot did best on them, as `eval` would choose; None without them
-        loss: mean over the last logged steps [nat]
+        loss: mean over the last logged steps [nat], or as the agent's losses say
         held_out: that of snapshots on held-out demonstrations by step [nat]
         seconds: of this call [s]
         cpu_seconds: that the steps of all calls took the process, without validation [s]

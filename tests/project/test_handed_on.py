@@ -8,6 +8,7 @@ import sys
 import pytest
 from fixtures.places import ROOT
 
+from learning.policy.policy import load_policy
 from warp_deform.tasks.registration import env_id
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -27,6 +28,7 @@ def test_a_policy_is_small_and_has_a_result_of_its_task_as_it_is(name: str) -> N
     assert row["environment"] == env_id(run["agent"]["task"])
     assert len(weights) == 1 and weights[0].stat().st_size == row["bytes"] <= MOST
     assert not row["revision"]["dirty"] and row["n_episodes"] >= 100
+    assert load_policy(handed_on.POLICIES / name).description.agent == row["agent"]
 
 
 def test_no_result_is_without_its_policy() -> None:

@@ -169,3 +169,14 @@ def test_labels_are_counted_beside_demonstrations() -> None:
     report = {**TRAINED, "demos": 30, "corrected": 20, "labels": 300}
     said = trained(report, out=Path("runs/line"))
     assert "10 demonstrations and 20 corrected episodes, 300 labels in all" in said
+
+
+def test_what_an_agent_of_outcomes_learnt_is_no_label_and_no_likelihood() -> None:
+    report = {**TRAINED, "agent": "traced", "demos": 30, "corrected": 20, "labels": 300}
+    report |= {"loss": 0.07, "held_out": {40: 0.05}}
+    said = trained(report, out=Path("runs/mask"))
+    assert "20 corrected episodes, 300 actions in all" in said
+    assert "0.070 over the last" in said and "loss 0.050 on demonstrations" in said
+    assert "nat" not in said
+    named = trained({**report, "agent": "transporter"}, out=Path("runs/mask"))
+    assert "0.070 nat over the last" in named and "loss 0.050 nat on demonstrations" in named

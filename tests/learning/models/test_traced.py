@@ -15,7 +15,15 @@ from learning.data.dataset import Demonstrations
 from learning.evaluation.protocol import Protocol
 from learning.evaluation.snapshot import evaluate_snapshot
 from learning.evaluation.video import heat_maps
-from learning.models.cable_model import after_moves
+from learning.models.cable_model import (
+    WAYS,
+    after_moves,
+    moved_points,
+    same_way,
+    seen_moves,
+    turned_over,
+    turned_over_points,
+)
 from learning.models.traced import Traced, TracedConfig, matched_traces
 from learning.policy.policy import AgentDescription, ImagePolicy, load_policy
 from learning.runs.folder import RunFolder
@@ -29,7 +37,7 @@ from warp_deform.tasks.chain_shapes import curved_chain, tossed_chain
 from warp_deform.tasks.strand_trace import trace_strand
 
 TASK = CableMaskGoal()
-SMALL = TracedConfig(channels=8, members=2, beam=2)
+SMALL = TracedConfig(channels=8, members=2)
 
 
 def lines(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -97,32 +105,51 @@ def test_what_is_foreseen_is_in_pixels_of_the_picture() -> None:
     np.testing.assert_allclose(still, many, atol=1e-6)
 
 
-def knowing(beam: int) -> Traced:
+def knowing() -> Traced:
     """An agent whose model is `Rigid`."""
-    agent = Traced(dataclasses.replace(SMALL, members=1, beam=beam), seed=0)
+    agent = Traced(dataclasses.replace(SMALL, members=1), seed=0)
     agent.members = torch.nn.ModuleList([Rigid()])
     return agent
 
 
-@pytest.mark.parametrize("beam", [0, 3])
-def test_it_takes_what_leads_to_the_goal(beam: int) -> None:
+def test_it_takes_what_leads_to_the_goal() -> None:
     """A rigid cable beside its goal, one end astray: any grip but those there solves it."""
     goal = np.column_stack([np.linspace(40, 280, SMALL.points), np.full(SMALL.points, 90.0)])
     now = goal - np.array([0.0, 50.0])
     now[:6, 1] -= np.linspace(40, 0, 6)
-    values = knowing(beam).values(now, goal)
-    assert values[:2].max() < values[3:].min()
+    values = knowing().values(now, goal)
+    assert values[:2].max() < values[3:].min() and values.max() > 1.0, "solved"
     image = torch.from_numpy(np.stack([picture(each)[0][..., 0] > 127 for each in (now, goal)]))
-    action = knowing(beam).act(image[None])
+    action = knowing().act(image[None])
     assert np.linalg.norm(action.place[0] - action.pick[0] - [0.0, 50.0]) < 4.0
 
 
-def test_a_second_move_counts_where_the_first_does_not_solve() -> None:
-    now, goal = lines(0)
-    one, two = knowing(0).values(now, goal), knowing(3).values(now, goal)
-    best = np.argsort(-one)[:3]
-    assert (two[best] != one[best]).any()
-    assert two[best].min() >= np.delete(two, best).max(), "what is not looked at comes later"
+def test_a_cable_that_folds_up_is_worth_less_than_one_as_near_that_does_not() -> None:
+    goal = np.column_stack([np.linspace(40, 280, SMALL.points), np.full(SMALL.points, 70.0)])
+    agent, aim = knowing(), picture(goal)[0][..., 0] > 127
+    folded = goal + np.array([0.0, 20.0])
+    folded[30:] = folded[29:14:-1] + np.array([0.0, 12.0])  # back beside itself
+    off = np.linalg.norm(folded - goal, axis=1).mean()
+    beside = goal + np.array([0.0, off])
+    for line in (folded, beside):
+        assert not (picture(line)[0][..., 0] > 127)[aim].any(), "neither overlaps the goal"
+    assert agent._value(folded, goal, aim) < agent._value(beside, goal, aim) - 0.05
+
+
+def test_an_end_that_is_carried_beyond_the_other_is_still_that_end() -> None:
+    """Read from either end the line after it lies about as close; the picked end tells."""
+    now = np.column_stack([np.linspace(40, 240, SMALL.points), np.full(SMALL.points, 60.0)])
+    for beyond in (0.9, 1.1, 1.3, 1.45):  # of the cable's length, where the end is carried to
+        half = np.argmin(np.abs(now[:, 0] - 40 - 100 * beyond))
+        after = now.copy()
+        # what is left of the fold is drawn over to the right, beside the rest
+        after[:half, 0] = 2 * now[half, 0] - now[:half, 0]
+        after[:half, 1] += 16.0
+        for way in (after, after[::-1]):
+            np.testing.assert_array_equal(same_way(now, way, now[0], after[0]), after)
+            np.testing.assert_array_equal(
+                same_way(now[::-1], way, now[0], after[0]), after[::-1], err_msg="from there"
+            )
 
 
 def test_it_picks_on_the_cable_and_places_on_the_goal_where_that_point_belongs() -> None:
@@ -189,7 +216,6 @@ def test_without_a_cable_what_there_is_goes_to_the_middle_of_the_goal() -> None:
         ({"points": 8}, "points"),
         ({"members": 0}, "members"),
         ({"channels": 0}, "channels"),
-        ({"beam": 16}, "beam: 0 to 15"),
         ({"lifts": (0.05, 0.3)}, "lifts: one"),
     ],
 )
@@ -252,12 +278,39 @@ def test_it_learns_what_the_actions_led_to(trained: Path) -> None:
     far = plain.seen[:, 4, 0]
     placed = (ahead - far).hypot(aside) < 0.3  # 15 px, 3 cm
     assert len(every) > 8 and placed.float().mean() > 0.8 and far.max() > 2.0
+    found = set()
     for batch in turned:
-        # neither distances nor the way ahead of the whole cable change
-        torch.testing.assert_close(batch.moved[:, 0].mean(dim=1), plain.moved[:, 0].mean(dim=1))
-        size, before = (each.moved.norm(dim=1).sort(dim=1).values for each in (batch, plain))
-        torch.testing.assert_close(size, before)
-        assert not torch.equal(batch.moved, plain.moved)
+        for seen, moved, shown, went in zip(*batch, *plain, strict=True):
+            ways = [
+                way
+                for way in WAYS
+                if torch.equal(turned_over(shown[None], *way)[0], seen)
+                and torch.equal(turned_over_points(went[None], *way)[0], moved)
+            ]
+            assert len(ways) == 1, "both are turned, and in the same way"
+            found.update(ways)
+    assert found == set(WAYS)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_moves_turned_over_are_those_of_the_cable_turned_over(way: tuple[bool, bool]) -> None:
+    mirror, back = way
+    (now, goal), rng = lines(4), np.random.default_rng(0)
+    after = now + rng.normal(0, 5, now.shape)
+    picks, places = now[[9, 30]], goal[[9, 30]]
+    both = [np.stack([each, each]) for each in (now, after)]
+    seen = torch.from_numpy(seen_moves(both[0], picks, places))
+    moved = torch.from_numpy(moved_points(*both, picks, places))
+    if mirror:
+        both, picks, places = [b * [1, -1] for b in both], picks * [1, -1], places * [1, -1]
+    if back:
+        both = [b[:, ::-1] for b in both]
+    np.testing.assert_allclose(
+        turned_over(seen, *way).numpy(), seen_moves(both[0], picks, places), atol=1e-5
+    )
+    np.testing.assert_allclose(
+        turned_over_points(moved, *way).numpy(), moved_points(*both, picks, places), atol=1e-5
+    )
 
 
 def test_outcomes_are_learnt(trained: Path) -> None:
