@@ -26,7 +26,7 @@ from learning.models.cable_model import (
 )
 from learning.models.traced import Traced, TracedConfig, matched_traces
 from learning.policy.policy import AgentDescription, ImagePolicy, load_policy
-from learning.runs.folder import RunFolder
+from learning.runs.folder import RunFolder, read_snapshot
 from learning.training.config import TrainConfig
 from learning.training.train import train
 from warp_deform.collecting.collect import CollectConfig, collect
@@ -368,3 +368,15 @@ def test_a_run_trains_is_evaluated_and_acts(trained: Path) -> None:
         assert shown[tuple(TASK.grid.to_pixel(xy))] == shown.max() > 0
     near = [(action[:2], 0.01)]
     assert np.linalg.norm(policy.act(seen, aim, avoid=near)[:2] - action[:2]) > 0.01
+
+
+def test_weights_of_another_build_are_refused_with_what_differs(trained: Path) -> None:
+    run = RunFolder(trained / "run")
+    weights, record = read_snapshot(run.snapshot(4))
+    name = "members.0.layers.0.weight"
+    weights[name] = torch.zeros(64, 9, 5)  # of the agent that named grips
+    other = RunFolder(trained / "other")
+    (trained / "other" / "snapshots").mkdir(parents=True)
+    other.write_snapshot(4, weights, {"agent": record["agent"]})
+    with pytest.raises(InputError, match=rf"of this release's agents: .*{name}"):
+        load_policy(other.snapshot(4))

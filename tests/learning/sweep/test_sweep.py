@@ -277,3 +277,12 @@ def test_a_wrong_number_of_workers(
 ) -> None:
     assert main(["sweep", str(grid), "--workers", workers]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_an_agent_that_learns_of_no_goal_stands_beside_those_that_do(tmp_path: Path) -> None:
+    asked = GRID.format(root=tmp_path, more='preset = "fast"\ngoal = "own"')
+    asked = asked.replace(TASK, "cable-mask-goal").replace("gt-mlp", 'goal-split", "traced')
+    path = tmp_path / "grid.toml"
+    path.write_text(asked)
+    cells = read_sweep(path).cells()
+    assert {(cell.agent, cell.goal) for cell in cells} == {("goal-split", "own"), ("traced", "end")}
