@@ -2,8 +2,8 @@
 
 A frame shows, from left to right, the observation with the action drawn into it, the goal where
 there is one, and over the observation the heat maps of pick and place: the square root of every
-pixel's probability, relative to the most probable one's. Agents that see the simulator's state have
-no heat maps; their frames show observation and goal alone.
+pixel's probability, relative to the most probable one's; of `traced` see `Traced.heat`. Agents that
+see the simulator's state have no heat maps; their frames show observation and goal alone.
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ class RunFolder:
         return self.snapshot(chosen)
 
     def held_out(self) -> dict[int, float]:
-        """Loss [nat] on held-out demonstrations by step, see `held_out.HeldOut`."""
+        """Loss on held-out demonstrations by step, see `held_out.HeldOut`."""
         records = {step: read_record(self.snapshot(step)) for step in self.steps()}
         return {step: each["held_out"] for step, each in records.items() if "held_out" in each}
 

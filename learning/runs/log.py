@@ -41,7 +41,7 @@ def load_tensorboard() -> Any:
 
 
 class TrainingLog:
-    """Mean losses [nat] of every `LINE_STEPS` steps, and what they cost.
+    """Mean losses of every `LINE_STEPS` steps, and what they cost.
 
     seconds [s] and cpu_seconds [s], of all threads of this process, are those of the steps of a
     line: what lies in `paused` does not count.
@@ -163,7 +163,7 @@ class TrainingLog:
                 self._board.close()
 
     def last_loss(self) -> float | None:
-        """Mean loss of the last line [nat]; None where nothing was logged."""
+        """Mean loss of the last line; None where nothing was logged."""
         return float(self._lines[-1]["loss"]) if self._lines else None
 
     def cpu_seconds(self) -> float:

@@ -34,7 +34,7 @@ class HeldOut:
 
     @torch.no_grad()
     def loss(self, weights: Mapping[str, Tensor]) -> float:
-        """Mean loss [nat] over all transitions, as they were recorded, with weights by name."""
+        """Mean loss over all transitions, as they were recorded, with weights by name."""
         device = next(iter(weights.values())).device
         transitions = [
             (e, t) for e, length in enumerate(self._data.lengths()) for t in range(length)

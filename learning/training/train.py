@@ -71,8 +71,8 @@ class TrainReport:
         validation: of snapshots on validation episodes, `n_success`, `n_episodes`, `mean_score` by
             step; one that solved all that every snapshot plays has played more, see `confirm`
         chosen: the step whose snapshot did best on them, as `eval` would choose; None without them
-        loss: mean over the last logged steps [nat], or as the agent's losses say
-        held_out: that of snapshots on held-out demonstrations by step [nat]
+        loss: mean over the last logged steps [nat]; of an agent of outcomes in its own unit
+        held_out: that of snapshots on held-out demonstrations by step, in the same unit
         seconds: of this call [s]
         cpu_seconds: that the steps of all calls took the process, without validation [s]
         weights_hash: of the last snapshot's weights
