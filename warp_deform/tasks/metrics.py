@@ -120,10 +120,10 @@ def chord_error(beads: np.ndarray, targets: np.ndarray, *, links: int, spacing: 
     A chord joins beads so many links apart. It says how bent the chain is there, not where it lies.
 
     Args:
-        beads: along the chain [m], (n, 2)
-        targets: where they are to lie [m], (n, 2)
+        beads: along the chain, (n, 2), in any unit of length
+        targets: where they are to lie, (n, 2)
         links: bridged by a chord
-        spacing: of the beads [m]
+        spacing: of the beads
 
     Returns:
         the mean over all chords, relative to the length of a straight one
