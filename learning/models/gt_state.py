@@ -16,6 +16,9 @@ matters, sines and cosines are those of the bodies' yaws, not of yaws / 15, whic
 numbers before and after a whole turn.
 
 An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
+
+The original reads the lift from the simulator. Here a network of its own chooses it, which sees the
+action that was drawn: whether a bag is pulled or carried says the place, not the state alone.
 """
 
 from __future__ import annotations
@@ -37,6 +40,7 @@ __all__ = [
     "GtState2Step",
     "GtStateConfig",
     "GtStateLosses",
+    "LiftMLP",
     "Mixture",
     "MixtureMLP",
     "encode_action",
@@ -62,7 +66,7 @@ class GtStateConfig:
     one_rotation: bool = True
     """Act with yaws of 0, as in tasks where rotation does not matter."""
     lifts: tuple[float, ...] = (0.04,)
-    """Lifts of the task's stages [m]; with several there is one more output that chooses."""
+    """Lifts of the task's stages [m]; with several there is one more network that chooses."""
     yaws: tuple[int, ...] = ()
     """Columns of the state that hold a -yaw / 15 [rad] whose own sine and cosine are seen."""
     exact: bool = False
@@ -81,54 +85,94 @@ class Mixture(NamedTuple):
     variance: Tensor
 
 
-class MixtureMLP(nn.Module):
-    """State (B, d) -> a mixture over (B, D), and lift logits (B, n_lifts) or None.
+class _StateMLP(nn.Module):
+    """Inputs (B, d), the first of them a state -> features (B, hidden + 3 d) for last layers.
+
+    Args:
+        d_seen: d
+        config: sizes and choices
+    """
+
+    def __init__(self, d_seen: int, config: GtStateConfig) -> None:
+        super().__init__()
+        self.config = config
+        seen = 3 * d_seen
+        self.features = config.hidden + seen
+        self.first = _linear(seen, config.hidden)
+        self.second = _linear(self.features, config.hidden)
+        turns = torch.ones(d_seen)
+        if not config.exact:
+            turns[list(config.yaws)] = -YAW_SCALE
+        self.register_buffer("turns", turns, persistent=False)
+
+    def _draw_weights(self, generator: torch.Generator) -> None:
+        for parameter in self.parameters():
+            nn.init.normal_(parameter, std=0.05, generator=generator)
+
+    def _seen(self, x: Tensor) -> Tensor:
+        angles = x * self.turns
+        z = torch.cat([x, angles.cos(), angles.sin()], dim=1)
+        h = torch.cat([functional.relu(self.first(z)), z], dim=1)
+        return torch.cat([functional.relu(self.second(h)), z], dim=1)
+
+
+class MixtureMLP(_StateMLP):
+    """State (B, d) -> a mixture over (B, D).
 
     Args:
         d_state: d
         d_action: D
         config: sizes and choices
-        n_lifts: lifts to choose from; 0 or 1 for none
         generator: draws the initial weights
     """
 
     def __init__(
-        self,
-        d_state: int,
-        d_action: int,
-        *,
-        config: GtStateConfig,
-        n_lifts: int = 0,
-        generator: torch.Generator,
+        self, d_state: int, d_action: int, *, config: GtStateConfig, generator: torch.Generator
     ) -> None:
-        super().__init__()
-        self.config = config
-        seen, hidden, k = 3 * d_state, config.hidden, config.n_gaussians
-        self.first = _linear(seen, hidden)
-        self.second = _linear(hidden + seen, hidden)
-        self.mean = _linear(hidden + seen, d_action * k)
-        self.log_variance = _linear(hidden + seen, k)
-        self.mixing = _linear(hidden + seen, k)
-        self.lift = _linear(hidden + seen, n_lifts) if n_lifts > 1 else None
-        for parameter in self.parameters():
-            nn.init.normal_(parameter, std=0.05, generator=generator)
-        turns = torch.ones(d_state)
-        if not config.exact:
-            turns[list(config.yaws)] = -YAW_SCALE
-        self.register_buffer("turns", turns, persistent=False)
+        super().__init__(d_state, config)
+        self.mean = _linear(self.features, d_action * config.n_gaussians)
+        self.log_variance = _linear(self.features, config.n_gaussians)
+        self.mixing = _linear(self.features, config.n_gaussians)
+        self._draw_weights(generator)
 
-    def forward(self, state: Tensor) -> tuple[Mixture, Tensor | None]:
-        """The mixture of states (B, d), and lift logits where there is a choice."""
-        angles = state * self.turns
-        z = torch.cat([state, angles.cos(), angles.sin()], dim=1)
-        h = torch.cat([functional.relu(self.first(z)), z], dim=1)
-        h = torch.cat([functional.relu(self.second(h)), z], dim=1)
+    def forward(self, state: Tensor) -> Mixture:
+        """The mixture of states (B, d)."""
+        h = self._seen(state)
         log_pi = functional.log_softmax(self.mixing(h) / self.config.temperature, dim=1)
         variance = self.log_variance(h).exp()
         if not self.config.exact:
             variance = variance + _LEAST_VARIANCE
-        mean = self.mean(h).unflatten(1, (self.config.n_gaussians, -1))
-        return Mixture(log_pi, mean, variance), None if self.lift is None else self.lift(h)
+        return Mixture(log_pi, self.mean(h).unflatten(1, (self.config.n_gaussians, -1)), variance)
+
+
+class LiftMLP(_StateMLP):
+    """State (B, d) and encoded action (B, 6) -> logits (B, n_lifts).
+
+    Args:
+        d_state: d
+        config: sizes and choices, two lifts or more
+        generator: draws the initial weights
+    """
+
+    def __init__(self, d_state: int, *, config: GtStateConfig, generator: torch.Generator) -> None:
+        super().__init__(d_state + 2 * _POSE, config)
+        self.choose = _linear(self.features, len(config.lifts))
+        self._draw_weights(generator)
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """Logits; yaws that acting leaves out are not looked at."""
+        if self.config.one_rotation:
+            action = action * action.new_tensor([1.0, 1.0, 0.0] * 2)
+        logits: Tensor = self.choose(self._seen(torch.cat([state, action], dim=1)))
+        return logits
+
+    @classmethod
+    def of(
+        cls, d_state: int, *, config: GtStateConfig, generator: torch.Generator
+    ) -> LiftMLP | None:
+        """The network, where there is something to choose."""
+        several = len(config.lifts) > 1
+        return cls(d_state, config=config, generator=generator) if several else None
 
 
 def mixture_loss(mixture: Mixture, target: Tensor, *, exact: bool = False) -> Tensor:
@@ -192,15 +236,13 @@ class GtState(nn.Module):
         super().__init__()
         self.config = config
         generator = torch.Generator().manual_seed(seed)
-        self.network = MixtureMLP(
-            d_state, 2 * _POSE, config=config, n_lifts=len(config.lifts), generator=generator
-        )
+        self.network = MixtureMLP(d_state, 2 * _POSE, config=config, generator=generator)
+        self.lift = LiftMLP.of(d_state, config=config, generator=generator)
 
     def forward(self, state: Tensor, target: Tensor, lift: Tensor) -> GtStateLosses:
         """Losses of states (B, d), encoded actions (B, 6) and lift indices (B,) int64."""
-        mixture, logits = self.network(state)
-        loss = mixture_loss(mixture, target, exact=self.config.exact)
-        return GtStateLosses(loss, _lift_loss(logits, lift, loss))
+        loss = mixture_loss(self.network(state), target, exact=self.config.exact)
+        return GtStateLosses(loss, _lift_loss(self.lift, state, target, lift))
 
     @torch.no_grad()
     def act(self, state: Tensor, *, rng: np.random.Generator) -> np.ndarray:
@@ -208,8 +250,8 @@ class GtState(nn.Module):
 
         They may lie outside of the action space: nothing is clipped here.
         """
-        mixture, logits = self.network(state)
-        return _actions(sample_mixture(mixture, rng=rng), logits, self.config)
+        draws = sample_mixture(self.network(state), rng=rng)
+        return _actions(draws, self.lift, state, self.config)
 
 
 class GtState2Step(nn.Module):
@@ -227,41 +269,38 @@ class GtState2Step(nn.Module):
         self.config = config
         generator = torch.Generator().manual_seed(seed)
         self.pick = MixtureMLP(d_state, _POSE, config=config, generator=generator)
-        self.place = MixtureMLP(
-            d_state + _POSE,
-            _POSE,
-            config=config,
-            n_lifts=len(config.lifts),
-            generator=generator,
-        )
+        self.place = MixtureMLP(d_state + _POSE, _POSE, config=config, generator=generator)
+        self.lift = LiftMLP.of(d_state, config=config, generator=generator)
 
     def forward(self, state: Tensor, target: Tensor, lift: Tensor) -> GtStateLosses:
         """Losses of states (B, d), encoded actions (B, 6) and lift indices (B,) int64."""
         pick, place = target[:, :_POSE], target[:, _POSE:]
-        first, _ = self.pick(state)
-        second, logits = self.place(torch.cat([state, pick], dim=1))
-        loss = mixture_loss(first, pick, exact=self.config.exact)
+        second = self.place(torch.cat([state, pick], dim=1))
+        loss = mixture_loss(self.pick(state), pick, exact=self.config.exact)
         loss = loss + mixture_loss(second, place, exact=self.config.exact)
-        return GtStateLosses(loss, _lift_loss(logits, lift, loss))
+        return GtStateLosses(loss, _lift_loss(self.lift, state, target, lift))
 
     @torch.no_grad()
     def act(self, state: Tensor, *, rng: np.random.Generator) -> np.ndarray:
         """Actions (B, 7) float64 drawn for states (B, d); see `GtState.act`."""
-        pick = sample_mixture(self.pick(state)[0], rng=rng)
+        pick = sample_mixture(self.pick(state), rng=rng)
         seen = pick.copy()
         seen[:, 2] = 0.0
         given = torch.from_numpy(seen).to(state)
-        second, logits = self.place(torch.cat([state, given], dim=1))
-        place = sample_mixture(second, rng=rng)
-        return _actions(np.hstack([pick, place]), logits, self.config)
+        place = sample_mixture(self.place(torch.cat([state, given], dim=1)), rng=rng)
+        return _actions(np.hstack([pick, place]), self.lift, state, self.config)
 
 
-def _actions(draws: np.ndarray, logits: Tensor | None, config: GtStateConfig) -> np.ndarray:
-    """Actions (B, 7) of encoded draws (B, 6)."""
+def _actions(
+    draws: np.ndarray, lift: LiftMLP | None, state: Tensor, config: GtStateConfig
+) -> np.ndarray:
+    """Actions (B, 7) of encoded draws (B, 6) for states (B, d)."""
+    choice = np.zeros(len(draws), int)
+    if lift is not None:
+        choice = lift(state, torch.from_numpy(draws).to(state)).argmax(dim=1).cpu().numpy()
     poses = draws / _units()
     if config.one_rotation:
         poses[:, [2, 5]] = 0.0
-    choice = np.zeros(len(draws), int) if logits is None else logits.argmax(dim=1).cpu().numpy()
     return np.column_stack([poses, np.array(config.lifts)[choice]])
 
 
@@ -269,8 +308,11 @@ def _units() -> np.ndarray:
     return np.array([1.0, 1.0, -1.0 / YAW_SCALE] * 2)
 
 
-def _lift_loss(logits: Tensor | None, lift: Tensor, like: Tensor) -> Tensor:
-    return like.new_zeros(()) if logits is None else functional.cross_entropy(logits, lift)
+def _lift_loss(lift: LiftMLP | None, state: Tensor, action: Tensor, index: Tensor) -> Tensor:
+    """Loss of the lift's index (B,), given states (B, d) and encoded actions (B, 6)."""
+    if lift is None:
+        return state.new_zeros(())
+    return functional.cross_entropy(lift(state, action), index)
 
 
 def _linear(before: int, after: int) -> nn.Linear:

@@ -96,7 +96,7 @@ def test_a_whole_turn_is_seen_as_none(exact: bool, same: bool) -> None:
         layer.weight.data[:, -9:-6] = 0
     state = torch.tensor([[0.5, 0.1, -1.0 / 15]])
     turned = state - torch.tensor([0.0, 0.0, 2 * math.pi / 15])
-    before, after = (network(each)[0].mean for each in (state, turned))
+    before, after = (network(each).mean for each in (state, turned))
     assert torch.allclose(before, after, atol=1e-5) is same
 
 
@@ -135,6 +135,37 @@ def test_agent_learns_an_action_that_depends_on_the_state(
     assert (drawn[:, 6] == action[:, 6])[np.abs(state[:, 1]) > 0.1].mean() > 0.95
     agent.config = dataclasses.replace(config, one_rotation=True)
     assert not agent.act(torch.from_numpy(state), rng=np.random.default_rng(1))[:, [2, 5]].any()
+
+
+@pytest.mark.parametrize("agent_class", AGENTS)
+def test_the_lift_goes_with_the_action_that_was_drawn(
+    agent_class: type[GtState] | type[GtState2Step],
+) -> None:
+    """In one state a bag is either pulled, low, or carried, high: the state alone does not say."""
+    config = GtStateConfig(lifts=(0.05, 0.3))
+    agent = agent_class(2, config, seed=0)
+    rng = np.random.default_rng(0)
+    state = torch.from_numpy(np.tile(np.array([0.4, 0.1], np.float32), (256, 1)))
+
+    def actions() -> np.ndarray:
+        carried = rng.random(256) < 0.3
+        action = np.zeros((256, 7))
+        action[:, :2], action[:, 3:5] = [0.4, 0.1], [0.3, 0.1]
+        action[carried, 3:5], action[:, 6] = [0.6, -0.3], np.where(carried, 0.3, 0.05)
+        return action
+
+    optimiser = KerasAdam(agent.parameters(), lr=1e-3)
+    for _ in range(300):
+        action = actions()
+        index = torch.from_numpy(action[:, 6] > 0.1).long()
+        losses = agent(state, torch.from_numpy(encode_action(action)), index)
+        optimiser.zero_grad()
+        losses.total().backward()
+        optimiser.step()
+    drawn = agent.act(state, rng=rng)
+    carried = drawn[:, 4] < -0.1
+    assert 0.2 < carried.mean() < 0.4
+    assert (drawn[:, 6] == np.where(carried, 0.3, 0.05)).all()
 
 
 def test_wrong_input_is_refused() -> None:
