@@ -51,6 +51,9 @@ def check_in(paths: Sequence[Path], out: Path) -> list[str]:
             name += f"-{steps}-steps"
         if run.settings.get("goal") == "own":
             name += "-own-goals"
+        by = run.settings["demonstrators"]
+        if by and by != ["scripted"]:
+            name += "-" + "-".join(each.replace(" ", "-") for each in by)
         target = RunFolder(out / "runs" / name)
         target.path.mkdir(parents=True, exist_ok=True)
         settings = {key: value for key, value in run.settings.items() if key != "data"}

@@ -1,0 +1,116 @@
+"""Ground-truth baselines on bags that start as narrow as ours do, and on wider ones.
+
+    python benchmarks/wide_bags.py [--agents A...] [--episodes N] [--work FOLDER] [--out FILE]
+
+A cell is a task, a baseline and who chooses the lift: the agent, or the paper's rule, which reads
+the simulator. The wide bag has a stiffer seam and is not pushed at the start, so that its
+demonstrations take about as many actions as the original's. All cells have a hundred scripted
+demonstrations of their task, seed 0 and the steps of `fast`; the last snapshot plays the test
+episodes, so nothing is chosen. Each finished cell is a line of OUT, and a cell with a line is left
+out: the command goes on after an interruption. As a module of tasks it serves the command line:
+
+    warp-deform demo bag-items-1-wide --task-module benchmarks/wide_bags.py -n 100 --out demos
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from learning.evaluation.paper_results import read_paper
+from learning.evaluation.run import evaluate_run
+from learning.training.config import TrainConfig
+from learning.training.settings import AgentName
+from learning.training.train import train
+from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.quiet import quiet_warp
+from warp_deform.support.revision import running_revision
+from warp_deform.tasks.bag_items import BagItems1
+from warp_deform.tasks.registration import register_task
+
+RESULTS = Path("benchmarks/results/wide_bags.jsonl")
+AGENTS: tuple[AgentName, ...] = ("gt-mlp", "gt-mlp-2step")
+Rule = Literal["action", "privileged"]
+DEMOS = 100
+
+
+@register_task
+class WideBagItems1(BagItems1):
+    """bag-items-1 with a bag that starts wider open."""
+
+    name = "bag-items-1-wide"
+    bag = replace(BagItems1.bag, ring_stiffness=120.0)
+    pushes = 0
+
+
+TASKS = (BagItems1.name, WideBagItems1.name)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--agents", nargs="+", choices=AGENTS, default=AGENTS)
+    parser.add_argument("--demos", type=int, default=DEMOS)
+    parser.add_argument("--steps", type=int, help="in place of the schedule's")
+    parser.add_argument("--episodes", type=int, default=100, help="of the test")
+    parser.add_argument("--work", type=Path, default=Path("wide-bags"))
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    quiet_warp()
+    lines = options.out.read_text().splitlines() if options.out.exists() else []
+    done = {(row["task"], row["agent"], row["stage_rule"]) for row in map(json.loads, lines)}
+    for task, agent, rule in product(TASKS, options.agents, get_args(Rule)):
+        if (task, agent, rule) not in done:
+            row = json.dumps(cell(task, agent, rule, options))
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            with options.out.open("a") as file:
+                file.write(row + "\n")
+            print(row)
+
+
+def cell(task: str, agent: AgentName, rule: Rule, options: argparse.Namespace) -> dict[str, Any]:
+    """Demonstrate and train where that has not been done, and test."""
+    demos, run = options.work / f"{task}-demos", options.work / f"{task}-{agent}"
+    collected = collect(CollectConfig(task=task, episodes=options.demos, out=demos, workers=1))
+    train(
+        TrainConfig(
+            task=task,
+            agent=agent,
+            preset="fast",
+            data=demos,
+            demos=options.demos,
+            steps=options.steps,
+            snapshots=1,
+            validate=0,
+            out=run,
+        )
+    )
+    info = evaluate_run(
+        run, episodes=options.episodes, validation_episodes=1, stage_rule=rule, workers=1
+    )
+    test = info["test"]
+    paper = read_paper().values.get((BagItems1.name, agent, options.demos))
+    return {
+        "task": task,
+        "agent": agent,
+        "stage_rule": rule,
+        "demos": options.demos,
+        "demonstrated_actions": collected.mean_actions,
+        "n_success": test["n_success"],
+        "n_success_enclosed": test["n_success_enclosed"],
+        "n_episodes": test["n_episodes"],
+        "mean_score": test["mean_score"],
+        "mean_actions": test["mean_actions"],
+        "failures": test["failures"],
+        "training_cpu_s": info["training_cpu_seconds"],
+        "paper_percent": paper,
+        "steps": info["trained_steps"],
+        "commit": running_revision().commit,
+    }
+
+
+if __name__ == "__main__":
+    main()
