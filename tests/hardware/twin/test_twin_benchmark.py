@@ -116,6 +116,7 @@ def test_tosses_of_one_goal_are_no_further_goals(twin: ModuleType) -> None:
             "| `policy`, Goal-Split, 24 + 6 demonstrations, one",
         ),
         ("twin_traced.jsonl", "policy", "| `policy`, traced, 1000 demonstrations |"),
+        ("twin_traced_24.jsonl", "policy", "| `policy`, traced from 24 + 6 demonstrations |"),
         ("twin.jsonl", "scripted", "| `scripted`, which knows the chain |"),
         ("twin.jsonl", "random", "| `random` | 0 |"),
     ],
