@@ -52,7 +52,7 @@ def check_in(paths: Sequence[Path], out: Path) -> list[str]:
         if run.settings.get("goal") == "own":
             name += "-own-goals"
         by = run.settings["demonstrators"]
-        if by and by != ["scripted"]:
+        if by and by != ["scripted"]:  # who else demonstrated must not replace the paper's way
             name += "-" + "-".join(each.replace(" ", "-") for each in by)
         target = RunFolder(out / "runs" / name)
         target.path.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ numbers before and after a whole turn.
 An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
 
 The original reads the lift from the simulator. Here a network of its own chooses it, which sees the
-action that was drawn: whether a bag is pulled or carried says the place, not the state alone.
+action that was drawn: of one state a bag may be pulled or carried, and the place tells which.
 """
 
 from __future__ import annotations
@@ -156,6 +156,8 @@ class LiftMLP(_StateMLP):
 
     def __init__(self, d_state: int, *, config: GtStateConfig, generator: torch.Generator) -> None:
         super().__init__(d_state + 2 * _POSE, config)
+        if not config.exact:
+            self.turns[[d_state + 2, d_state + 5]] = -YAW_SCALE
         self.choose = _linear(self.features, len(config.lifts))
         self._draw_weights(generator)
 

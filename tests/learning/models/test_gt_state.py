@@ -15,6 +15,7 @@ from learning.models.gt_state import (
     GtState,
     GtState2Step,
     GtStateConfig,
+    LiftMLP,
     Mixture,
     encode_action,
     mixture_loss,
@@ -166,6 +167,15 @@ def test_the_lift_goes_with_the_action_that_was_drawn(
     carried = drawn[:, 4] < -0.1
     assert 0.2 < carried.mean() < 0.4
     assert (drawn[:, 6] == np.where(carried, 0.3, 0.05)).all()
+
+
+@pytest.mark.parametrize("one_rotation", [True, False])
+def test_the_lift_hangs_on_yaws_only_where_they_are_carried_out(one_rotation: bool) -> None:
+    config = GtStateConfig(lifts=(0.05, 0.3), one_rotation=one_rotation)
+    lift = LiftMLP(2, config=config, generator=torch.Generator().manual_seed(0))
+    state, action = torch.tensor([[0.4, 0.1]]), torch.tensor([[0.4, 0.1, 0.0, 0.5, 0.2, 0.0]])
+    turned = action + torch.tensor([0.0, 0.0, 0.1, 0.0, 0.0, -0.1])
+    assert torch.equal(lift(state, action), lift(state, turned)) is one_rotation
 
 
 def test_wrong_input_is_refused() -> None:

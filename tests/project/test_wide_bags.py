@@ -1,0 +1,65 @@
+"""benchmarks/wide_bags.py: cells are made once, and a cell is played on the wide bag."""
+
+from __future__ import annotations
+
+import json
+import sys
+from argparse import Namespace
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from fixtures.places import ROOT
+
+from warp_deform.tasks import registry
+
+
+@pytest.fixture
+def wide_bags(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The script, whose task is forgotten afterwards."""
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    ids = set(gymnasium.registry)
+    import wide_bags
+
+    yield wide_bags
+    del sys.modules["wide_bags"]
+    for name in set(gymnasium.registry) - ids:
+        del gymnasium.registry[name]
+
+
+def test_cells_with_a_line_of_their_sizes_are_left_out(
+    wide_bags: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    made: list[tuple[str, str, str]] = []
+
+    def cell(task: str, agent: str, rule: str, options: Namespace) -> dict[str, Any]:
+        made.append((task, agent, rule))
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        sizes = {"demos": options.demos, "steps": options.steps, "n_episodes": options.episodes}
+        return {"task": task, "agent": agent, "stage_rule": rule, **sizes}
+
+    monkeypatch.setattr(wide_bags, "cell", cell)
+    out = tmp_path / "rows.jsonl"
+    monkeypatch.setattr(sys, "argv", ["wide_bags.py", "--out", str(out)])
+    with pytest.raises(KeyboardInterrupt):
+        wide_bags.main()
+    wide_bags.main()
+    wide_bags.main()
+    assert len(made) == 9 and len(set(made)) == 8
+    assert {json.loads(line)["steps"] for line in out.read_text().splitlines()} == {2000}
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--episodes", "2", "--agents", "gt-mlp"])
+    wide_bags.main()
+    assert len(made) == 13
+
+
+def test_a_cell_is_demonstrated_trained_and_tested_on_the_wide_bag(
+    wide_bags: Any, tmp_path: Path
+) -> None:
+    sizes = Namespace(demos=1, steps=1, episodes=1, work=tmp_path)
+    row = wide_bags.cell("bag-items-1-wide", "gt-mlp", "privileged", sizes)
+    assert row["n_episodes"] == 1 and row["steps"] == 1 and row["demonstrated_actions"] >= 2
+    assert row["paper_percent"] == 1.7  # of bag-items-1, from one demonstration
