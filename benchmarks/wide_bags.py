@@ -1,9 +1,9 @@
-"""Ground-truth baselines on bags as they start here, and on bags that start wider open.
+"""Agents on bags as they start here, and on bags that start wider open.
 
-    python benchmarks/wide_bags.py [--agents A...] [--demos N] [--steps N] [--episodes N]
-                                   [--work FOLDER] [--out FILE]
+    python benchmarks/wide_bags.py [--tasks T...] [--agents A...] [--demos N] [--steps N]
+                                   [--episodes N] [--work FOLDER] [--out FILE]
 
-A cell is a task, a baseline and who chooses the lift: the agent, or the paper's rule, which reads
+A cell is a task, an agent and who chooses the lift: the agent, or the paper's rule, which reads
 the simulator. The wide bag is not pushed at the start, and its seam is softer: of what
 hardness.py tried, its demonstrations come nearest to the original's in actions. By default cells
 have a hundred scripted demonstrations of their task and the steps of `fast`; seed 0, and the last
@@ -26,17 +26,17 @@ from typing import Any, Literal, get_args
 from learning.evaluation.paper_results import read_paper
 from learning.evaluation.run import evaluate_run
 from learning.training.config import TrainConfig
-from learning.training.schedules import STATE_SCHEDULES
+from learning.training.schedules import SCHEDULES, STATE_SCHEDULES
 from learning.training.settings import AgentName
 from learning.training.train import train
 from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.quiet import quiet_warp
 from warp_deform.support.revision import running_revision
-from warp_deform.tasks.bag_items import BagItems1
+from warp_deform.tasks.bag_items import BagItems1, BagItems2
 from warp_deform.tasks.registration import register_task
 
 RESULTS = Path("benchmarks/results/wide_bags.jsonl")
-AGENTS: tuple[AgentName, ...] = ("gt-mlp", "gt-mlp-2step")
+AGENTS: tuple[AgentName, ...] = ("gt-mlp", "gt-mlp-2step", "transporter")
 Rule = Literal["action", "privileged"]
 DEMOS = 100
 
@@ -50,11 +50,23 @@ class WideBagItems1(BagItems1):
     pushes = 0
 
 
-TASKS = (BagItems1.name, WideBagItems1.name)
+@register_task
+class WideBagItems2(BagItems2):
+    """bag-items-2 with the same bag."""
+
+    name = "bag-items-2-wide"
+    bag = WideBagItems1.bag
+    pushes = 0
+
+
+NARROW = {WideBagItems1.name: BagItems1.name, WideBagItems2.name: BagItems2.name}
+"""The task that each task with a wide bag is beside."""
+TASKS = tuple(name for pair in zip(NARROW.values(), NARROW, strict=True) for name in pair)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS)
     parser.add_argument("--agents", nargs="+", choices=AGENTS, default=AGENTS)
     parser.add_argument("--demos", type=int, default=DEMOS)
     parser.add_argument("--steps", type=int, help="in place of the schedule's")
@@ -66,21 +78,22 @@ def main() -> None:
     lines = options.out.read_text().splitlines() if options.out.exists() else []
     keys = ("task", "agent", "stage_rule", "demos", "steps", "n_episodes")
     done = {tuple(row[key] for key in keys) for row in map(json.loads, lines)}
-    if options.steps is None:
-        options.steps = STATE_SCHEDULES["fast"].steps
-    sizes = options.demos, options.steps, options.episodes
-    for task, agent, rule in product(TASKS, options.agents, get_args(Rule)):
-        if (task, agent, rule, *sizes) not in done:
-            row = json.dumps(cell(task, agent, rule, options))
+    for task, agent, rule in product(options.tasks, options.agents, get_args(Rule)):
+        schedules = SCHEDULES if agent == "transporter" else STATE_SCHEDULES
+        steps = options.steps or schedules["fast"].steps
+        if (task, agent, rule, options.demos, steps, options.episodes) not in done:
+            row = json.dumps(cell(task, agent, rule, steps, options))
             options.out.parent.mkdir(parents=True, exist_ok=True)
             with options.out.open("a") as file:
                 file.write(row + "\n")
             print(row)
 
 
-def cell(task: str, agent: AgentName, rule: Rule, options: argparse.Namespace) -> dict[str, Any]:
+def cell(
+    task: str, agent: AgentName, rule: Rule, steps: int, options: argparse.Namespace
+) -> dict[str, Any]:
     """Demonstrate and train where that has not been done, and test."""
-    size = f"{options.demos}-{options.steps}"
+    size = f"{options.demos}-{steps}"
     demos, run = options.work / f"{task}-demos", options.work / f"{task}-{agent}-{size}"
     collected = collect(CollectConfig(task=task, episodes=options.demos, out=demos, workers=1))
     train(
@@ -90,7 +103,7 @@ def cell(task: str, agent: AgentName, rule: Rule, options: argparse.Namespace) -
             preset="fast",
             data=demos,
             demos=options.demos,
-            steps=options.steps,
+            steps=steps,
             snapshots=1,
             validate=0,
             out=run,
@@ -100,7 +113,7 @@ def cell(task: str, agent: AgentName, rule: Rule, options: argparse.Namespace) -
         run, episodes=options.episodes, validation_episodes=1, stage_rule=rule, workers=1
     )
     test = info["test"]
-    paper = read_paper().values.get((BagItems1.name, agent, options.demos))
+    paper = read_paper().values.get((NARROW.get(task, task), agent, options.demos))
     return {
         "task": task,
         "agent": agent,

@@ -35,11 +35,11 @@ def test_cells_with_a_line_of_their_sizes_are_left_out(
 ) -> None:
     made: list[tuple[str, str, str]] = []
 
-    def cell(task: str, agent: str, rule: str, options: Namespace) -> dict[str, Any]:
+    def cell(task: str, agent: str, rule: str, steps: int, options: Namespace) -> dict[str, Any]:
         made.append((task, agent, rule))
         if len(made) == 3:
             raise KeyboardInterrupt
-        sizes = {"demos": options.demos, "steps": options.steps, "n_episodes": options.episodes}
+        sizes = {"demos": options.demos, "steps": steps, "n_episodes": options.episodes}
         return {"task": task, "agent": agent, "stage_rule": rule, **sizes}
 
     monkeypatch.setattr(wide_bags, "cell", cell)
@@ -49,17 +49,27 @@ def test_cells_with_a_line_of_their_sizes_are_left_out(
         wide_bags.main()
     wide_bags.main()
     wide_bags.main()
-    assert len(made) == 9 and len(set(made)) == 8
-    assert {json.loads(line)["steps"] for line in out.read_text().splitlines()} == {2000}
+    assert len(made) == 25 and len(set(made)) == 24
+    steps = {(row["agent"], row["steps"]) for row in map(json.loads, out.read_text().splitlines())}
+    assert steps == {("gt-mlp", 2000), ("gt-mlp-2step", 2000), ("transporter", 4000)}
     monkeypatch.setattr(sys, "argv", [*sys.argv, "--episodes", "2", "--agents", "gt-mlp"])
     wide_bags.main()
-    assert len(made) == 13
+    assert len(made) == 33
+    assert not {task.removesuffix("-wide") for task, _, _ in made} - {"bag-items-1", "bag-items-2"}
 
 
 def test_a_cell_is_demonstrated_trained_and_tested_on_the_wide_bag(
     wide_bags: Any, tmp_path: Path
 ) -> None:
-    sizes = Namespace(demos=1, steps=1, episodes=1, work=tmp_path)
-    row = wide_bags.cell("bag-items-1-wide", "gt-mlp", "privileged", sizes)
+    sizes = Namespace(demos=1, episodes=1, work=tmp_path)
+    row = wide_bags.cell("bag-items-1-wide", "gt-mlp", "privileged", 1, sizes)
     assert row["n_episodes"] == 1 and row["steps"] == 1 and row["demonstrated_actions"] >= 2
     assert row["paper_percent"] == 1.7  # of bag-items-1, from one demonstration
+
+
+def test_a_wide_bag_is_its_neighbour_but_for_the_bag(wide_bags: Any) -> None:
+    for wide, narrow in wide_bags.NARROW.items():
+        ours, theirs = registry.task(wide), registry.task(narrow)
+        assert ours.pushes == 0 < theirs.pushes
+        assert ours.bag.ring_stiffness < theirs.bag.ring_stiffness
+        assert isinstance(ours, type(theirs)) and ours.max_actions == theirs.max_actions
