@@ -4,11 +4,12 @@
     count(success)    100*interval[0]    mean(actions[success])    what their columns say
 
 Rows are those of CSV and JSON lines, and every object in a JSON file, which also has the `key`
-that it stands under; `FILE+FILE` joins rows of one task. Conditions compare names as they are
-printed: `task=cable-shape|cable-line`, `variant~8,000` for a part of it; `$2` is the second cell of
-the table's row, and `$2.1` its part before the first comma. An expression has Python's syntax
-without spaces: columns by name, their entries (`interval[0]`, `failures.other`), the rows that a
-mask keeps (`actions[success]`), arithmetic, comparisons and `FUNCTIONS`. It comes to one number.
+that it stands under; `FILE+FILE` joins rows of one task, and what both have is `other_NAME` of the
+second. Conditions compare names as they are printed: `task=cable-shape|cable-line`, `variant~8,000`
+for a part of it; `$2` is the second cell of the table's row, and `$2.1` its part before the first
+comma. An expression has Python's syntax without spaces: columns by name, their entries
+(`interval[0]`, `failures.other`), the rows that a mask keeps (`actions[success]`), arithmetic,
+comparisons and `FUNCTIONS`. It comes to one number.
 """
 
 from __future__ import annotations
@@ -71,8 +72,10 @@ def chosen(source: str, cells: Sequence[str] = ()) -> list[Row]:
     assert match is not None
     kept = rows(ROOT / match["file"])
     if match["other"]:
-        of_task = {row["task"]: row for row in rows(ROOT / match["other"])}
-        kept = [{**of_task[row["task"]], **row} for row in kept if row["task"] in of_task]
+        others = rows(ROOT / match["other"])
+        kept = [
+            _joined(row, each) for row in kept for each in others if row["task"] == each["task"]
+        ]
     for condition in (match["chosen"] or "").split(",") if match["chosen"] else []:
         left, relation, right = re.split(r"([=~])", condition, maxsplit=1)
         wanted = [name(_filled(each, cells)) for each in right.split("|")]
@@ -82,6 +85,11 @@ def chosen(source: str, cells: Sequence[str] = ()) -> list[Row]:
         else:
             kept = [row for row in kept if left in row and holds(name(row[left]), wanted)]
     return kept
+
+
+def _joined(row: Row, other: Row) -> Row:
+    """Both rows; what both have is `other_NAME` of the second."""
+    return {**other, **{f"other_{key}": value for key, value in other.items()}, **row}
 
 
 def _equal(value: str, wanted: list[str]) -> bool:

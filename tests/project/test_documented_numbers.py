@@ -177,6 +177,13 @@ def test_tables_are_compared_row_by_row(tmp_path: Path, monkeypatch: pytest.Monk
     joined = "{} times\n<!--from: rows.csv+paper.jsonl[part=0]\n100*share-paper\n-->"
     assert numbers.examine("page", joined.format(10))[1] == []
     assert numbers.examine("page", joined.format(80))[1]
+    (tmp_path / "by.jsonl").write_text(
+        '{"task": "whole", "by": "a", "share": 2}\n{"task": "whole", "by": "b", "share": 4}\n'
+    )
+    ratio = "{} %\n<!--from: rows.csv+by.jsonl[part=0,by=b]\n100*share/other_share\n-->"
+    assert numbers.examine("page", ratio.format(12.5))[1] == []
+    both = ratio.replace(",by=b", ",task=whole").format(12.5)
+    assert "2 different numbers" in numbers.examine("page", both)[1][0]
     nowhere = comment.replace("2: ", "")
     assert "without a column" in numbers.examine("page", nowhere + head + good)[1][0]
     twice = comment + comment + head + good
