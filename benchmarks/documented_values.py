@@ -3,13 +3,14 @@
     benchmarks/results/twin.jsonl[agent=planner,goal=1|4]     a file, and which of its rows
     count(success)    100*interval[0]    mean(actions[success])    what their columns say
 
-Rows are those of CSV and JSON lines, and every object in a JSON file, which also has the `key`
-that it stands under; `FILE+FILE` joins rows of one task, and what both have is `other_NAME` of the
-second. Conditions compare names as they are printed: `task=cable-shape|cable-line`, `variant~8,000`
-for a part of it; `$2` is the second cell of the table's row, and `$2.1` its part before the first
-comma. An expression has Python's syntax without spaces: columns by name, their entries
-(`interval[0]`, `failures.other`), the rows that a mask keeps (`actions[success]`), arithmetic,
-comparisons and `FUNCTIONS`. It comes to one number.
+Rows are those of CSV and JSON lines, and every object in a JSON file, which also has the `key` that
+it stands under; `FILE+FILE` has each row of the first with every row of its task in the second
+(choose one of these before summing), whose columns are also called `other_NAME`: where both have
+one, its name alone is the first's. Conditions compare names as they are printed:
+`task=cable-shape|cable-line`, `variant~8,000` for a part of it; `$2` is the second cell of the
+table's row, and `$2.1` its part before the first comma. An expression has Python's syntax without
+spaces: columns by name, their entries (`interval[0]`, `failures.other`), the rows that a mask keeps
+(`actions[success]`), arithmetic, comparisons and `FUNCTIONS`. It comes to one number.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def chosen(source: str, cells: Sequence[str] = ()) -> list[Row]:
 
 
 def _joined(row: Row, other: Row) -> Row:
-    """Both rows; what both have is `other_NAME` of the second."""
+    """Both rows; a name that both have is the first's, and `other_NAME` the second's."""
     return {**other, **{f"other_{key}": value for key, value in other.items()}, **row}
 
 

@@ -182,6 +182,8 @@ def test_tables_are_compared_row_by_row(tmp_path: Path, monkeypatch: pytest.Monk
     )
     ratio = "{} %\n<!--from: rows.csv+by.jsonl[part=0,by=b]\n100*share/other_share\n-->"
     assert numbers.examine("page", ratio.format(12.5))[1] == []
+    of_first = ratio.replace("by=b", "by=b,share=0.5").format(12.5)
+    assert numbers.examine("page", of_first)[1] == []
     both = ratio.replace(",by=b", ",task=whole").format(12.5)
     assert "2 different numbers" in numbers.examine("page", both)[1][0]
     nowhere = comment.replace("2: ", "")

@@ -6,6 +6,7 @@ import json
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from warp_deform.tasks import registry
 
 @pytest.fixture
 def wide_bags(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The script, whose task is forgotten afterwards."""
+    """The script, whose tasks are forgotten afterwards."""
     monkeypatch.setattr(registry, "_REGISTERED", {})
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     ids = set(gymnasium.registry)
@@ -55,7 +56,12 @@ def test_cells_with_a_line_of_their_sizes_are_left_out(
     monkeypatch.setattr(sys, "argv", [*sys.argv, "--episodes", "2", "--agents", "gt-mlp"])
     wide_bags.main()
     assert len(made) == 33
-    assert not {task.removesuffix("-wide") for task, _, _ in made} - {"bag-items-1", "bag-items-2"}
+    assert {task for task, _, _ in made} == {
+        f"bag-items-{items}{wide}" for items in (1, 2) for wide in ("", "-wide")
+    }
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--demos", "7", "--tasks", "bag-items-2-wide"])
+    wide_bags.main()
+    assert [task for task, _, _ in made[33:]] == ["bag-items-2-wide"] * 2
 
 
 def test_a_cell_is_demonstrated_trained_and_tested_on_the_wide_bag(
@@ -72,4 +78,10 @@ def test_a_wide_bag_is_its_neighbour_but_for_the_bag(wide_bags: Any) -> None:
         ours, theirs = registry.task(wide), registry.task(narrow)
         assert ours.pushes == 0 < theirs.pushes
         assert ours.bag.ring_stiffness < theirs.bag.ring_stiffness
-        assert isinstance(ours, type(theirs)) and ours.max_actions == theirs.max_actions
+        assert replace(ours.bag, ring_stiffness=theirs.bag.ring_stiffness) == theirs.bag
+        assert type(ours).__bases__ == (type(theirs),)
+        own = {name for name in vars(type(ours)) if not name.startswith("_")}
+        assert (
+            own == {"name", "bag", "pushes", "instruction"}
+            and ours.instruction == theirs.instruction
+        )
