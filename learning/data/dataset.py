@@ -119,7 +119,8 @@ class Demonstrations:
 
     Raises:
         InputError: no folder, another task's episodes, failures among them, or too few; a goal of
-            their own is asked for, and they have none.
+            their own is asked for, and they have none, or one that shows what goals of tests do
+            not (`Task.goal_shows_its_start`).
 
     Source: Seita et al., ICRA 2021, code that records demonstrations.
     """
@@ -311,6 +312,15 @@ def _learnt(episode: Episode, kind: _Kind, *, what: Path) -> Episode:
         return episode
     if episode.goal is None:
         raise InputError(f"{what} has no goal of its own; leave --goal out")
+    if (
+        episode.goal.seed == episode.info.seed
+        and find_task(episode.info.task).goal_shows_its_start()
+    ):
+        raise InputError(
+            f"the goal of {what} is made of its own start and shows the rest of it, too, which "
+            "goals of tests do not; collect for goals (`warp-deform goals`, `demo --goals`), or "
+            "leave --goal out"
+        )
     return replace(episode, steps=(*episode.steps[:-1], _aimed_at(episode)))
 
 

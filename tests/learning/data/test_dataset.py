@@ -20,6 +20,7 @@ from learning.training.schedules import Schedule
 from learning.training.train import train
 from warp_deform.episodes import HEIGHT_UNIT, Episode, EpisodeReader, EpisodeWriter
 from warp_deform.errors import InputError
+from warp_deform.tasks.task import Task
 
 TASK = "cable-line-notarget"
 
@@ -78,6 +79,23 @@ def test_a_recording_without_a_goal_has_none_of_its_own(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no goal of its own; leave --goal out"):
         Demonstrations(tmp_path, task=TASK, goal="own")
     assert len(Demonstrations(tmp_path, task=TASK)) == 1
+
+
+def test_a_goal_of_the_start_s_own_is_refused_where_it_shows_what_tests_do_not(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episode = block_episode(0)
+    assert episode.goal is not None
+    for number, goal in ((0, 0), (1, 200_000)):
+        aimed = dataclasses.replace(episode.goal, seed=goal)
+        EpisodeWriter(tmp_path / str(goal)).write(
+            dataclasses.replace(block_episode(number), goal=aimed)
+        )
+    monkeypatch.setattr(Task, "goal_shows_its_start", lambda task: True)
+    assert len(Demonstrations(tmp_path / "200000", task=TASK, goal="own")) == 1
+    with pytest.raises(InputError, match=r"shows the rest of it, too.*or leave --goal out"):
+        Demonstrations(tmp_path / "0", task=TASK, goal="own")
+    assert len(Demonstrations(tmp_path / "0", task=TASK)) == 1
 
 
 def test_goals_of_their_own_are_another_run_and_need_a_task_with_goals(
