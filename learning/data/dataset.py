@@ -172,6 +172,9 @@ class Demonstrations:
     def _take(self, seeds: tuple[int, ...]) -> None:
         self.seeds = seeds
         self.seals = tuple(self._index[episode_name(number)]["seal"] for number in seeds)
+        if self._kind == "own" and self.task.goal_shows_its_start():
+            for number in seeds:
+                _check_made_elsewhere(self._reader, number)
         cache, kind = self._reader.folder / _FOLDER, "" if self._kind == "end" else f"-{self._kind}"
         self._episodes = [
             _open(
@@ -312,16 +315,23 @@ def _learnt(episode: Episode, kind: _Kind, *, what: Path) -> Episode:
         return episode
     if episode.goal is None:
         raise InputError(f"{what} has no goal of its own; leave --goal out")
-    if (
-        episode.goal.seed == episode.info.seed
-        and find_task(episode.info.task).goal_shows_its_start()
-    ):
-        raise InputError(
-            f"the goal of {what} is made of its own start and shows the rest of it, too, which "
-            "goals of tests do not; collect for goals (`warp-deform goals`, `demo --goals`), or "
-            "leave --goal out"
-        )
     return replace(episode, steps=(*episode.steps[:-1], _aimed_at(episode)))
+
+
+def _check_made_elsewhere(reader: EpisodeReader, seed: int) -> None:
+    """Refuse a demonstration whose goal is made of its own start.
+
+    Raises:
+        InputError: it is one.
+    """
+    info = reader.info(seed)
+    if info.goal is None or info.goal["seed"] != seed or is_corrected(info.demonstrator):
+        return
+    raise InputError(
+        f"the goal of {reader.path(seed)} is made of its own start and shows the rest of it, too, "
+        "which goals of tests do not; collect for goals (`warp-deform goals`, `demo --goals`), or "
+        "leave --goal out"
+    )
 
 
 def _aimed_at(episode: Episode) -> Step:

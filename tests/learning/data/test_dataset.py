@@ -91,6 +91,7 @@ def test_a_goal_of_the_start_s_own_is_refused_where_it_shows_what_tests_do_not(
         EpisodeWriter(tmp_path / str(goal)).write(
             dataclasses.replace(block_episode(number), goal=aimed)
         )
+    assert len(Demonstrations(tmp_path / "0", task=TASK, goal="own")) == 1  # which leaves a cache
     monkeypatch.setattr(Task, "goal_shows_its_start", lambda task: True)
     assert len(Demonstrations(tmp_path / "200000", task=TASK, goal="own")) == 1
     with pytest.raises(InputError, match=r"shows the rest of it, too.*or leave --goal out"):
