@@ -124,7 +124,16 @@ class SweepConfig(TrainMethod):
         for task in self.tasks:
             if not any(_fits(task, agent) for agent in self.agents):
                 raise InputError(f"none of the agents {', '.join(self.agents)} fits {task}")
-        self.cells()
+        for cell in self.cells():
+            if (
+                cell.goal == "own"
+                and self.demonstrations.folder is None
+                and find_task(cell.task).goal_shows_its_start()
+            ):
+                raise InputError(
+                    f"goal is 'own', for which demonstrations of {cell.task} have to be collected "
+                    "for goals (`demo --goals`); name what holds them by demonstrations.folder"
+                )
 
     def cells(self) -> list[TrainConfig]:
         """The training runs, those with few demonstrations first."""

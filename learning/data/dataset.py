@@ -21,6 +21,7 @@ from warp_deform.episodes.corrected import is_corrected, labels_of
 from warp_deform.errors import InputError
 from warp_deform.support.whole_file import whole_file
 from warp_deform.tasks.registry import task as find_task
+from warp_deform.tasks.task import Task
 
 from .goal_name import GoalName
 
@@ -36,6 +37,8 @@ _IMPORTED_ABOVE = {"bag-color-goal": 0.5}
 """Scores that the original code's recordings of a task must exceed to be kept."""
 _IMPORTED_SOLVED = "bag-items-1", "bag-items-2"
 """Tasks of whose recordings by the original code it keeps the solved ones."""
+_TEST_GOALS = range(100_000, 200_000)
+"""Seeds of goals of tests and validation, see `evaluation.protocol`, which needs the simulator."""
 
 
 class Transition(NamedTuple):
@@ -119,8 +122,8 @@ class Demonstrations:
 
     Raises:
         InputError: no folder, another task's episodes, failures among them, or too few; a goal of
-            their own is asked for, and they have none, or one that shows what goals of tests do
-            not (`Task.goal_shows_its_start`).
+            their own is asked for, and they have none, or one of the tests' seeds, or one that
+            shows what goals of tests do not (`Task.goal_shows_its_start`).
 
     Source: Seita et al., ICRA 2021, code that records demonstrations.
     """
@@ -153,6 +156,8 @@ class Demonstrations:
                     f"{Path(folder) / name} is no successful demonstration; train on a folder "
                     "that `warp-deform demo` wrote"
                 )
+        for number in seeds if goal == "own" and not as_played else ():
+            _check_goal(reader, number, self.task)
         self.left_out = len(reader) - len(seeds)
         if not seeds:
             raise InputError(f"{folder}: none of its {len(reader)} episodes is a demonstration")
@@ -172,9 +177,6 @@ class Demonstrations:
     def _take(self, seeds: tuple[int, ...]) -> None:
         self.seeds = seeds
         self.seals = tuple(self._index[episode_name(number)]["seal"] for number in seeds)
-        if self._kind == "own" and self.task.goal_shows_its_start():
-            for number in seeds:
-                _check_made_elsewhere(self._reader, number)
         cache, kind = self._reader.folder / _FOLDER, "" if self._kind == "end" else f"-{self._kind}"
         self._episodes = [
             _open(
@@ -318,20 +320,29 @@ def _learnt(episode: Episode, kind: _Kind, *, what: Path) -> Episode:
     return replace(episode, steps=(*episode.steps[:-1], _aimed_at(episode)))
 
 
-def _check_made_elsewhere(reader: EpisodeReader, seed: int) -> None:
-    """Refuse a demonstration whose goal is made of its own start.
+def _check_goal(reader: EpisodeReader, seed: int, task: Task) -> None:
+    """Refuse a demonstration whose own goal no agent should learn from.
 
     Raises:
-        InputError: it is one.
+        InputError: it is a goal of tests or validation, or is made of the demonstration's start and
+            shows the rest of it, too.
     """
     info = reader.info(seed)
-    if info.goal is None or info.goal["seed"] != seed or is_corrected(info.demonstrator):
+    if info.goal is None or info.goal["kind"] != "constructed" or is_corrected(info.demonstrator):
         return
-    raise InputError(
-        f"the goal of {reader.path(seed)} is made of its own start and shows the rest of it, too, "
-        "which goals of tests do not; collect for goals (`warp-deform goals`, `demo --goals`), or "
-        "leave --goal out"
-    )
+    made_of, path = int(info.goal["seed"]), reader.path(seed)
+    collect = f"`warp-deform goals {task.name} --kind constructed --seed {_TEST_GOALS.stop}`"
+    if made_of in _TEST_GOALS:
+        raise InputError(
+            f"the goal of {path} is of seed {made_of}, one of those of tests and validation; "
+            f"collect for others ({collect}, then `demo --goals`)"
+        )
+    if made_of == seed and task.goal_shows_its_start():
+        raise InputError(
+            f"the goal of {path} is made of its own start and shows the rest of it, too, which "
+            f"goals of tests do not; collect for goals of other seeds ({collect}, then "
+            "`demo --goals`), or leave --goal out"
+        )
 
 
 def _aimed_at(episode: Episode) -> Step:

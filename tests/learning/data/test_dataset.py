@@ -12,7 +12,10 @@ import pytest
 from fixtures.episode_samples import with_info
 from fixtures.training_samples import block_episode, write_demonstrations
 
+from learning.data import dataset
 from learning.data.dataset import Demonstrations, choose
+from learning.evaluation import protocol
+from learning.evaluation.protocol import FIRST_SEED, Protocol
 from learning.interchange.original_recording import DEMONSTRATOR
 from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
@@ -82,21 +85,47 @@ def test_a_recording_without_a_goal_has_none_of_its_own(tmp_path: Path) -> None:
 
 
 def test_a_goal_of_the_start_s_own_is_refused_where_it_shows_what_tests_do_not(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    episode = block_episode(0)
-    assert episode.goal is not None
-    for number, goal in ((0, 0), (1, 200_000)):
-        aimed = dataclasses.replace(episode.goal, seed=goal)
-        EpisodeWriter(tmp_path / str(goal)).write(
-            dataclasses.replace(block_episode(number), goal=aimed)
-        )
+    """Of any demonstration of the folder, also one that is held out, and with its rows cached."""
+    for number, seed in ((0, 0), (1, 200_000)):
+        _aimed(tmp_path / "mixed", number, seed=seed)
+        _aimed(tmp_path / str(seed), number, seed=seed)
+    _aimed(tmp_path / "ends", 0, seed=0, kind="demonstrated")
     assert len(Demonstrations(tmp_path / "0", task=TASK, goal="own")) == 1  # which leaves a cache
     monkeypatch.setattr(Task, "goal_shows_its_start", lambda task: True)
-    assert len(Demonstrations(tmp_path / "200000", task=TASK, goal="own")) == 1
-    with pytest.raises(InputError, match=r"shows the rest of it, too.*or leave --goal out"):
+    for fine in ("200000", "ends"):
+        assert len(Demonstrations(tmp_path / fine, task=TASK, goal="own")) == 1
+    for seed in (0, 1):
+        with pytest.raises(InputError, match=r"shows the rest of it, too.*or leave --goal out"):
+            Demonstrations(tmp_path / "mixed", task=TASK, goal="own", count=1, seed=seed)
+    with pytest.raises(InputError, match="--kind constructed --seed 200000"):
         Demonstrations(tmp_path / "0", task=TASK, goal="own")
     assert len(Demonstrations(tmp_path / "0", task=TASK)) == 1
+
+
+def test_goals_of_tests_are_not_learnt_from(tmp_path: Path) -> None:
+    for seed in (99_999, 100_000, 140_000, 199_999, 200_000):
+        _aimed(tmp_path / str(seed), 0, seed=seed)
+        if seed in (99_999, 200_000):
+            assert len(Demonstrations(tmp_path / str(seed), task=TASK, goal="own")) == 1
+        else:
+            with pytest.raises(InputError, match=f"of seed {seed}, one of those of tests and val"):
+                Demonstrations(tmp_path / str(seed), task=TASK, goal="own")
+            assert len(Demonstrations(tmp_path / str(seed), task=TASK)) == 1
+
+
+def test_seeds_of_tests_goals_are_those_of_the_protocol() -> None:
+    made = [protocol._goal_seed(Protocol(split=split, episodes=200)) for split in FIRST_SEED]
+    assert min(made) == dataset._TEST_GOALS.start and max(made) + 200 in dataset._TEST_GOALS
+
+
+def _aimed(folder: Path, number: int, *, seed: int, kind: str = "constructed") -> None:
+    """Write an episode whose goal is of a kind and made of a seed."""
+    episode = block_episode(number)
+    assert episode.goal is not None
+    goal = dataclasses.replace(episode.goal, seed=seed, kind=kind)
+    EpisodeWriter(folder).write(dataclasses.replace(episode, goal=goal))
 
 
 def test_goals_of_their_own_are_another_run_and_need_a_task_with_goals(

@@ -286,3 +286,13 @@ def test_an_agent_that_learns_of_no_goal_stands_beside_those_that_do(tmp_path: P
     path.write_text(asked)
     cells = read_sweep(path).cells()
     assert {(cell.agent, cell.goal) for cell in cells} == {("goal-split", "own"), ("traced", "end")}
+
+
+def test_goals_of_the_start_s_own_are_refused_before_anything_is_collected(tmp_path: Path) -> None:
+    asked = GRID.format(root=tmp_path, more='goal = "own"').replace(TASK, "bag-color-goal")
+    path = tmp_path / "grid.toml"
+    path.write_text(asked)
+    assert read_sweep(path).cells()[0].goal == "own"
+    path.write_text(asked.replace(f'folder = "{tmp_path}/data"', "count = 2"))
+    with pytest.raises(InputError, match=r"bag-color-goal have to be collected for goals"):
+        read_sweep(path)
