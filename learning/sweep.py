@@ -39,6 +39,7 @@ from warp_deform.support.owned_folder import owned_folder
 from warp_deform.support.progress import progress_bar
 from warp_deform.tasks.registry import task as find_task
 
+from .data.goals import check_goals_are_given
 from .evaluation.run import evaluate_run
 from .evaluation.settings import EvalSettings
 from .models.transporter import Transporter
@@ -125,14 +126,12 @@ class SweepConfig(TrainMethod):
             if not any(_fits(task, agent) for agent in self.agents):
                 raise InputError(f"none of the agents {', '.join(self.agents)} fits {task}")
         for cell in self.cells():
-            if (
-                cell.goal == "own"
-                and self.demonstrations.folder is None
-                and find_task(cell.task).goal_shows_its_start()
-            ):
-                raise InputError(
-                    f"goal is 'own', for which demonstrations of {cell.task} have to be collected "
-                    "for goals (`demo --goals`); name what holds them by demonstrations.folder"
+            if cell.goal == "own":
+                check_goals_are_given(
+                    find_task(cell.task),
+                    given=self.demonstrations.folder is not None,
+                    advice="collect demonstrations for other goals (`demo --goals`) and name what "
+                    "holds them by demonstrations.folder",
                 )
 
     def cells(self) -> list[TrainConfig]:

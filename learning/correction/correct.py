@@ -18,11 +18,12 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from warp_deform.collecting.folder import Attempt, Collection, append_attempt, check_seeds
+from warp_deform.collecting.goals import check_goals, goals_in_turn
 from warp_deform.collecting.recording import observe, record
 from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import (
@@ -30,6 +31,7 @@ from warp_deform.episodes import (
     EpisodeInfo,
     EpisodeReader,
     EpisodeWriter,
+    Goal,
     Step,
     combine_hashes,
     episode_name,
@@ -43,11 +45,13 @@ from warp_deform.rendering.pixels import SHAPE
 from warp_deform.robots import robot as find_robot
 from warp_deform.support.progress import progress_bar
 from warp_deform.support.whole_file import whole_file
+from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Action, Task
 from warp_deform.worlds.loop import EpisodeRun, play, worlds_for
 from warp_deform.worlds.worlds import Worlds
 
 from ..data.batches import task_lifts
+from ..data.goals import check_goal, check_goals_are_given, making_goals
 from ..evaluation.play import acting
 from ..evaluation.protocol import Protocol, check_splits
 from ..evaluation.snapshot import trained_steps
@@ -113,8 +117,8 @@ def correct(config: CorrectConfig) -> CorrectReport:
 
     Raises:
         InputError: there is no finished run, what it learned from is not there, the teacher has
-            nothing to say of its task, a seed is needed elsewhere, or the folder holds something
-            else.
+            nothing to say of its task, a seed is needed elsewhere, a goal is one of tests, goals
+            have to be given, or the folder holds something else.
     """
     began = time.perf_counter()
     out, run = Path(config.out).resolve(), RunFolder(config.run)
@@ -125,6 +129,7 @@ def correct(config: CorrectConfig) -> CorrectReport:
     if source == out:
         raise InputError(f"{config.out} is what {config.run} learned from; give --out another one")
     seeds = _seeds(config, known, task)
+    _check_goals(config, task, seeds)
     snapshot = run.chosen_snapshot().resolve()
     load_policy(snapshot)  # refuses a damaged one before anything is made
     weights = hashlib.blake2b(snapshot.read_bytes(), digest_size=16).hexdigest()
@@ -136,13 +141,16 @@ def correct(config: CorrectConfig) -> CorrectReport:
         "seed": seeds[0],
         "demonstrations": settings["demonstrations"],
     }
+    if config.goals is not None:
+        infos = EpisodeReader(config.goals).infos()
+        description["goals"] = [info.state_hash for info in infos]
     count = worker_count(config.workers, _COLLECTED * len(seeds))
     with Collection(out, description).owned() as collection:
         _copy(source, out, known)
         todo = [seed for seed in seeds if seed not in collection.attempts]
         size = max(1, min(_CHUNK, math.ceil(len(todo) / count)))
         chunks = [
-            _Chunk(out, snapshot, weights, config.teacher, config.robot, tuple(todo[i : i + size]))
+            _Chunk(config, out, snapshot, weights, tuple(todo[i : i + size]))
             for i in range(0, len(todo), size)
         ]
         bar = progress_bar(f"correct {task}", len(seeds), done=len(seeds) - len(todo))
@@ -196,6 +204,31 @@ def _seeds(config: CorrectConfig, known: Sequence[int], task: str) -> range:
     return seeds
 
 
+def _check_goals(config: CorrectConfig, task: str, seeds: Sequence[int]) -> None:
+    """Refuse goals that an agent should not learn with, before anything is made.
+
+    Raises:
+        InputError: one is of the tests, the folder holds none of the task, or some are missing.
+    """
+    known = find_task(task)
+    advice = f"give goals of other seeds by --goals (`{making_goals(known)}`)"
+    check_goals_are_given(known, given=config.goals is not None, advice=advice)
+    if config.goals is None:
+        return
+    goal_of = goals_in_turn(check_goals(config.goals, task))
+    for seed in seeds:
+        goal = cast(Goal, goal_of(seed))
+        check_goal(
+            known,
+            seed=seed,
+            kind=goal.kind,
+            goal=goal.seed,
+            learnt=True,
+            advice=advice,
+            what=f"the episode of seed {seed}, in {config.goals},",
+        )
+
+
 def _check_teacher(config: CorrectConfig, task: str, seed: int) -> None:
     """Ask the teacher once, so that one that is not for the task leaves nothing behind.
 
@@ -209,8 +242,8 @@ def _check_teacher(config: CorrectConfig, task: str, seed: int) -> None:
         said.extend(_learnable(each, worlds.task) for each in teach(worlds, runs).values())
         return dict.fromkeys(runs)
 
-    worlds = worlds_for(task, config.robot)
-    for _ in play(worlds, [seed], act=act, look=lambda *_: None):
+    worlds, goals = worlds_for(task, config.robot), goals_in_turn(config.goals)
+    for _ in play(worlds, [seed], act=act, look=lambda *_: None, goals=goals):
         pass
     if not any(each is not None for each in said):
         raise InputError(
@@ -230,22 +263,21 @@ def _copy(source: Path, out: Path, seeds: Sequence[int]) -> None:
 
 @dataclass(frozen=True)
 class _Chunk:
+    config: CorrectConfig
     out: Path
     snapshot: Path
     weights: str
-    teacher: str
-    robot: str
     seeds: tuple[int, ...]
 
 
 def _correct_chunk(chunk: _Chunk) -> Iterator[Attempt]:
     """Play and label episodes; each is a file and a line of the ledger at once."""
-    policy = load_policy(chunk.snapshot)
-    worlds = worlds_for(policy.description.task, chunk.robot)
+    config, policy = chunk.config, load_policy(chunk.snapshot)
+    worlds = worlds_for(policy.description.task, config.robot)
     writer = EpisodeWriter(chunk.out, overwrite=True)  # by the same episode, if at all
     # as in evaluation; nothing of a protocol but its manner of playing is used
-    chosen = acting(policy, Protocol(split="test", episodes=1, robot=chunk.robot))
-    teach = demonstrator(chunk.teacher)
+    chosen = acting(policy, Protocol(split="test", episodes=1, robot=config.robot))
+    teach = demonstrator(config.teacher)
     labels: dict[int, list[Action | None]] = {}
 
     def act(worlds: Worlds, runs: Mapping[int, EpisodeRun[Step]]) -> Mapping[int, Action | None]:
@@ -256,13 +288,14 @@ def _correct_chunk(chunk: _Chunk) -> Iterator[Attempt]:
             labels[slot].append(_learnable(said, worlds.task))
         return chosen(worlds, runs)
 
-    for slot, run in play(worlds, chunk.seeds, act=act, look=observe):
+    goals = goals_in_turn(config.goals)
+    for slot, run in play(worlds, chunk.seeds, act=act, look=observe, goals=goals):
         said = labels.pop(slot, [])
         reason = _reason(run, said)
         score = run.rows[-1].score if run.rows else 0.0
         if reason == "":
-            episode = record(worlds, slot, run, demonstrator=corrector(chunk.teacher))
-            writer.write(_labelled(episode, correction(chunk.teacher, said, policy=chunk.weights)))
+            episode = record(worlds, slot, run, demonstrator=corrector(config.teacher))
+            writer.write(_labelled(episode, correction(config.teacher, said, policy=chunk.weights)))
         attempt = Attempt(
             run.seed, reason == "", len(run.actions), score, reason or run.ended or ""
         )

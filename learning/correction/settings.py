@@ -36,6 +36,10 @@ class CorrectSettings:
     """Folder that holds what RUN learned from. By default, the one that RUN names."""
     seed: Annotated[int | None, SEED] = None
     """First seed. By default, the one after the greatest that RUN learned from."""
+    goals: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder of goals, see `warp-deform goals`; none may be of tests. The seed decides which one an
+    episode goes for, as in `demo --goals`. By default every seed makes a goal of its own.
+    bag-color-goal needs a folder, as such a goal would show what those of tests do not."""
     robot: RobotName = "ur5"
     """Which arm moves."""
     workers: Annotated[int | None, arg(metavar="W"), COUNT] = None

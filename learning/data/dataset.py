@@ -24,6 +24,7 @@ from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Task
 
 from .goal_name import GoalName
+from .goals import check_goal, goal_is_elsewhere, making_goals
 
 __all__ = ["Demonstrations", "Transition", "choose", "remove_cache"]
 
@@ -37,8 +38,6 @@ _IMPORTED_ABOVE = {"bag-color-goal": 0.5}
 """Scores that the original code's recordings of a task must exceed to be kept."""
 _IMPORTED_SOLVED = "bag-items-1", "bag-items-2"
 """Tasks of whose recordings by the original code it keeps the solved ones."""
-_TEST_GOALS = range(100_000, 200_000)
-"""Seeds of goals of tests and validation, see `evaluation.protocol`, which needs the simulator."""
 
 
 class Transition(NamedTuple):
@@ -121,9 +120,9 @@ class Demonstrations:
         as_played: whether to learn what was done and where it led, of corrected episodes too
 
     Raises:
-        InputError: no folder, another task's episodes, failures among them, or too few; a goal of
-            their own is asked for, and they have none, or one of the tests' seeds, or one that
-            shows what goals of tests do not (`Task.goal_shows_its_start`).
+        InputError: no folder, another task's episodes, failures among them, or too few; one went
+            for a goal of tests; goals of their own are learnt, and they have none, or such as show
+            what goals of tests do not (`Task.goal_shows_its_start`).
 
     Source: Seita et al., ICRA 2021, code that records demonstrations.
     """
@@ -156,8 +155,8 @@ class Demonstrations:
                     f"{Path(folder) / name} is no successful demonstration; train on a folder "
                     "that `warp-deform demo` wrote"
                 )
-        for number in seeds if goal == "own" and not as_played else ():
-            _check_goal(reader, number, self.task)
+        for number in seeds if self.task.goal_conditioned and not as_played else ():
+            _check_goal(reader, number, self.task, goal=goal)
         self.left_out = len(reader) - len(seeds)
         if not seeds:
             raise InputError(f"{folder}: none of its {len(reader)} episodes is a demonstration")
@@ -209,6 +208,11 @@ class Demonstrations:
         """How many of them are corrected episodes."""
         names = (self._index[episode_name(seed)]["demonstrator"] for seed in self.seeds)
         return sum(map(is_corrected, names))
+
+    @property
+    def goals_elsewhere(self) -> bool:
+        """Whether a goal of theirs was made of another start, see `warp-deform demo --goals`."""
+        return any(goal_is_elsewhere(self._reader.info(seed)) for seed in self.seeds)
 
     @property
     def state_size(self) -> int:
@@ -320,29 +324,29 @@ def _learnt(episode: Episode, kind: _Kind, *, what: Path) -> Episode:
     return replace(episode, steps=(*episode.steps[:-1], _aimed_at(episode)))
 
 
-def _check_goal(reader: EpisodeReader, seed: int, task: Task) -> None:
-    """Refuse a demonstration whose own goal no agent should learn from.
+def _check_goal(reader: EpisodeReader, seed: int, task: Task, *, goal: GoalName) -> None:
+    """Refuse an episode that went for a goal that no agent should learn from.
 
     Raises:
-        InputError: it is a goal of tests or validation, or is made of the demonstration's start and
-            shows the rest of it, too.
+        InputError: see `goals.check_goal`.
     """
     info = reader.info(seed)
-    if info.goal is None or info.goal["kind"] != "constructed" or is_corrected(info.demonstrator):
+    if info.goal is None:
         return
-    made_of, path = int(info.goal["seed"]), reader.path(seed)
-    collect = f"`warp-deform goals {task.name} --kind constructed --seed {_TEST_GOALS.stop}`"
-    if made_of in _TEST_GOALS:
-        raise InputError(
-            f"the goal of {path} is of seed {made_of}, one of those of tests and validation; "
-            f"collect for others ({collect}, then `demo --goals`)"
-        )
-    if made_of == seed and task.goal_shows_its_start():
-        raise InputError(
-            f"the goal of {path} is made of its own start and shows the rest of it, too, which "
-            f"goals of tests do not; collect for goals of other seeds ({collect}, then "
-            "`demo --goals`), or leave --goal out"
-        )
+    corrected = is_corrected(info.demonstrator)
+    verb = "correct" if corrected else "demo"
+    advice = f"use goals of other seeds (`{making_goals(task)}`, then `{verb} --goals`)"
+    if goal == "own" and not corrected:
+        advice += ", or leave --goal out"
+    check_goal(
+        task,
+        seed=seed,
+        kind=info.goal["kind"],
+        goal=int(info.goal["seed"]),
+        learnt=goal == "own" or corrected,
+        advice=advice,
+        what=reader.path(seed),
+    )
 
 
 def _aimed_at(episode: Episode) -> Step:

@@ -7,6 +7,7 @@ training play validation episodes, and the best of them plays the test.
 
     OUT/distill.json    settings, costs and plan
     OUT/stages.jsonl    what was done, and its CPU time
+    OUT/goals           what is played for, where a start's own goal shows what a test's does not
     OUT/demos, refined  demonstrations
     OUT/rounds/K        run and corrected episodes of a round
     OUT/run             the last training, with its test
@@ -23,6 +24,8 @@ from typing import Any, cast
 import numpy as np
 
 from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.goals import CONSTRUCTED
+from warp_deform.collecting.make_goals import make_goals
 from warp_deform.episodes import versions
 from warp_deform.errors import InputError, WarpDeformError
 from warp_deform.planning.demonstrators import demonstrator
@@ -31,6 +34,8 @@ from warp_deform.tasks.registry import task as find_task
 
 from ..correction.correct import CorrectConfig, correct
 from ..data.dataset import remove_cache
+from ..data.goal_name import GoalName
+from ..data.goals import TEST_GOALS
 from ..evaluation.run import evaluate_run
 from ..policy.policy import AGENTS, AgentDescription
 from ..refinement.refine import RefineConfig, refine
@@ -48,6 +53,8 @@ __all__ = ["DistillConfig", "distill"]
 _TIMED_STEPS = 50
 """Steps by which the cost of one is measured: a line of the log."""
 _LOCK = "distill.lock"
+_GOALS = 100
+"""Goals that all episodes share in turn, where they have to be made."""
 _FIRST_SHARE = 0.4
 """When the last training keeps its first snapshot, if it keeps several."""
 
@@ -76,6 +83,15 @@ class DistillConfig(DistillSettings):
             return "goal-split" if find_task(self.task).goal_conditioned else "transporter"
         return self.agent
 
+    @property
+    def goal_name(self) -> GoalName:
+        """What is learnt as the goal of demonstrations."""
+        return "own" if find_task(self.task).goal_shows_its_start() else "end"
+
+    def goals(self) -> Path | None:
+        """Folder of the goals that demonstrator and policy go for; None: each start's own."""
+        return Path(self.out).resolve() / "goals" if self.goal_name == "own" else None
+
 
 def distill(config: DistillConfig) -> dict[str, Any]:
     """Distill into a folder; goes on where an earlier call with the same settings stopped.
@@ -96,6 +112,7 @@ def distill(config: DistillConfig) -> dict[str, Any]:
     with owned_folder(out, lock=_LOCK, work="distillation"):
         record = _claim(out, config)
         stages = Stages(out / "stages.jsonl", told=f"distill {config.task}" * config.progress)
+        _make_goals(config, stages)
         few = FEW if planned is None else planned.demos
         if planned is None:
             _demonstrate(config, out, stages, FIRST)
@@ -134,6 +151,21 @@ def distill(config: DistillConfig) -> dict[str, Any]:
     }
 
 
+def _make_goals(config: DistillConfig, stages: Stages) -> None:
+    """Have goals of other starts, where a start's own would show what goals of tests do not."""
+    folder = config.goals()
+    if folder is None:
+        return
+
+    def made() -> dict[str, Any]:
+        report = make_goals(
+            config.task, folder, count=_GOALS, seed=TEST_GOALS.stop, kind=CONSTRUCTED, workers=1
+        )
+        return {"goals": report["goals"]}
+
+    stages("goals", made, what=f"{_GOALS} goals")
+
+
 def _demonstrate(config: DistillConfig, out: Path, stages: Stages, count: int) -> Path:
     """Have so many demonstrations, refined if they are to be; returns their folder."""
     demos = out / "demos"
@@ -145,6 +177,7 @@ def _demonstrate(config: DistillConfig, out: Path, stages: Stages, count: int) -
                 episodes=count,
                 out=demos,
                 demonstrator=config.teacher,
+                goals=config.goals(),
                 workers=1,
             )
         )
@@ -206,7 +239,13 @@ def _learn(config: DistillConfig, plan: Plan, out: Path, stages: Stages, data: P
         training = _training(config, data, run, steps=steps, start=before)
         stages(f"training {number}", partial(_trained, training), what=f"{of}, {steps} steps")
         by = CorrectConfig(
-            run=run, data=data, out=corrected, teacher=config.teacher, episodes=episodes, workers=1
+            run=run,
+            data=data,
+            out=corrected,
+            teacher=config.teacher,
+            episodes=episodes,
+            goals=config.goals(),
+            workers=1,
         )
         what = f"{of}, {episodes} episodes to correct"
         said = stages(f"correction {number}", partial(_corrected, by), what=what)
@@ -257,6 +296,7 @@ def _training(
         agent=config.learner,
         data=data,
         out=out,
+        goal=config.goal_name,
         preset="fast",
         schedule=schedule,
         patience=0,

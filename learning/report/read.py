@@ -103,6 +103,8 @@ def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
         parts.append(f"{settings['corrected']} episodes {' and '.join(by)}")
     if settings.get("goal") == "own":
         parts.append("goals of their own")
+    if settings.get("goals_elsewhere"):
+        parts.append("demonstrated for goals of other starts")
     if settings.get("start"):
         parts.append("begun with trained weights")
     return ", ".join(parts)

@@ -210,6 +210,7 @@ def claim(
         "labels": sum(data.lengths()),
         "corrected": data.corrected,
         "demonstrators": names,
+        **({"goals_elsewhere": True} if data.goals_elsewhere else {}),
         "revisions": [asdict(running_revision())],
     }
     write_json(run.settings, {**deciding, **described})

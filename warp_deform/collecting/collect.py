@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from ..episodes import EpisodeReader, EpisodeWriter, Goal, combine_hashes, rebuild_index
+from ..episodes import EpisodeReader, EpisodeWriter, combine_hashes, rebuild_index
 from ..episodes.enclosed import enclosed_count
 from ..errors import InputError
 from ..planning.demonstrators import demonstrator
@@ -23,7 +23,7 @@ from ..worlds.loop import SLOTS, SOLVED, play, worlds_for
 from .control_demos import ControlChunk, attempt_control_chunk, check_control, describe_control
 from .control_video import film_control
 from .folder import Attempt, Collection, append_attempt, check_seeds
-from .goals import check_goals, load_goals
+from .goals import check_goals, goals_in_turn
 from .recording import observe, record, task_config
 from .settings import CollectSettings
 from .video import check_video, film
@@ -211,13 +211,9 @@ def attempt_chunk(chunk: _Chunk) -> Iterator[Attempt]:
     """Attempt seeds; a success is a file, and every attempt a line of the ledger, at once."""
     config = chunk.config
     writer = EpisodeWriter(config.out, overwrite=True)  # by the same episode, if at all
-    goals = [] if config.goals is None else load_goals(config.goals)
-
-    def goal(seed: int) -> Goal | None:
-        return goals[seed % len(goals)] if goals else None
-
+    goals = goals_in_turn(config.goals)
     worlds, act = worlds_for(config.task, config.robot), demonstrator(config.demonstrator)
-    for slot, run in play(worlds, chunk.seeds, act=act, look=observe, goals=goal):
+    for slot, run in play(worlds, chunk.seeds, act=act, look=observe, goals=goals):
         success = run.ended == SOLVED
         if success:
             writer.write(record(worlds, slot, run, demonstrator=config.demonstrator))

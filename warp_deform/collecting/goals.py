@@ -7,6 +7,7 @@ every folder of demonstrations is a set of goals too, and one reader serves both
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ __all__ = [
     "DEMONSTRATED",
     "at_goal",
     "check_goals",
+    "goals_in_turn",
     "load_goal",
     "load_goals",
 ]
@@ -42,6 +44,22 @@ def load_goals(folder: Path) -> list[Goal]:
     """
     reader = EpisodeReader(folder)
     return [_goal(reader, seed) for seed in reader.seeds]
+
+
+def goals_in_turn(folder: Path | None) -> Callable[[int], Goal | None]:
+    """What an episode goes for, by its seed: the folder's goals in turn.
+
+    Without a folder it is None: the seed makes a goal of its own.
+
+    Raises:
+        InputError: see `load_goals`.
+    """
+    goals = [] if folder is None else load_goals(folder)
+
+    def goal(seed: int) -> Goal | None:
+        return goals[seed % len(goals)] if goals else None
+
+    return goal
 
 
 def check_goals(folder: Path, task: str) -> Path:

@@ -21,13 +21,16 @@ from learning.training.config import TrainConfig
 from learning.training.schedules import Schedule
 from learning.training.train import train
 from warp_deform.collecting.collect import CollectConfig, collect
+from warp_deform.collecting.goals import CONSTRUCTED
 from warp_deform.collecting.inspection import contact_sheet
+from warp_deform.collecting.make_goals import make_goals
 from warp_deform.collecting.replay import verify
 from warp_deform.command.main import main
 from warp_deform.episodes import EpisodeReader, EpisodeWriter, episode_name
 from warp_deform.episodes.corrected import CORRECTION, corrector, labels_of
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
+from warp_deform.tasks.task import Task
 
 NEW = (2, 3, 4)
 """Seeds of the corrected episodes; the run learned from 0 and 1."""
@@ -239,6 +242,58 @@ def test_a_teacher_that_has_nothing_to_say_is_refused(
     with pytest.raises(InputError, match="scripted has nothing to say of block-notarget"):
         correct(CorrectConfig(run=trained, teacher="scripted", episodes=1, out=out, workers=1))
     assert not out.exists()
+
+
+def test_goals_that_are_given_are_played_for_and_learnt(trained: Path, tmp_path: Path) -> None:
+    """By the seed's turn, whatever the parts; the same folder goes on for no others."""
+    goals = made_goals(tmp_path / "goals", 2, seed=200_000)
+    config = CorrectConfig(
+        run=trained, teacher="scripted", episodes=1, goals=goals, out=tmp_path / "a", workers=1
+    )
+    correct(config)
+    report = correct(replace(config, episodes=3, workers=2))
+    whole = correct(replace(config, episodes=3, out=tmp_path / "b"))
+    assert report.state_hash == whole.state_hash and whole.corrected == 3
+    reader = EpisodeReader(tmp_path / "a")
+    for seed in NEW:
+        goal, wanted = reader.read_goal(seed), EpisodeReader(goals).read(200_000 + seed % 2)
+        assert goal is not None and goal.seed == 200_000 + seed % 2
+        np.testing.assert_array_equal(goal.color, wanted.steps[-1].color)
+    assert verify(new_ones(report, tmp_path / "new"), workers=1)["mismatches"] == 0
+    data = Demonstrations(tmp_path / "a", task=TASK)
+    assert data.goals_elsewhere
+    shown = data.transition(data.seeds.index(3), 0)
+    np.testing.assert_array_equal(shown.goal_color, reader.read(3).goal.color)
+    for others in (None, made_goals(tmp_path / "others", 2, seed=200_001)):
+        with pytest.raises(InputError, match="collection of another kind: goals"):
+            correct(replace(config, goals=others))
+
+
+def test_goals_that_no_agent_should_learn_with_are_refused(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = CorrectConfig(run=trained, teacher="scripted", episodes=2, out=tmp_path / "out")
+
+    def refused(match: str, **changes: object) -> None:
+        with pytest.raises(InputError, match=match):
+            correct(replace(config, **changes))
+        assert not (tmp_path / "out").exists()
+
+    tests = made_goals(tmp_path / "tests", 1, seed=100_000)
+    refused("of seed 100000, one of those of tests.*--seed 200000", goals=tests)
+    refused("cannot be read as a folder of episodes", goals=tmp_path / "nowhere")
+    refused("holds goals of cable-line", goals=write_demonstrations(
+        tmp_path / "line", 1, task="cable-line-notarget"))  # fmt: skip
+    monkeypatch.setattr(Task, "goal_shows_its_start", lambda task: True)
+    refused("made of its own start.*give goals of other seeds by --goals")
+    own = made_goals(tmp_path / "own", 2, seed=2)
+    refused("of seed 2, in .* is made of its own start", goals=own)
+
+
+def made_goals(folder: Path, count: int, *, seed: int) -> Path:
+    """Goals of the task, made of neighbouring seeds."""
+    make_goals(TASK, folder, count=count, seed=seed, kind=CONSTRUCTED, workers=1)
+    return folder
 
 
 @pytest.mark.parametrize(

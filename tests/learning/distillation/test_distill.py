@@ -18,6 +18,7 @@ from learning.runs.folder import RunFolder
 from warp_deform.command.main import main
 from warp_deform.episodes import EpisodeReader
 from warp_deform.errors import InputError
+from warp_deform.tasks.task import Task
 
 TASK = "block-notarget"
 PLAN = Plan(demos=2, round_steps=(1, 1), round_episodes=(1, 1), last_steps=2, snapshots=2,
@@ -63,6 +64,22 @@ def test_every_round_learns_from_all_before_it(whole: dict[str, Any]) -> None:
     spent = sum(each["cpu_seconds"] for each in whole["stages"] if each["stage"] != "test")
     assert whole["cpu_minutes"] == pytest.approx(spent / 60)
     assert whole["test_cpu_minutes"] == pytest.approx(stages["test"]["cpu_seconds"] / 60)
+
+
+def test_where_a_start_s_own_goal_would_show_too_much_goals_are_made(
+    narrow_networks: None, plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Task, "goal_shows_its_start", lambda task: True)
+    monkeypatch.setattr(distilling, "_GOALS", 2)
+    report = distill(
+        DistillConfig(task=TASK, plan=plan, episodes=1, out=tmp_path / "out", progress=False)
+    )
+    assert report["stages"][0]["stage"] == "goals"
+    settings = RunFolder(Path(report["run"])).read_settings()
+    assert settings["goal"] == "own" and settings["goals_elsewhere"]
+    learnt = EpisodeReader(tmp_path / "out" / "rounds" / "2" / "corrected")
+    seeds = {info.seed: info.goal and info.goal["seed"] for info in learnt.infos()}
+    assert len(seeds) == 4 and all(seeds[k] == 200_000 + k % 2 for k in seeds)
 
 
 def test_an_interruption_loses_no_bit(

@@ -294,5 +294,5 @@ def test_goals_of_the_start_s_own_are_refused_before_anything_is_collected(tmp_p
     path.write_text(asked)
     assert read_sweep(path).cells()[0].goal == "own"
     path.write_text(asked.replace(f'folder = "{tmp_path}/data"', "count = 2"))
-    with pytest.raises(InputError, match=r"bag-color-goal have to be collected for goals"):
+    with pytest.raises(InputError, match=r"goal of bag-color-goal .* demonstrations\.folder"):
         read_sweep(path)
