@@ -146,3 +146,17 @@ def run(trained, tmp_path):
 
     shutil.copytree(trained, tmp_path / "run")
     return RunFolder(tmp_path / "run")
+
+
+@pytest.fixture
+def forgets_tasks(monkeypatch):
+    """Tasks that a test registers, and their environments, are not left to the next."""
+    import gymnasium
+
+    from warp_deform.tasks import registry
+
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    ids = set(gymnasium.registry)
+    yield
+    for name in set(gymnasium.registry) - ids:
+        del gymnasium.registry[name]

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import pytest
 from fixtures.places import ROOT
 
@@ -18,17 +17,13 @@ from warp_deform.tasks import registry
 
 
 @pytest.fixture
-def wide_bags(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def wide_bags(forgets_tasks: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The script, whose tasks are forgotten afterwards."""
-    monkeypatch.setattr(registry, "_REGISTERED", {})
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    ids = set(gymnasium.registry)
     import wide_bags
 
     yield wide_bags
     del sys.modules["wide_bags"]
-    for name in set(gymnasium.registry) - ids:
-        del gymnasium.registry[name]
 
 
 def test_cells_with_a_line_of_their_sizes_are_left_out(

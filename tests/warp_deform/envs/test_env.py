@@ -222,7 +222,7 @@ def test_frames_for_people() -> None:
     assert PickPlaceEnv(BLOCK).render() is None
 
 
-def test_own_task_needs_no_registry() -> None:
+def test_own_task_needs_no_registry(forgets_tasks: None) -> None:
     module = runpy.run_path(str(EXAMPLES / "own_task.py"))
     env = PickPlaceEnv(module["CableGather"]())
     _, info = env.reset(seed=1)

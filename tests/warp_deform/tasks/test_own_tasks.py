@@ -68,14 +68,11 @@ class BoxAway(Task):
 
 
 @pytest.fixture(autouse=True)
-def _forget(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _forget(forgets_tasks: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Nothing that a test registers, imports or puts on the path is left to the next."""
-    monkeypatch.setattr(registry, "_REGISTERED", {})
     monkeypatch.setattr(sys, "path", [*sys.path])
-    ids, modules = set(gymnasium.registry), set(sys.modules)
+    modules = set(sys.modules)
     yield
-    for name in set(gymnasium.registry) - ids:
-        del gymnasium.registry[name]
     for name in set(sys.modules) - modules:
         if name.endswith("_tasks"):
             del sys.modules[name]
