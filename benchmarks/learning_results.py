@@ -51,6 +51,8 @@ def check_in(paths: Sequence[Path], out: Path) -> list[str]:
             name += f"-{steps}-steps"
         if run.settings.get("goal") == "own":
             name += "-own-goals"
+        if run.settings.get("given_goals"):
+            name += "-given"
         by = run.settings["demonstrators"]
         if by and by != ["scripted"]:  # who else demonstrated must not replace the paper's way
             name += "-" + "-".join(each.replace(" ", "-") for each in by)

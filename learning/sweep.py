@@ -129,9 +129,9 @@ class SweepConfig(TrainMethod):
             if cell.goal == "own":
                 check_goals_are_given(
                     find_task(cell.task),
-                    given=self.demonstrations.folder is not None,
-                    advice="collect demonstrations for other goals (`demo --goals`) and name what "
-                    "holds them by demonstrations.folder",
+                    given=self.demonstrations.folder is not None and self.data(cell.task).is_dir(),
+                    advice="collect demonstrations for given goals (`demo --goals`) and name what "
+                    "holds their folder by demonstrations.folder",
                 )
 
     def cells(self) -> list[TrainConfig]:

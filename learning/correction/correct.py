@@ -3,8 +3,8 @@
 A policy that learned from demonstrations meets states that no demonstrator would have come to. Here
 it plays, and in every state a teacher that sees the simulator is asked for its action, which is not
 carried out. The labelled episodes stand in one folder with what the policy learned from, so that
-the next training learns from both. An episode depends on the policy, the teacher and its seed
-alone.
+the next training learns from both. An episode depends on the policy, the teacher, its seed and,
+where goals are given, its goal alone.
 
 Source: Ross et al., AISTATS 2011.
 """
@@ -18,12 +18,12 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from warp_deform.collecting.folder import Attempt, Collection, append_attempt, check_seeds
-from warp_deform.collecting.goals import check_goals, goals_in_turn
+from warp_deform.collecting.goals import check_goals, goals_in_turn, load_goals
 from warp_deform.collecting.recording import observe, record
 from warp_deform.collecting.workers import Workers, worker_count
 from warp_deform.episodes import (
@@ -31,7 +31,6 @@ from warp_deform.episodes import (
     EpisodeInfo,
     EpisodeReader,
     EpisodeWriter,
-    Goal,
     Step,
     combine_hashes,
     episode_name,
@@ -51,11 +50,12 @@ from warp_deform.worlds.loop import EpisodeRun, play, worlds_for
 from warp_deform.worlds.worlds import Worlds
 
 from ..data.batches import task_lifts
-from ..data.goals import check_goal, check_goals_are_given, making_goals
+from ..data.dataset import LearntGoal, check_learnt_goals
+from ..data.goals import check_goals_are_given, making_goals, refuse_test_goal
 from ..evaluation.play import acting
 from ..evaluation.protocol import Protocol, check_splits
 from ..evaluation.snapshot import trained_steps
-from ..policy.policy import load_policy
+from ..policy.policy import AGENTS, load_policy
 from ..runs.folder import RunFolder
 from .settings import CorrectSettings
 
@@ -121,7 +121,9 @@ def correct(config: CorrectConfig) -> CorrectReport:
             have to be given, or the folder holds something else.
     """
     began = time.perf_counter()
-    out, run = Path(config.out).resolve(), RunFolder(config.run)
+    goals = None if config.goals is None else Path(config.goals).resolve()
+    config = replace(config, out=Path(config.out).resolve(), goals=goals)
+    out, run = config.out, RunFolder(config.run)
     settings = run.read_settings()
     trained_steps(run)  # refuses a run that has not come to its end
     task, known = settings["agent"]["task"], sorted(map(int, settings["demonstrations"]))
@@ -130,6 +132,9 @@ def correct(config: CorrectConfig) -> CorrectReport:
         raise InputError(f"{config.out} is what {config.run} learned from; give --out another one")
     seeds = _seeds(config, known, task)
     _check_goals(config, task, seeds)
+    follows = AGENTS[settings["agent"]["agent"]].sees == "traces"
+    learnt: LearntGoal = "played" if follows else settings.get("goal", "end")
+    check_learnt_goals(EpisodeReader(source), known, find_task(task), goal=learnt)
     snapshot = run.chosen_snapshot().resolve()
     load_policy(snapshot)  # refuses a damaged one before anything is made
     weights = hashlib.blake2b(snapshot.read_bytes(), digest_size=16).hexdigest()
@@ -150,7 +155,7 @@ def correct(config: CorrectConfig) -> CorrectReport:
         todo = [seed for seed in seeds if seed not in collection.attempts]
         size = max(1, min(_CHUNK, math.ceil(len(todo) / count)))
         chunks = [
-            _Chunk(config, out, snapshot, weights, tuple(todo[i : i + size]))
+            _Chunk(config, snapshot, weights, tuple(todo[i : i + size]))
             for i in range(0, len(todo), size)
         ]
         bar = progress_bar(f"correct {task}", len(seeds), done=len(seeds) - len(todo))
@@ -208,25 +213,22 @@ def _check_goals(config: CorrectConfig, task: str, seeds: Sequence[int]) -> None
     """Refuse goals that an agent should not learn with, before anything is made.
 
     Raises:
-        InputError: one is of the tests, the folder holds none of the task, or some are missing.
+        InputError: one is of tests, the folder holds none of the task, or none are given where
+            starts make goals that show what those of tests do not.
     """
     known = find_task(task)
-    advice = f"give goals of other seeds by --goals (`{making_goals(known)}`)"
-    check_goals_are_given(known, given=config.goals is not None, advice=advice)
+    making = f"(`{making_goals(known)}`)"
+    check_goals_are_given(
+        known, given=config.goals is not None, advice=f"give goals by --goals {making}"
+    )
     if config.goals is None:
+        for seed in seeds if known.goal_conditioned else ():
+            advice = "choose another --seed, or give goals by --goals"
+            refuse_test_goal(seed, what=f"the episode of seed {seed}", advice=advice)
         return
-    goal_of = goals_in_turn(check_goals(config.goals, task))
-    for seed in seeds:
-        goal = cast(Goal, goal_of(seed))
-        check_goal(
-            known,
-            seed=seed,
-            kind=goal.kind,
-            goal=goal.seed,
-            learnt=True,
-            advice=advice,
-            what=f"the episode of seed {seed}, in {config.goals},",
-        )
+    for goal in load_goals(check_goals(config.goals, task)):
+        advice = f"give goals of other seeds {making}"
+        refuse_test_goal(goal.seed, what=config.goals, advice=advice)
 
 
 def _check_teacher(config: CorrectConfig, task: str, seed: int) -> None:
@@ -264,7 +266,6 @@ def _copy(source: Path, out: Path, seeds: Sequence[int]) -> None:
 @dataclass(frozen=True)
 class _Chunk:
     config: CorrectConfig
-    out: Path
     snapshot: Path
     weights: str
     seeds: tuple[int, ...]
@@ -274,7 +275,7 @@ def _correct_chunk(chunk: _Chunk) -> Iterator[Attempt]:
     """Play and label episodes; each is a file and a line of the ledger at once."""
     config, policy = chunk.config, load_policy(chunk.snapshot)
     worlds = worlds_for(policy.description.task, config.robot)
-    writer = EpisodeWriter(chunk.out, overwrite=True)  # by the same episode, if at all
+    writer = EpisodeWriter(config.out, overwrite=True)  # by the same episode, if at all
     # as in evaluation; nothing of a protocol but its manner of playing is used
     chosen = acting(policy, Protocol(split="test", episodes=1, robot=config.robot))
     teach = demonstrator(config.teacher)
@@ -299,7 +300,7 @@ def _correct_chunk(chunk: _Chunk) -> Iterator[Attempt]:
         attempt = Attempt(
             run.seed, reason == "", len(run.actions), score, reason or run.ended or ""
         )
-        append_attempt(chunk.out, attempt)
+        append_attempt(config.out, attempt)
         yield attempt
 
 

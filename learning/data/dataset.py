@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -24,11 +24,19 @@ from warp_deform.tasks.registry import task as find_task
 from warp_deform.tasks.task import Task
 
 from .goal_name import GoalName
-from .goals import check_goal, goal_is_elsewhere, making_goals
+from .goals import given_goals, making_goals, refuse_own_goal, refuse_test_goal
 
-__all__ = ["Demonstrations", "Transition", "choose", "remove_cache"]
+__all__ = [
+    "Demonstrations",
+    "LearntGoal",
+    "Transition",
+    "check_learnt_goals",
+    "choose",
+    "remove_cache",
+]
 
-_Kind = GoalName | Literal["played"]
+LearntGoal = GoalName | Literal["played"]
+"""What is learnt with; "played": what was done, and where it led."""
 _FOLDER = "rows"
 _FORMAT = 1
 _COLUMNS = "color", "height", "action", "ground_truth"
@@ -77,6 +85,31 @@ def choose(seeds: tuple[int, ...], count: int, *, seed: int) -> tuple[int, ...]:
         )
     chosen = np.random.default_rng(seed).choice(np.array(seeds), count, replace=False)
     return tuple(sorted(chosen.tolist()))
+
+
+def check_learnt_goals(
+    reader: EpisodeReader, seeds: Iterable[int], task: Task, *, goal: LearntGoal
+) -> None:
+    """Refuse episodes of these seeds that went for a goal that no agent should learn from.
+
+    Args:
+        goal: what counts as the goal of demonstrations; of corrected episodes it is their own
+
+    Raises:
+        InputError: a goal is one of tests, or is learnt though it shows what theirs do not.
+    """
+    for seed in seeds if task.goal_conditioned else ():
+        info, what = reader.info(seed), reader.path(seed)
+        if info.goal is None:
+            continue
+        corrected = is_corrected(info.demonstrator)
+        verb = "correct" if corrected else "demo"
+        advice = f"collect for goals of other seeds (`{making_goals(task)}`, then `{verb} --goals`)"
+        refuse_test_goal(int(info.goal["seed"]), what=what, advice=advice)
+        if goal == "own" and not corrected:
+            refuse_own_goal(info, task, what=what, advice=f"{advice}, or leave --goal out")
+        elif goal != "played" and corrected:
+            refuse_own_goal(info, task, what=what, advice=advice)
 
 
 def remove_cache(folder: Path) -> None:
@@ -155,8 +188,7 @@ class Demonstrations:
                     f"{Path(folder) / name} is no successful demonstration; train on a folder "
                     "that `warp-deform demo` wrote"
                 )
-        for number in seeds if self.task.goal_conditioned and not as_played else ():
-            _check_goal(reader, number, self.task, goal=goal)
+        check_learnt_goals(reader, seeds, self.task, goal="played" if as_played else goal)
         self.left_out = len(reader) - len(seeds)
         if not seeds:
             raise InputError(f"{folder}: none of its {len(reader)} episodes is a demonstration")
@@ -170,7 +202,7 @@ class Demonstrations:
                 f"hold out {spare}; collect more"
             )
         self._reader, self._index, self._seed, self._rest = reader, index, seed, rest
-        self._kind: _Kind = "played" if as_played else goal
+        self._kind: LearntGoal = "played" if as_played else goal
         self._take(chosen)
 
     def _take(self, seeds: tuple[int, ...]) -> None:
@@ -210,9 +242,9 @@ class Demonstrations:
         return sum(map(is_corrected, names))
 
     @property
-    def goals_elsewhere(self) -> bool:
-        """Whether a goal of theirs was made of another start, see `warp-deform demo --goals`."""
-        return any(goal_is_elsewhere(self._reader.info(seed)) for seed in self.seeds)
+    def given_goals(self) -> list[int]:
+        """Seeds of the goals of those that went for given ones, see `warp-deform demo --goals`."""
+        return given_goals(map(self._reader.info, self.seeds))
 
     @property
     def state_size(self) -> int:
@@ -286,7 +318,7 @@ def _counts(entry: Mapping[str, Any]) -> bool:
     return least is None or entry["score"] > least
 
 
-def _open(reader: EpisodeReader, seed: int, path: Path, kind: _Kind) -> _Rows:
+def _open(reader: EpisodeReader, seed: int, path: Path, kind: LearntGoal) -> _Rows:
     """The cached rows of an episode, made first where they are missing or damaged."""
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -298,7 +330,7 @@ def _open(reader: EpisodeReader, seed: int, path: Path, kind: _Kind) -> _Rows:
     return _Rows(path, np.array(rows["action"][:-1]), np.array(rows["ground_truth"]))
 
 
-def _learnt(episode: Episode, kind: _Kind, *, what: Path) -> Episode:
+def _learnt(episode: Episode, kind: LearntGoal, *, what: Path) -> Episode:
     """An episode as it is learnt from: states with what is to be done in them, then its goal.
 
     Raises:
@@ -322,31 +354,6 @@ def _learnt(episode: Episode, kind: _Kind, *, what: Path) -> Episode:
     if episode.goal is None:
         raise InputError(f"{what} has no goal of its own; leave --goal out")
     return replace(episode, steps=(*episode.steps[:-1], _aimed_at(episode)))
-
-
-def _check_goal(reader: EpisodeReader, seed: int, task: Task, *, goal: GoalName) -> None:
-    """Refuse an episode that went for a goal that no agent should learn from.
-
-    Raises:
-        InputError: see `goals.check_goal`.
-    """
-    info = reader.info(seed)
-    if info.goal is None:
-        return
-    corrected = is_corrected(info.demonstrator)
-    verb = "correct" if corrected else "demo"
-    advice = f"use goals of other seeds (`{making_goals(task)}`, then `{verb} --goals`)"
-    if goal == "own" and not corrected:
-        advice += ", or leave --goal out"
-    check_goal(
-        task,
-        seed=seed,
-        kind=info.goal["kind"],
-        goal=int(info.goal["seed"]),
-        learnt=goal == "own" or corrected,
-        advice=advice,
-        what=reader.path(seed),
-    )
 
 
 def _aimed_at(episode: Episode) -> Step:

@@ -35,7 +35,7 @@ from warp_deform.tasks.registry import task as find_task
 from ..correction.correct import CorrectConfig, correct
 from ..data.dataset import remove_cache
 from ..data.goal_name import GoalName
-from ..data.goals import TEST_GOALS
+from ..data.goals import LEARNT_GOALS
 from ..evaluation.run import evaluate_run
 from ..policy.policy import AGENTS, AgentDescription
 from ..refinement.refine import RefineConfig, refine
@@ -88,6 +88,7 @@ class DistillConfig(DistillSettings):
         """What is learnt as the goal of demonstrations."""
         return "own" if find_task(self.task).goal_shows_its_start() else "end"
 
+    @property
     def goals(self) -> Path | None:
         """Folder of the goals that demonstrator and policy go for; None: each start's own."""
         return Path(self.out).resolve() / "goals" if self.goal_name == "own" else None
@@ -153,13 +154,13 @@ def distill(config: DistillConfig) -> dict[str, Any]:
 
 def _make_goals(config: DistillConfig, stages: Stages) -> None:
     """Have goals of other starts, where a start's own would show what goals of tests do not."""
-    folder = config.goals()
+    folder = config.goals
     if folder is None:
         return
 
     def made() -> dict[str, Any]:
         report = make_goals(
-            config.task, folder, count=_GOALS, seed=TEST_GOALS.stop, kind=CONSTRUCTED, workers=1
+            config.task, folder, count=_GOALS, seed=LEARNT_GOALS, kind=CONSTRUCTED, workers=1
         )
         return {"goals": report["goals"]}
 
@@ -177,7 +178,7 @@ def _demonstrate(config: DistillConfig, out: Path, stages: Stages, count: int) -
                 episodes=count,
                 out=demos,
                 demonstrator=config.teacher,
-                goals=config.goals(),
+                goals=config.goals,
                 workers=1,
             )
         )
@@ -244,7 +245,7 @@ def _learn(config: DistillConfig, plan: Plan, out: Path, stages: Stages, data: P
             out=corrected,
             teacher=config.teacher,
             episodes=episodes,
-            goals=config.goals(),
+            goals=config.goals,
             workers=1,
         )
         what = f"{of}, {episodes} episodes to correct"
@@ -343,6 +344,8 @@ def _claim(out: Path, config: DistillConfig) -> dict[str, Any]:
     """
     path = out / "distill.json"
     settings = {**asdict(config), "agent": config.learner}
+    if config.goal_name != "end":
+        settings["goal"] = config.goal_name
     for name in ("out", "progress", "plan"):
         del settings[name]
     wanted: dict[str, Any] = {"settings": settings, "versions": versions()}

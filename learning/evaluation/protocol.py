@@ -137,25 +137,27 @@ def goals_of(folder: Path, protocol: Protocol, seeds: Sequence[int]) -> dict[int
     return {seed: goals[k] for seed, k in turns.items()}
 
 
-def check_splits(trained: Iterable[int], protocols: Sequence[Protocol], *, task: str) -> None:
+def check_splits(
+    trained: Iterable[int], protocols: Sequence[Protocol], *, task: str, goals: Iterable[int] = ()
+) -> None:
     """Refuse protocols that would play what was trained on, or share seeds among their splits.
 
     Args:
         trained: seeds of the demonstrations
+        goals: seeds of the goals that were given to these
 
     Raises:
-        InputError: a seed of training is one of the episodes or goals, or one of an episode is
-            that of another split's or of a goal.
+        InputError: a seed of training is one of the episodes or goals, a goal was one of training,
+            or a seed of an episode is that of another split's or of a goal.
     """
-    known = sorted(trained)
+    known, learnt = sorted(trained), set(goals)
     splits: dict[str, range] = {}
     for protocol in protocols:
         parts: dict[str, range] = {protocol.split: protocol.seeds}
         if protocol.makes_goals(task):
-            first, count = _goal_seed(protocol), min(protocol.n_goals, protocol.episodes)
-            most = most_attempts(count) if protocol.goals == "demonstrated" else count
-            if first != protocol.seeds.start:
-                parts[f"{protocol.split} goal"] = range(first, first + most)
+            made = _made_goals(protocol)
+            if made.start != protocol.seeds.start:
+                parts[f"{protocol.split} goal"] = made
         for name, seeds in parts.items():
             before = splits.get(name, seeds)
             splits[name] = range(seeds.start, max(seeds.stop, before.stop))
@@ -164,6 +166,12 @@ def check_splits(trained: Iterable[int], protocols: Sequence[Protocol], *, task:
             raise InputError(
                 f"seed {min(both)} is one of training and of the goals in {protocol.given}; give "
                 "goals of other seeds"
+            )
+        played = _goals_played(protocol, task)
+        if both := {seed for seed in learnt if seed in played}:
+            raise InputError(
+                f"training went for the goal of seed {min(both)}, which is one of those of "
+                f"{protocol.split}; choose others by --goals or --first-seed"
             )
     for split, seeds in splits.items():
         hit = next((seed for seed in known if seed in seeds), None)
@@ -178,6 +186,24 @@ def check_splits(trained: Iterable[int], protocols: Sequence[Protocol], *, task:
             raise InputError(
                 f"seed {shared.start} is one of {mine} and of {theirs}; play fewer episodes"
             )
+
+
+def _goals_played(protocol: Protocol, task: str) -> Sequence[int]:
+    """Seeds of the goals that a protocol can play for."""
+    if not find_task(task).goal_conditioned:
+        return ()
+    if protocol.given is not None:
+        return EpisodeReader(protocol.given).seeds
+    if not protocol.makes_goals(task):
+        return protocol.seeds  # each makes its own
+    return _made_goals(protocol)
+
+
+def _made_goals(protocol: Protocol) -> range:
+    """Seeds from which goals are made for a protocol."""
+    first, count = _goal_seed(protocol), min(protocol.n_goals, protocol.episodes)
+    most = most_attempts(count) if protocol.goals == "demonstrated" else count
+    return range(first, first + most)
 
 
 def _goal_seed(protocol: Protocol) -> int:

@@ -148,7 +148,8 @@ def evaluate_run(
         motions_must_succeed=True,
     )
     planned = [validation, test, paper_protocol] if paper else [validation, test]
-    check_splits(map(int, settings["demonstrations"]), planned, task=task)
+    learnt = settings.get("goal_seeds", ())
+    check_splits(map(int, settings["demonstrations"]), planned, task=task, goals=learnt)
     for step in steps:  # a damaged one is told of before anything is played
         load_policy(run.snapshot(step))
     if video is not None and video.exists() and not video.is_dir():

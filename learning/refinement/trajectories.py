@@ -42,6 +42,7 @@ from warp_deform.episodes import (
     combine_hashes,
     rebuild_index,
 )
+from warp_deform.episodes.goals import goal_is_own
 from warp_deform.errors import InputError
 from warp_deform.support.progress import progress_bar
 from warp_deform.worlds.loop import SOLVED
@@ -166,7 +167,7 @@ def _groups(
         if info.control is None:
             seeds_by_task(source, [info])  # refuses what is no demonstration
             goal = info.goal
-            if goal is not None and (goal["kind"], goal["seed"]) != (CONSTRUCTED, info.seed):
+            if goal is not None and not (goal["kind"] == CONSTRUCTED and goal_is_own(info)):
                 raise InputError(
                     f"{source} has goals that are not those of its seeds, which control cannot "
                     "repeat; collect with `warp-deform demo --control` instead"

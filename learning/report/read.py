@@ -103,8 +103,9 @@ def _variant(info: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
         parts.append(f"{settings['corrected']} episodes {' and '.join(by)}")
     if settings.get("goal") == "own":
         parts.append("goals of their own")
-    if settings.get("goals_elsewhere"):
-        parts.append("demonstrated for goals of other starts")
+    if given := settings.get("given_goals"):
+        all_of_them = given == len(settings["demonstrations"])
+        parts.append("goals given" if all_of_them else f"goals given to {given} of them")
     if settings.get("start"):
         parts.append("begun with trained weights")
     return ", ".join(parts)

@@ -118,7 +118,8 @@ class RunFolder:
         check_fields(settings["agent"], _AGENT, what=what)
         check_fields(settings["schedule"], {"steps": int}, what=what)
         optional = {"validate": int, "trained_steps": int, "versions": dict, "demonstrators": list,
-                    "hold_out": int, "revisions": list, "goal": str}  # fmt: skip
+                    "hold_out": int, "revisions": list, "goal": str, "given_goals": int,
+                    "goal_seeds": list}  # fmt: skip
         check_fields(settings, {k: v for k, v in optional.items() if k in settings}, what=what)
         check_fields({"patience": None, **settings}, {"patience": (int, type(None))}, what=what)
         if not all(seed.isdecimal() for seed in settings["demonstrations"]):

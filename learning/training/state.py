@@ -210,11 +210,17 @@ def claim(
         "labels": sum(data.lengths()),
         "corrected": data.corrected,
         "demonstrators": names,
-        **({"goals_elsewhere": True} if data.goals_elsewhere else {}),
+        **_goals(data),
         "revisions": [asdict(running_revision())],
     }
     write_json(run.settings, {**deciding, **described})
     return key
+
+
+def _goals(data: Demonstrations) -> dict[str, Any]:
+    """How many episodes went for given goals, and the seeds of these, if any did."""
+    given = data.given_goals
+    return {"given_goals": len(given), "goal_seeds": sorted(set(given))} if given else {}
 
 
 def _compare(run: RunFolder, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:

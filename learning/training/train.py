@@ -136,6 +136,7 @@ def train(config: TrainConfig) -> TrainReport:
             confirm=plan.confirm,
             process=process,
             trained=data.seeds,
+            goals=data.given_goals,
             task=config.task,
         )
         if not run.settings.exists():

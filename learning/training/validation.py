@@ -30,10 +30,11 @@ class Validation:
         confirm: further ones that a snapshot plays which solved all of these
         process: of rank 0 plays, others wait
         trained: seeds of the demonstrations
+        goals: seeds of the goals that were given to these
         task: its name
 
     Raises:
-        InputError: an episode would start as a demonstration that is learnt from.
+        InputError: an episode would start as a demonstration that is learnt from, or have its goal.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class Validation:
         confirm: int,
         process: Process,
         trained: Iterable[int],
+        goals: Iterable[int],
         task: str,
     ) -> None:
         self._run, self._process = run, process
@@ -63,7 +65,7 @@ class Validation:
 
             self._protocol = Protocol(split="validation", episodes=episodes)
             self._longer = replace(self._protocol, episodes=episodes + confirm)
-            check_splits(trained, [self._longer], task=task)
+            check_splits(trained, [self._longer], task=task, goals=goals)
 
     def evaluate(self, steps: Sequence[int]) -> bool:
         """Evaluate the snapshots of these steps; returns whether training ends with the last."""

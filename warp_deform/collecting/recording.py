@@ -10,6 +10,7 @@ import numpy as np
 
 from ..episodes import Episode, EpisodeInfo, Step, combine_hashes, cpu_fingerprint, versions
 from ..episodes.enclosed import ENCLOSED
+from ..episodes.goals import GOAL_GIVEN
 from ..tasks.registry import FURTHER_TASKS, TASKS, task_name
 from ..tasks.registry import task as find_task
 from ..tasks.task import Task
@@ -114,10 +115,14 @@ def episode_info(worlds: Worlds, slot: int, run: _Run, **own: Any) -> EpisodeInf
 
 
 def _as_goal(worlds: Worlds, slot: int) -> dict[str, Any]:
-    """What the last state of an episode stands for as a goal, where the task has goals."""
+    """Where the task has goals: whether it was given, and what the last state stands for as one."""
     if not worlds.task.goal_conditioned:
         return {}
-    return {GOAL_TARGETS: worlds.as_goal(slot, kind="demonstrated").targets.tolist()}
+    targets = worlds.as_goal(slot, kind="demonstrated").targets.tolist()
+    return {
+        GOAL_TARGETS: targets,
+        **({GOAL_GIVEN: True} if worlds.episodes[slot].goal_given else {}),
+    }
 
 
 def origin(task: Task) -> dict[str, Any]:

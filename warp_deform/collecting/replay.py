@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..episodes import Episode, EpisodeReader, Goal, Step, cpu_fingerprint, versions
+from ..episodes.goals import goal_is_own
 from ..errors import InputError
 from ..support.progress import progress_bar
 from ..tasks.registry import task as find_task
@@ -110,7 +111,7 @@ class Recording:
         """
         episode = self._episode(seed)
         goal = episode.goal
-        own = goal is not None and goal.kind == CONSTRUCTED and goal.seed == seed
+        own = goal is not None and goal.kind == CONSTRUCTED and goal_is_own(episode.info)
         return None if own else goal
 
     def act(

@@ -49,7 +49,8 @@ class CollectSettings:
     """Which arm moves."""
     goals: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of goals, see `warp-deform goals`. The seed decides which one an episode goes for, and
-    its start is drawn for it, as a test's is. By default every seed makes a goal of its own."""
+    its start is drawn for it, as a test's is. By default every seed makes a goal of its own. To
+    train on, take goals of seeds from 200,000 on."""
     control: bool = False
     """Demonstrate control at 20 Hz: the tip is led step by step, in the environment
     `WarpDeform/<Task>-Control-v1`. Swings (whip, whip-target) are searched for."""

@@ -143,7 +143,7 @@ class GoalsOptions(CommandOptions):
     count: Annotated[int, arg(name="goals", aliases=["-n"], metavar="N"), COUNT] = 20
     """How many goals to make. The paper evaluates on 20."""
     seed: Annotated[int, SEED] = 100_000
-    """First seed. Goals have seeds of their own."""
+    """First seed. From 100,000 to 199,999 they are of tests; to learn with, take 200,000 and up."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder for the goals."""
     kind: Literal["demonstrated", "constructed"] = "demonstrated"

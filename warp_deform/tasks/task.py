@@ -348,7 +348,8 @@ class Task(abc.ABC):
     def goal_shows_its_start(self) -> bool:
         """Whether a goal picture also shows things as they lay in the start that it is made of.
 
-        In a start that is drawn for the goal they lie elsewhere.
+        In a start that is drawn for the goal they lie elsewhere, as in tests. Then validation plays
+        for goals of other starts, and what is learnt with the goal of its own start is refused.
         """
         return False
 

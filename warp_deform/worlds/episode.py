@@ -60,6 +60,8 @@ class RunningEpisode:
     drawables: Drawables
     goal: Goal | None
     discarded_starts: int
+    goal_given: bool = False
+    """Whether the start was drawn for the goal; else it made it."""
     sim_seconds: float = 0.0
     history: tuple[PastAction, ...] = ()
     """Actions so far, and what came of each."""

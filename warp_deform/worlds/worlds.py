@@ -126,8 +126,7 @@ class Worlds:
         self._end_control(seeds)
         goals = goals or {}
         rngs = {slot: episode_rng(seed, LAYOUT_STREAM) for slot, seed in seeds.items()}
-        discarded = dict.fromkeys(seeds, 0)
-        waiting = list(seeds)
+        discarded, waiting = dict.fromkeys(seeds, 0), list(seeds)
         for _ in range(MOST_STARTS):
             if not waiting:
                 return
@@ -143,8 +142,9 @@ class Worlds:
             self._start(layouts, seeds, made)
             again = []
             for s in waiting:
-                self.episodes[s].discarded_starts = discarded[s]
-                if s not in layouts or not self._acceptable(self.episodes[s]):
+                episode = self.episodes[s]
+                episode.discarded_starts, episode.goal_given = discarded[s], s in goals
+                if s not in layouts or not self._acceptable(episode):
                     discarded[s] += 1
                     again.append(s)
             waiting = again

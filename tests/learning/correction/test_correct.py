@@ -26,7 +26,7 @@ from warp_deform.collecting.inspection import contact_sheet
 from warp_deform.collecting.make_goals import make_goals
 from warp_deform.collecting.replay import verify
 from warp_deform.command.main import main
-from warp_deform.episodes import EpisodeReader, EpisodeWriter, episode_name
+from warp_deform.episodes import EpisodeReader, EpisodeWriter, episode_name, read_index
 from warp_deform.episodes.corrected import CORRECTION, corrector, labels_of
 from warp_deform.errors import InputError
 from warp_deform.tasks.registry import task as find_task
@@ -244,24 +244,31 @@ def test_a_teacher_that_has_nothing_to_say_is_refused(
     assert not out.exists()
 
 
-def test_goals_that_are_given_are_played_for_and_learnt(trained: Path, tmp_path: Path) -> None:
-    """By the seed's turn, whatever the parts; the same folder goes on for no others."""
-    goals = made_goals(tmp_path / "goals", 2, seed=200_000)
+def test_goals_that_are_given_are_played_for_and_learnt(
+    trained: Path, corrected: CorrectReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the seed's turn, whatever the parts, also those of the episodes' own seeds."""
+    goals = made_goals(tmp_path / "goals", 2, seed=NEW[0])
+    monkeypatch.chdir(tmp_path)
     config = CorrectConfig(
-        run=trained, teacher="scripted", episodes=1, goals=goals, out=tmp_path / "a", workers=1
+        run=trained, teacher="scripted", episodes=1, goals=Path("goals"), out=Path("a"), workers=1
     )
     correct(config)
     report = correct(replace(config, episodes=3, workers=2))
     whole = correct(replace(config, episodes=3, out=tmp_path / "b"))
-    assert report.state_hash == whole.state_hash and whole.corrected == 3
+    assert report.state_hash == whole.state_hash != corrected.state_hash and whole.corrected == 3
     reader = EpisodeReader(tmp_path / "a")
     for seed in NEW:
-        goal, wanted = reader.read_goal(seed), EpisodeReader(goals).read(200_000 + seed % 2)
-        assert goal is not None and goal.seed == 200_000 + seed % 2
+        goal = reader.read_goal(seed)
+        assert goal is not None and goal.seed == NEW[0] + seed % 2
+        wanted = EpisodeReader(goals).read(goal.seed)
         np.testing.assert_array_equal(goal.color, wanted.steps[-1].color)
-    assert verify(new_ones(report, tmp_path / "new"), workers=1)["mismatches"] == 0
+    new = new_ones(report, tmp_path / "new")
+    assert verify(new, workers=1)["mismatches"] == 0
+    assert Demonstrations(new, task=TASK).given_goals == [NEW[0], NEW[0] + 1, NEW[0]]
+    without = new_ones(corrected, tmp_path / "without")
+    assert Demonstrations(without, task=TASK).given_goals == []
     data = Demonstrations(tmp_path / "a", task=TASK)
-    assert data.goals_elsewhere
     shown = data.transition(data.seeds.index(3), 0)
     np.testing.assert_array_equal(shown.goal_color, reader.read(3).goal.color)
     for others in (None, made_goals(tmp_path / "others", 2, seed=200_001)):
@@ -270,9 +277,10 @@ def test_goals_that_are_given_are_played_for_and_learnt(trained: Path, tmp_path:
 
 
 def test_goals_that_no_agent_should_learn_with_are_refused(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: RunFolder, corrected: CorrectReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = CorrectConfig(run=trained, teacher="scripted", episodes=2, out=tmp_path / "out")
+    """Those to play for, and those of what the run has learned from, before anything is made."""
+    config = CorrectConfig(run=run.path, teacher="scripted", episodes=2, out=tmp_path / "out")
 
     def refused(match: str, **changes: object) -> None:
         with pytest.raises(InputError, match=match):
@@ -281,13 +289,21 @@ def test_goals_that_no_agent_should_learn_with_are_refused(
 
     tests = made_goals(tmp_path / "tests", 1, seed=100_000)
     refused("of seed 100000, one of those of tests.*--seed 200000", goals=tests)
+    refused("of seed 120000, one of those of tests.*choose another --seed", seed=120_000)
     refused("cannot be read as a folder of episodes", goals=tmp_path / "nowhere")
     refused("holds goals of cable-line", goals=write_demonstrations(
         tmp_path / "line", 1, task="cable-line-notarget"))  # fmt: skip
     monkeypatch.setattr(Task, "goal_shows_its_start", lambda task: True)
-    refused("made of its own start.*give goals of other seeds by --goals")
-    own = made_goals(tmp_path / "own", 2, seed=2)
-    refused("of seed 2, in .* is made of its own start", goals=own)
+    refused("that a start makes itself shows the rest.*give goals by --goals")
+    own = new_ones(corrected, tmp_path / "own")
+    settle(run, data=str(own), demonstrations=seals(own))
+    given = made_goals(tmp_path / "given", 1, seed=200_000)
+    refused("episode_000000002.parquet is of its own start", goals=given)
+
+
+def seals(folder: Path) -> dict[str, str]:
+    """A folder's episodes as a run knows them."""
+    return {str(each["seed"]): each["seal"] for each in read_index(folder)["episodes"].values()}
 
 
 def made_goals(folder: Path, count: int, *, seed: int) -> Path:

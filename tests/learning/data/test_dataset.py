@@ -22,6 +22,7 @@ from learning.training.config import TrainConfig
 from learning.training.schedules import Schedule
 from learning.training.train import train
 from warp_deform.episodes import HEIGHT_UNIT, Episode, EpisodeReader, EpisodeWriter
+from warp_deform.episodes.goals import GOAL_GIVEN
 from warp_deform.errors import InputError
 from warp_deform.tasks.task import Task
 
@@ -91,28 +92,42 @@ def test_a_goal_of_the_start_s_own_is_refused_where_it_shows_what_tests_do_not(
     for number, seed in ((0, 0), (1, 200_000)):
         _aimed(tmp_path / "mixed", number, seed=seed)
         _aimed(tmp_path / str(seed), number, seed=seed)
-    _aimed(tmp_path / "ends", 0, seed=0, kind="demonstrated")
+    _aimed(tmp_path / "ends", 0, seed=0, kind="demonstrated")  # as imported ones have
+    _aimed(tmp_path / "given", 0, seed=0, given=True)
     assert len(Demonstrations(tmp_path / "0", task=TASK, goal="own")) == 1  # which leaves a cache
     monkeypatch.setattr(Task, "goal_shows_its_start", lambda task: True)
-    for fine in ("200000", "ends"):
+    for fine in ("200000", "given"):
         assert len(Demonstrations(tmp_path / fine, task=TASK, goal="own")) == 1
     for seed in (0, 1):
-        with pytest.raises(InputError, match=r"shows the rest of it, too.*or leave --goal out"):
+        with pytest.raises(InputError, match=r"shows the rest of that start.*or leave --goal out"):
             Demonstrations(tmp_path / "mixed", task=TASK, goal="own", count=1, seed=seed)
-    with pytest.raises(InputError, match="--kind constructed --seed 200000"):
-        Demonstrations(tmp_path / "0", task=TASK, goal="own")
-    assert len(Demonstrations(tmp_path / "0", task=TASK)) == 1
+    for refused in ("0", "ends"):
+        with pytest.raises(InputError, match=r"--kind constructed --seed 200000 .*demo --goals"):
+            Demonstrations(tmp_path / refused, task=TASK, goal="own")
+        assert len(Demonstrations(tmp_path / refused, task=TASK)) == 1
 
 
 def test_goals_of_tests_are_not_learnt_from(tmp_path: Path) -> None:
+    """Nor their ends, nor what led to them."""
     for seed in (99_999, 100_000, 140_000, 199_999, 200_000):
-        _aimed(tmp_path / str(seed), 0, seed=seed)
-        if seed in (99_999, 200_000):
-            assert len(Demonstrations(tmp_path / str(seed), task=TASK, goal="own")) == 1
-        else:
-            for goal in ("own", "end"):  # where an episode ended that reached it, it shows
-                with pytest.raises(InputError, match=f"of seed {seed}, one of those of tests and"):
-                    Demonstrations(tmp_path / str(seed), task=TASK, goal=goal)
+        for kind in ("constructed", "demonstrated"):
+            folder = tmp_path / kind / str(seed)
+            _aimed(folder, 0, seed=seed, kind=kind)
+            for how in ({"goal": "own"}, {"goal": "end"}, {"as_played": True}):
+                if seed in (99_999, 200_000):
+                    assert len(Demonstrations(folder, task=TASK, **how)) == 1
+                    continue
+                with pytest.raises(InputError, match=f"of seed {seed}, one of those of tests") as e:
+                    Demonstrations(folder, task=TASK, **how)
+                assert "leave --goal out" not in str(e.value), "that would be refused, too"
+
+
+def test_given_goals_are_told_from_own_ones(tmp_path: Path) -> None:
+    """By what an episode says, or by the seeds."""
+    for number, (seed, given) in enumerate([(0, False), (1, True), (200_000, False)]):
+        _aimed(tmp_path, number, seed=seed, given=given)
+    EpisodeWriter(tmp_path).write(dataclasses.replace(block_episode(3), goal=None))
+    assert Demonstrations(tmp_path, task=TASK).given_goals == [1, 200_000]
 
 
 def test_seeds_of_tests_goals_are_those_of_the_protocol() -> None:
@@ -120,11 +135,15 @@ def test_seeds_of_tests_goals_are_those_of_the_protocol() -> None:
     assert min(made) == TEST_GOALS.start and max(made) + 200 in TEST_GOALS
 
 
-def _aimed(folder: Path, number: int, *, seed: int, kind: str = "constructed") -> None:
-    """Write an episode whose goal is of a kind and made of a seed."""
+def _aimed(
+    folder: Path, number: int, *, seed: int, kind: str = "constructed", given: bool = False
+) -> None:
+    """Write an episode whose goal is of a kind, made of a seed, and perhaps given to it."""
     episode = block_episode(number)
     assert episode.goal is not None
     goal = dataclasses.replace(episode.goal, seed=seed, kind=kind)
+    if given:
+        episode = with_info(episode, extra={GOAL_GIVEN: True})
     EpisodeWriter(folder).write(dataclasses.replace(episode, goal=goal))
 
 

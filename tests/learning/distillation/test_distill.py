@@ -76,7 +76,8 @@ def test_where_a_start_s_own_goal_would_show_too_much_goals_are_made(
     )
     assert report["stages"][0]["stage"] == "goals"
     settings = RunFolder(Path(report["run"])).read_settings()
-    assert settings["goal"] == "own" and settings["goals_elsewhere"]
+    assert (settings["goal"], settings["given_goals"]) == ("own", 4)
+    assert settings["goal_seeds"] == [200_000, 200_001]
     learnt = EpisodeReader(tmp_path / "out" / "rounds" / "2" / "corrected")
     seeds = {info.seed: info.goal and info.goal["seed"] for info in learnt.infos()}
     assert len(seeds) == 4 and all(seeds[k] == 200_000 + k % 2 for k in seeds)

@@ -56,7 +56,7 @@ def test_eval_takes_the_snapshot_that_was_confirmed(run: RunFolder) -> None:
 def test_training_takes_the_same_snapshot(run: RunFolder) -> None:
     alone = Process(0, 1, torch.device("cpu"))
     validation = Validation(
-        run, episodes=2, confirm=FURTHER, process=alone, trained=(), task="block-notarget"
+        run, episodes=2, confirm=FURTHER, process=alone, trained=(), goals=(), task="block-notarget"
     )
     validation.evaluate([1])
     assert validation.chosen == 1

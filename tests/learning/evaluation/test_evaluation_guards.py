@@ -225,6 +225,15 @@ def test_splits_are_apart() -> None:
         check_splits([140_000], [validation, test], task="bag-color-goal")
     with pytest.raises(InputError, match="seed 50000 is one of validation and of test"):
         check_splits([], [validation, replace(test, episodes=50_000)], task=TASK)
+    check_splits([], [validation, test], task=TASK, goals=[9_999, 49_999, 99_999, 200_000])
+    check_splits([], [validation, test], task="cable-ring", goals=[100_000])
+    for split, seed in (("test", 100_019), ("validation", 50_019)):
+        with pytest.raises(InputError, match=f"the goal of seed {seed}, .* those of {split};"):
+            check_splits([], [validation, test], task=TASK, goals=[7, seed])
+    check_splits([], [validation, test], task="bag-color-goal", goals=[50_000])
+    with pytest.raises(InputError, match="the goal of seed 200003, which is one of those of test"):
+        later = replace(test, first_seed=110_000)
+        check_splits([], [validation, later], task=TASK, goals=[200_003])
     huge = Protocol(split="test", episodes=10**12)
     with pytest.raises(InputError, match="fewer episodes"):
         check_splits([], [validation, huge], task=TASK)

@@ -134,8 +134,8 @@ def test_who_demonstrated_and_how_long_is_a_variant(tmp_path: Path) -> None:
     write_run(tmp_path / "c", trained={"demonstrators": ["refined"]})
     write_run(tmp_path / "d", trained={"demonstrators": ["original", "scripted"]})
     write_run(tmp_path / "i", trained={"goal": "own"})
-    write_run(tmp_path / "j", seed=1, trained={"goal": "own", "goals_elsewhere": True})
-    write_run(tmp_path / "k", trained={"goals_elsewhere": True})
+    write_run(tmp_path / "j", seed=1, trained={"goal": "own", "given_goals": 10})
+    write_run(tmp_path / "k", trained={"given_goals": 1})
     patient = {"patience": 2, "validate": 20}
     write_run(tmp_path / "e", trained=patient, trained_steps=2000)
     write_run(tmp_path / "f", seed=1, trained=patient, trained_steps=3000)
@@ -151,8 +151,8 @@ def test_who_demonstrated_and_how_long_is_a_variant(tmp_path: Path) -> None:
         "fast, refined demonstrations": (0,),
         "fast, original and scripted demonstrations": (0,),
         "fast, goals of their own": (0,),
-        "fast, goals of their own, demonstrated for goals of other starts": (1,),
-        "fast, demonstrated for goals of other starts": (0,),
+        "fast, goals of their own, goals given": (1,),
+        "fast, goals given to 1 of them": (0,),
         "fast, up to 4000 steps, patience 2": (0, 1),
         "fast, 4000 of 8000 steps": (0,),
     }

@@ -291,8 +291,9 @@ def test_an_agent_that_learns_of_no_goal_stands_beside_those_that_do(tmp_path: P
 def test_goals_of_the_start_s_own_are_refused_before_anything_is_collected(tmp_path: Path) -> None:
     asked = GRID.format(root=tmp_path, more='goal = "own"').replace(TASK, "bag-color-goal")
     path = tmp_path / "grid.toml"
-    path.write_text(asked)
+    for text in (asked.replace(f'folder = "{tmp_path}/data"', "count = 2"), asked):
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"goal of bag-color-goal .* demonstrations\.folder"):
+            read_sweep(path)
+    (tmp_path / "data" / "bag-color-goal").mkdir(parents=True)
     assert read_sweep(path).cells()[0].goal == "own"
-    path.write_text(asked.replace(f'folder = "{tmp_path}/data"', "count = 2"))
-    with pytest.raises(InputError, match=r"goal of bag-color-goal .* demonstrations\.folder"):
-        read_sweep(path)
