@@ -213,7 +213,8 @@ def move_states(
 def move_points(xy: np.ndarray, transforms: Sequence[RigidTransform]) -> np.ndarray:
     """World points (B, n, 2) [m], those of every entry moved by its transform."""
     matrix = _matrices(transforms)
-    origins = {each.grid: each.grid.to_world(np.zeros(2)) for each in transforms}
+    grids = {each.grid for each in transforms}
+    origins = {grid: grid.to_world(np.zeros(2)) for grid in grids}
     origin = np.array([origins[each.grid] for each in transforms])[:, None]
     pixel = np.array([each.grid.pixel_size for each in transforms])[:, None]
     shift = (matrix[:, :, 2] * pixel)[:, None]
