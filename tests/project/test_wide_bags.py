@@ -47,7 +47,7 @@ def test_cells_with_a_line_of_their_sizes_are_left_out(
     wide_bags.main()
     assert len(made) == 25 and len(set(made)) == 24
     steps = {(row["agent"], row["steps"]) for row in map(json.loads, out.read_text().splitlines())}
-    assert steps == {("gt-mlp", 2000), ("gt-mlp-2step", 2000), ("transporter", 4000)}
+    assert steps == {("gt-mlp", 20_000), ("gt-mlp-2step", 20_000), ("transporter", 4000)}
     monkeypatch.setattr(sys, "argv", [*sys.argv, "--episodes", "2", "--agents", "gt-mlp"])
     wide_bags.main()
     assert len(made) == 33

@@ -164,7 +164,7 @@ def test_steps_are_told_where_they_are_not_the_presets(tmp_path: Path) -> None:
     short, paper = ({**SCHEDULE, "steps": steps} for steps in (2000, 20_000))
     write_run(tmp_path / "a")
     write_run(tmp_path / "b", schedule=short, trained_steps=2000)
-    write_run(tmp_path / "c", schedule=short, trained_steps=2000, **baseline)
+    write_run(tmp_path / "c", schedule=paper, trained_steps=20_000, **baseline)
     write_run(tmp_path / "d", **baseline)
     write_run(tmp_path / "e", preset="paper", schedule=paper, trained_steps=20_000)
     write_run(tmp_path / "f", preset="of another version")
