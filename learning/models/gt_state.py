@@ -4,8 +4,8 @@ Source: Seita et al., ICRA 2021, baselines GT-State MLP and GT-State MLP 2-Step,
 does: sines and cosines of the inputs beside them, the input seen again by every layer, weights and
 biases drawn from N(0, 0.05^2), mixing logits divided by 2.5, the variance raised to the fourth
 power when acting. The inputs are not normalised (the original stores means and deviations, then
-ignores them), and no unit is dropped: the original builds dropout of 0.1 but calls its networks
-without training mode, and then Keras leaves it out.
+ignores them). No unit is dropped, while the original builds dropout of 0.1 and sets Keras' learning
+phase in training.
 
 `exact=True` keeps the original's likelihood, whose densities and probabilities are clipped to
 [1e-8, 1e8] and so lose their gradient far from the data. Otherwise the same likelihood is computed
