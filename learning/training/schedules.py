@@ -113,8 +113,8 @@ SCHEDULES = {
 """By the names of the command line, for agents over pictures."""
 STATE_SCHEDULES = {
     "paper": Schedule(steps=20_000, batch=128, lr=2e-4),
-    # The paper's steps and their size: a tenth of them leaves the block unlearnt, and five times the
-    # size has mixtures of cables collapse to one Gaussian.
+    # The paper's steps and their size: a tenth of them leaves the block unlearnt, and five times
+    # the size has mixtures of cables collapse to one Gaussian.
     "fast": Schedule(
         steps=20_000, batch=128, lr=2e-4, decay=True, ema=0.99, snapshots=4, validate=20, confirm=40
     ),
