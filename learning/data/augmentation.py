@@ -1,7 +1,7 @@
 """Turns and shifts of the whole table, which multiply few demonstrations.
 
-One transform moves the current picture, the goal's and both labelled pixels. It is drawn again
-until both pixels stay in view. The relative yaw of pick and place does not change.
+One transform moves the current picture, the goal's and both labelled pixels. For a picture it is
+drawn again until both pixels stay in view. The relative yaw of pick and place does not change.
 
 Source: Seita et al., ICRA 2021, appendix on training; Zeng et al., CoRL 2020, data augmentation.
 """
@@ -106,8 +106,13 @@ def draw_transforms(
     rng: np.random.Generator,
     grid: PixelGrid = TABLE_GRID,
     copies: int | None = None,
+    in_view: bool = True,
 ) -> list[RigidTransform]:
-    """A random transform for each of many actions (B, 7), all at once; see `draw_transform`."""
+    """A random transform for each of many actions (B, 7), all at once; see `draw_transform`.
+
+    Args:
+        in_view: draw again what moves a pick or place out of the picture
+    """
     actions = np.asarray(actions, dtype=float)
     pixels = grid.to_pixel(actions[:, [[0, 1], [3, 4]]])
     drawn: dict[int, RigidTransform] = {}
@@ -127,7 +132,7 @@ def draw_transforms(
         matrix = _matrices(tried)
         columns = pixels[left][..., ::-1]
         moved = columns @ matrix[:, :, :2].transpose(0, 2, 1) + matrix[:, None, :, 2]
-        seen = _in_view(moved[..., ::-1])
+        seen = _in_view(moved[..., ::-1]) | (not in_view)
         drawn |= {int(left[k]): tried[k] for k in np.flatnonzero(seen)}
         left = left[~seen]
     raise _too_far_apart(actions[left[0]])

@@ -242,7 +242,9 @@ def state_batch(
     pairs = [data.state(*each) for each in transitions]
     states, actions = (np.stack(each) for each in zip(*pairs, strict=True))
     if augment:
-        transforms = draw_transforms(actions, rng=rng, grid=grid, copies=copies)
+        # A state has no edges to leave. Seita et al. let labels leave the table here too: keeping
+        # them would show few turns where pick and place are far apart.
+        transforms = draw_transforms(actions, rng=rng, grid=grid, copies=copies, in_view=False)
         states = move_states(data.task.ground_truth_rows, states, transforms)
         actions = move_actions(actions, transforms)
     indices = torch.tensor([_lift_index(action, lifts) for action in actions])

@@ -142,6 +142,14 @@ def test_the_block_is_its_own_mirror_image() -> None:
     assert seen == {tuple(part[:, ::-1].ravel()) for part in parts}
 
 
+def test_where_labels_may_leave_the_picture_no_turn_is_thrown_away() -> None:
+    far = np.tile([0.25, -0.5, 0.0, 0.7, 0.45, 0.0, 0.04], (600, 1))
+    kept = draw_transforms(far, rng=np.random.default_rng(0))
+    free = draw_transforms(far, rng=np.random.default_rng(0), in_view=False)
+    assert np.std([t.turn for t in free]) == pytest.approx(2 * math.pi / 6, rel=0.08)
+    assert np.std([t.turn for t in kept]) < 0.8 * np.std([t.turn for t in free])
+
+
 def test_every_second_one_is_mirrored_where_wanted() -> None:
     rng = np.random.default_rng(0)
     drawn = [draw_transform(ACTION, rng=rng, mirror=True).mirror for _ in range(400)]
