@@ -11,9 +11,9 @@ phase in training.
 [1e-8, 1e8] and so lose their gradient far from the data. Otherwise the same likelihood is computed
 in logarithms without clipping, and (1 cm)^2 is added to every variance to bound it: without a bound
 training on actions that follow from the state never settles. Acting hardly feels it, as the fourth
-power leaves a standard deviation of 0.01 um. And where the place's rotation
-matters, sines and cosines are those of the bodies' yaws, not of yaws / 15, which are different
-numbers before and after a whole turn.
+power leaves a standard deviation of 0.01 um. Where the place's rotation matters, sines and cosines
+are those of the bodies' yaws, not of yaws / 15, which are different numbers before and after a
+whole turn. And the means of long states start closer together, or all but one are never used.
 
 An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
 
@@ -51,6 +51,8 @@ __all__ = [
 _POSE = 3
 _CLIP = (1e-8, 1e8)
 _LEAST_VARIANCE = 1e-4
+_BODIES_STATE = 6
+"""Length of the shortest state: a block's pose and its goal's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +136,10 @@ class MixtureMLP(_StateMLP):
         self.log_variance = _linear(self.features, config.n_gaussians)
         self.mixing = _linear(self.features, config.n_gaussians)
         self._draw_weights(generator)
+        if not config.exact:
+            # A mesh has 300 cosines of about 1: means would start metres apart, and the nearest one
+            # would take every demonstration. They start as close together as a block's do.
+            self.mean.weight.data *= math.sqrt(min(1.0, _BODIES_STATE / d_state))
 
     def forward(self, state: Tensor) -> Mixture:
         """The mixture of states (B, d)."""

@@ -215,7 +215,7 @@ def _compared(run: RunResult) -> dict[str, Any]:
     agent = settings["agent"]
     network = {key: each for key, each in agent["config"].items() if key != _PRECISION}
     compared["agent"] = {**agent, "config": network}
-    schedule = settings["schedule"]
+    schedule = {"place_lr": 1.0} | settings["schedule"]  # which older runs do not name
     compared["schedule"] = {key: each for key, each in schedule.items() if key not in _SPREAD}
     compared["environment"] = info.get("environment")
     compared["test episodes"] = info["test"]["n_episodes"]

@@ -51,6 +51,12 @@ class Trained:
         for name, part in self._parts(self._flat.detach()).items():
             self._parameters[name].data = part
         self.optimizer = KerasAdam([self._flat], lr=plan.lr)
+        self._faster = [
+            part
+            for name, part in self._parts(self._flat.detach()).items()
+            if plan.place_lr != 1.0 and name.startswith("place.")
+        ]
+        """Weights whose steps are `plan.place_lr` times as long."""
         self._average: Tensor | None = None
         """None where snapshots hold the weights as they are."""
         if plan.ema:
@@ -74,7 +80,10 @@ class Trained:
     def step(self, number: int, gradient: Tensor) -> None:
         """Take the optimiser's step, counted from 1, and count it into the average."""
         self._flat.grad = gradient
+        before = [part.clone() for part in self._faster]
         self.optimizer.step()
+        for part, old in zip(self._faster, before, strict=True):
+            part.lerp_(old, 1.0 - self._plan.place_lr)
         if self._average is not None:
             self._average.lerp_(self._flat.detach(), 1.0 - self._plan.kept_at(number))
 
