@@ -13,7 +13,7 @@ in logarithms without clipping, and (1 cm)^2 is added to every variance to bound
 training on actions that follow from the state never settles. Acting hardly feels it, as the fourth
 power leaves a standard deviation of 0.01 um. Where the place's rotation matters, sines and cosines
 are those of the bodies' yaws, not of yaws / 15, which are different numbers before and after a
-whole turn. And the means of long states start closer together, or all but one are never used.
+whole turn. And all means start from the same weights, or of long states one is used alone.
 
 An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
 
@@ -51,8 +51,6 @@ __all__ = [
 _POSE = 3
 _CLIP = (1e-8, 1e8)
 _LEAST_VARIANCE = 1e-4
-_BODIES_STATE = 6
-"""Length of the shortest state: a block's pose and its goal's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,8 +136,9 @@ class MixtureMLP(_StateMLP):
         self._draw_weights(generator)
         if not config.exact:
             # A mesh has 300 cosines of about 1: means would start metres apart, and the nearest one
-            # would take every demonstration. They start as close together as a block's do.
-            self.mean.weight.data *= math.sqrt(min(1.0, _BODIES_STATE / d_state))
+            # would take every demonstration. They start as one, but for their biases.
+            weights = self.mean.weight.data.unflatten(0, (config.n_gaussians, d_action))
+            weights[:] = weights[:1].clone()
 
     def forward(self, state: Tensor) -> Mixture:
         """The mixture of states (B, d)."""

@@ -130,6 +130,7 @@ def test_shares_end_with_the_last_step(shares: tuple[float, ...]) -> None:
         ({"warmup": -1}, "warmup is -1; it must be 0 or more"),
         ({"lr": 0.0}, "lr is 0.0; it must be a positive number"),
         ({"lr": float("nan")}, "lr is nan; it must be a positive number"),
+        ({"place_lr": 0.0}, "place_lr is 0.0; it must be a positive number"),
         ({"ema": 1.0}, "ema is 1.0; it must be 0 or more and less than 1"),
     ],
 )
