@@ -11,9 +11,9 @@ phase in training.
 [1e-8, 1e8] and so lose their gradient far from the data. Otherwise the same likelihood is computed
 in logarithms without clipping, and (1 cm)^2 is added to every variance to bound it: without a bound
 training on actions that follow from the state never settles. Acting hardly feels it, as the fourth
-power leaves a standard deviation of 0.01 um. Where the place's rotation matters, sines and cosines
-are those of the bodies' yaws, not of yaws / 15, which are different numbers before and after a
-whole turn. And all means start from the same weights, or of long states one is used alone.
+power leaves a standard deviation of 0.01 um. And where the place's rotation matters, sines and
+cosines are those of the bodies' yaws, not of yaws / 15, which are different numbers before and
+after a whole turn.
 
 An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
 
@@ -134,11 +134,6 @@ class MixtureMLP(_StateMLP):
         self.log_variance = _linear(self.features, config.n_gaussians)
         self.mixing = _linear(self.features, config.n_gaussians)
         self._draw_weights(generator)
-        if not config.exact:
-            # A mesh has 300 cosines of about 1: means would start metres apart, and the nearest one
-            # would take every demonstration. They start as one, but for their biases.
-            weights = self.mean.weight.data.unflatten(0, (config.n_gaussians, d_action))
-            weights[:] = weights[:1].clone()
 
     def forward(self, state: Tensor) -> Mixture:
         """The mixture of states (B, d)."""
