@@ -31,7 +31,7 @@ from ..evaluation.summary import wilson
 __all__ = ["Cell", "CurvePoint", "RunResult", "check_run", "environment_notes", "pool",
            "version_notes"]  # fmt: skip
 
-_ALIKE = ("schedule", "augment", "processes", "patience")
+_ALIKE = ("schedule", "augment", "in_view", "processes", "patience")
 """Settings that runs of a cell have in common."""
 _PRECISION = "bfloat16"
 _SPREAD = ("snapshots", "doubling", "shares", "validate", "confirm", "patience")
@@ -215,8 +215,13 @@ def _compared(run: RunResult) -> dict[str, Any]:
     agent = settings["agent"]
     network = {key: each for key, each in agent["config"].items() if key != _PRECISION}
     compared["agent"] = {**agent, "config": network}
-    schedule = {"place_lr": 1.0} | settings["schedule"]  # which older runs do not name
-    compared["schedule"] = {key: each for key, each in schedule.items() if key not in _SPREAD}
+    schedule = {"place_lr": 1.0} | settings["schedule"]
+    compared["schedule"] = {
+        key: each
+        for key, each in schedule.items()
+        # without a place network its step size says nothing
+        if key not in _SPREAD and (key != "place_lr" or run.agent == "gt-mlp-2step")
+    }
     compared["environment"] = info.get("environment")
     compared["test episodes"] = info["test"]["n_episodes"]
     compared["validation episodes"] = info["snapshots"][str(info["selected"])]["n_episodes"]

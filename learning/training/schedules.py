@@ -119,7 +119,7 @@ STATE_SCHEDULES = {
     "paper": Schedule(steps=20_000, batch=128, lr=2e-4),
     # The paper's steps and their size: a tenth of them leaves the block unlearnt, and five times
     # the size has mixtures of cables collapse to one Gaussian. Where to place what was picked is
-    # nearly certain, hard to learn, and has nothing to collapse.
+    # nearly certain and hard to learn: on the block longer steps bring it far more.
     "fast": Schedule(
         steps=20_000,
         batch=128,

@@ -18,7 +18,7 @@ from warp_deform.support.revision import running_revision
 
 from ..data.dataset import Demonstrations
 from ..models.adam import KerasAdam
-from ..policy.policy import AgentDescription
+from ..policy.policy import AGENTS, AgentDescription
 from ..runs.folder import RunFolder, read_json, write_json
 from ..runs.log import LINE_STEPS
 from .config import TrainConfig
@@ -180,7 +180,7 @@ def claim(
     deciding = {
         "agent": asdict(description),
         "preset": config.preset,
-        "schedule": asdict(plan),
+        "schedule": _described(plan),
         "seed": config.seed,
         "augment": config.augment,
         "hold_out": config.hold_out,
@@ -194,6 +194,8 @@ def claim(
         # as runs had it before there were choices
         **({} if start is None else {"start": start}),
         **({} if config.goal == "end" else {"goal": config.goal}),
+        # `state_batch` lets what it moves leave the table, which it did not always
+        **({"in_view": False} if AGENTS[config.agent].sees == "state" else {}),
     }
     text = json.dumps(deciding, sort_keys=True)
     key = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
@@ -226,6 +228,14 @@ def claim(
     return key
 
 
+def _described(plan: Schedule) -> dict[str, Any]:
+    """A schedule as runs had it before place networks had a step size of their own."""
+    described = asdict(plan)
+    if plan.place_lr == 1.0:
+        del described["place_lr"]
+    return described
+
+
 def _goals(data: Demonstrations) -> dict[str, Any]:
     """How many episodes went for given goals, and the seeds of these, if any did."""
     given = data.given_goals
@@ -238,7 +248,7 @@ def _compare(run: RunFolder, wanted: Mapping[str, Any], stored: Mapping[str, Any
         raise InputError(
             f"{run.path} is a shared policy, not trained further; choose another --out"
         )
-    for name, value in {"start": None, "goal": None, **wanted}.items():
+    for name, value in {"start": None, "goal": None, "in_view": None, **wanted}.items():
         before = stored.get(name)
         if before == value:
             continue

@@ -22,6 +22,7 @@ def test_presets_are_the_papers_and_ours() -> None:
     assert (paper.steps, paper.batch, paper.lr, paper.snapshots) == (20_000, 1, 1e-4, 10)
     assert (paper.ema, paper.decay, paper.warmup) == (0.0, False, 0)
     assert SCHEDULES["fast"].snapshot_steps() == (300, 600, 1200, 2400, 4000)
+    assert [STATE_SCHEDULES[name].place_lr for name in ("paper", "fast")] == [1.0, 5.0]
 
 
 @pytest.mark.parametrize(

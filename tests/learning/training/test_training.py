@@ -14,6 +14,7 @@ import torch
 from fixtures.episode_samples import with_step
 from fixtures.training_samples import block_episode, write_demonstrations
 
+from learning.data.augmentation import RigidTransform, draw_transforms
 from learning.data.batches import check_lifts, state_batch
 from learning.data.dataset import Demonstrations
 from learning.models.gt_state import GtState, GtState2Step, GtStateConfig
@@ -208,6 +209,23 @@ def test_without_augmentation_nothing_is_moved(
         train(config(folder, out, agent=agent, schedule=one, augment=False))
         with pytest.raises(AssertionError):
             train(config(folder, tmp_path / f"{agent}-moved", agent=agent, schedule=one))
+
+
+def test_what_a_baseline_sees_may_leave_the_table(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[bool] = []
+
+    def noted(*given: Any, in_view: bool = True, **more: Any) -> list[RigidTransform]:
+        kept.append(in_view)
+        return draw_transforms(*given, in_view=in_view, **more)
+
+    monkeypatch.setattr("learning.data.batches.draw_transforms", noted)
+    one = replace(SHORT, steps=1, snapshots=1)
+    train(config(folder, tmp_path, agent="gt-mlp", schedule=one))
+    settings = RunFolder(tmp_path).read_settings()
+    assert kept and not any(kept) and settings["in_view"] is False
+    assert "place_lr" not in settings["schedule"], "a run begun before goes on"
 
 
 def lifted(lift: float) -> Episode:

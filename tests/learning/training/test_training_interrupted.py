@@ -65,7 +65,11 @@ def lines(run: Path) -> list[dict[str, float]]:
 
 @pytest.mark.parametrize(
     ("agent", "schedule", "stored", "cut"),
-    [("goal-stack", PICTURES, 2, 4), ("gt-mlp", STATES, 100, 181)],
+    [
+        ("goal-stack", PICTURES, 2, 4),
+        ("gt-mlp", STATES, 100, 181),
+        ("gt-mlp-2step", replace(STATES, place_lr=5.0), 100, 181),
+    ],
 )
 def test_an_interrupted_run_goes_on_to_the_same_bits(
     agent: str,
@@ -80,7 +84,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
         monkeypatch.setattr(training, "state_steps", lambda _: stored)
     settings = {"agent": agent, "schedule": schedule}
     whole = train(config(folder, tmp_path / "whole", **settings))
-    name = "state_batch" if agent == "gt-mlp" else "image_batch"
+    name = "image_batch" if agent == "goal-stack" else "state_batch"
     calls = interrupt(monkeypatch, name, cut)
     with pytest.raises(KeyboardInterrupt):
         train(config(folder, tmp_path / "cut", **settings))
