@@ -3,9 +3,9 @@
     python benchmarks/place_network.py [--demos N...] [--lr LR...] [--exact] [--out FILE]
 
 Nothing is simulated. Scenes are drawn like the task's, a pick lies anywhere on the L, and where to
-place it follows from the goal's pose. The place network alone is trained on N such scenes, moved
-like demonstrations, and places what was picked in scenes that it never saw. A peer in the same run,
-GT-State MLP's network, chooses pick and place at once.
+place it follows from the goal's pose. 2-Step is trained on N such scenes, moved like
+demonstrations, and its place network alone is tested: it places what was picked in scenes that it
+never saw. A peer in the same run, GT-State MLP, chooses pick and place at once.
 """
 
 from __future__ import annotations
