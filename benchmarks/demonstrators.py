@@ -155,7 +155,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
     parser.add_argument("--compact", action="store_true", help="a table of mean actions by task")
     parser.add_argument("--out", type=Path, help="file of JSON lines to which rows are added")
-    parser.add_argument("--hardness", action="store_true", help="the table of docs/results.md")
+    parser.add_argument("--hardness", action="store_true", help="the table of docs/hardness.md")
     parser.add_argument("--bags", action="store_true", help="its table of the bags")
     options = parser.parse_args()
     if options.hardness or options.bags:
