@@ -1,13 +1,13 @@
 """What lets a baseline of long states use one Gaussian alone: where the mixture's means start.
 
-    python benchmarks/mixture_start.py [--tasks T...] [--demos N...] [--seeds S...] [--steps N]
-                                       [--episodes N] [--work FOLDER] [--out FILE]
+    python benchmarks/mixture_start.py [--tasks T...] [--agents A...] [--demos N...] [--seeds S...]
+                                       [--steps N] [--episodes N] [--work FOLDER] [--out FILE]
 
-GT-State MLP is trained as in the table, once as it is (its means start apart), and once with means
+A baseline is trained as in the table, once as it is (its means start apart), and once with means
 that start from the same weights, but for their biases. Both play the same fresh episodes, and
-`gaussians` is how many are in use on the demonstrations' states: the exponential of the entropy of
-their mean mixing weights, 1 to 26. Runs and demonstrations are in WORK, and a cell with a line in
-OUT is left out, so the command goes on after an interruption.
+`gaussians` is how many are in use on the demonstrations' states, by 2-Step for the pick: the
+exponential of the entropy of their mean mixing weights, 1 to 26. Runs and demonstrations are in
+WORK, and a cell with a line in OUT is left out: the command goes on after an interruption.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 from unittest.mock import patch
 
 import numpy as np
@@ -35,6 +35,7 @@ from warp_deform.quiet import quiet_warp
 from warp_deform.support.revision import running_revision
 
 RESULTS = Path("benchmarks/results/mixture_start.jsonl")
+Agent = Literal["gt-mlp", "gt-mlp-2step"]
 STARTS = ("apart", "together")
 FIRST_SEED = 60_000
 """Of the episodes that are played, which no run validates or tests on."""
@@ -43,6 +44,7 @@ FIRST_SEED = 60_000
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--tasks", nargs="+", default=("fabric-cover",))
+    parser.add_argument("--agents", nargs="+", choices=get_args(Agent), default=("gt-mlp",))
     parser.add_argument("--demos", nargs="+", type=int, default=(100,))
     parser.add_argument("--seeds", nargs="+", type=int, default=(0, 1, 2))
     parser.add_argument("--steps", type=int, help="in place of the schedule's")
@@ -52,28 +54,30 @@ def main() -> None:
     options = parser.parse_args()
     quiet_warp()
     lines = options.out.read_text().splitlines() if options.out.exists() else []
-    keys = ("task", "demos", "start", "seed")
+    keys = ("task", "agent", "demos", "seed", "start")
     done = {tuple(row[key] for key in keys) for row in map(json.loads, lines)}
-    cells = product(options.tasks, options.demos, options.seeds, STARTS)
-    for task, demos, seed, start in cells:
-        if (task, demos, start, seed) not in done:
-            row = json.dumps(cell(task, demos, start, seed, options))
+    cells = product(options.tasks, options.agents, options.demos, options.seeds, STARTS)
+    for each in cells:
+        if each not in done:
+            row = json.dumps(cell(*each, options))
             options.out.parent.mkdir(parents=True, exist_ok=True)
             with options.out.open("a") as file:
                 file.write(row + "\n")
             print(row, flush=True)
 
 
-def cell(task: str, demos: int, start: str, seed: int, options: argparse.Namespace) -> Any:
+def cell(
+    task: str, agent: Agent, demos: int, seed: int, start: str, options: argparse.Namespace
+) -> dict[str, Any]:
     """Demonstrate and train where that has not been done, and play."""
     folder = options.work / f"{task}-demos"
     collect(CollectConfig(task=task, episodes=max(options.demos), out=folder, workers=1))
-    run = options.work / f"{task}-{demos}-{start}-{seed}"
+    run = options.work / f"{task}-{agent}-{demos}-{start}-{seed}"
     with starting(start):
         train(
             TrainConfig(
                 task=task,
-                agent="gt-mlp",
+                agent=agent,
                 preset="fast",
                 data=folder,
                 demos=demos,
@@ -87,6 +91,7 @@ def cell(task: str, demos: int, start: str, seed: int, options: argparse.Namespa
     played = info["played"]["test"]
     return {
         "task": task,
+        "agent": agent,
         "demos": demos,
         "start": start,
         "seed": seed,
@@ -118,15 +123,16 @@ def starting(start: str) -> Iterator[None]:
 def in_use(run: Path, folder: Path, *, demos: int, seed: int) -> float:
     """Gaussians in use by the snapshot that plays, on the states that it learnt from."""
     policy = load_policy(run)
-    if not (isinstance(policy, StatePolicy) and isinstance(policy.agent, GtState)):
-        raise SystemExit(f"{run} is no run of GT-State MLP")
+    if not isinstance(policy, StatePolicy):
+        raise SystemExit(f"{run} is no run of a baseline")
+    network = policy.agent.network if isinstance(policy.agent, GtState) else policy.agent.pick
     learnt = Demonstrations(folder, task=policy.description.task, count=demos, seed=seed)
     states = [
         learnt.state(episode, t)[0]
         for episode, (_, actions) in enumerate(learnt.actions())
         for t in range(len(actions))
     ]
-    mixing = policy.agent.network(torch.from_numpy(np.stack(states))).log_pi.exp().mean(dim=0)
+    mixing = network(torch.from_numpy(np.stack(states))).log_pi.exp().mean(dim=0)
     return float(torch.special.entr(mixing).sum().exp())
 
 

@@ -41,12 +41,13 @@ def test_means_start_apart_or_together_and_nothing_else_changes(script: Any) -> 
         assert torch.equal(value, together.state_dict()[name]) == (name != "network.mean.weight")
 
 
+@pytest.mark.parametrize(("agent", "network"), [("gt-mlp", "network"), ("gt-mlp-2step", "pick")])
 def test_a_cell_is_trained_played_and_not_done_again(
-    script: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    agent: str, network: str, script: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work, out = tmp_path / "work", tmp_path / "rows.jsonl"
     arguments = ["--tasks", "block-notarget", "--demos", "2", "--seeds", "1", "--steps", "8"]
-    arguments += ["--episodes", "2", "--work", str(work), "--out", str(out)]
+    arguments += ["--agents", agent, "--episodes", "2", "--work", str(work), "--out", str(out)]
     monkeypatch.setattr(sys, "argv", ["mixture_start.py", *arguments])
     quick = partial(script.TrainConfig, validate=0, snapshots=1)
     monkeypatch.setattr(script, "TrainConfig", quick)
@@ -64,9 +65,9 @@ def test_a_cell_is_trained_played_and_not_done_again(
 
     def collapsed(run: Path) -> Any:
         policy = load(run)
-        policy.agent.network.mixing.bias.data[3] += 1e3
+        getattr(policy.agent, network).mixing.bias.data[3] += 1e3
         return policy
 
     monkeypatch.setattr(script, "load_policy", collapsed)
-    run, demos = work / "block-notarget-2-apart-1", work / "block-notarget-demos"
+    run, demos = work / f"block-notarget-{agent}-2-apart-1", work / "block-notarget-demos"
     assert script.in_use(run, demos, demos=2, seed=1) == pytest.approx(1.0, abs=1e-6)
