@@ -4,10 +4,11 @@
                                        [--steps N] [--episodes N] [--work FOLDER] [--out FILE]
 
 A baseline is trained as in the table, once as it is (its means start apart), and once with means
-that start from the same weights, but for their biases. Both play the same fresh episodes, and
-`gaussians` is how many are in use on the demonstrations' states, by 2-Step for the pick: the
-exponential of the entropy of their mean mixing weights, 1 to 26. Runs and demonstrations are in
-WORK, and a cell with a line in OUT is left out: the command goes on after an interruption.
+that start from the same weights, but for their biases. Both play the same fresh episodes.
+`gaussians` is how many are in use, by 2-Step for the pick: the exponential of the entropy of the
+mixing weights, 1 to 26, averaged over the demonstrations' states. `gaussians_a_state` is the mean
+of what single states use. Runs and demonstrations are in WORK, and a cell with a line in OUT is
+left out: the command goes on after an interruption.
 """
 
 from __future__ import annotations
@@ -28,11 +29,12 @@ from learning.data.dataset import Demonstrations
 from learning.evaluation.run import evaluate_run
 from learning.models.gt_state import GtState, MixtureMLP
 from learning.policy.policy import StatePolicy, load_policy
+from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
+from learning.training.schedules import preset_schedule
 from learning.training.train import train
 from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.quiet import quiet_warp
-from warp_deform.support.revision import running_revision
 
 RESULTS = Path("benchmarks/results/mixture_start.jsonl")
 Agent = Literal["gt-mlp", "gt-mlp-2step"]
@@ -54,12 +56,14 @@ def main() -> None:
     options = parser.parse_args()
     quiet_warp()
     lines = options.out.read_text().splitlines() if options.out.exists() else []
-    keys = ("task", "agent", "demos", "seed", "start")
+    keys = ("task", "agent", "demos", "seed", "start", "steps", "n_episodes")
     done = {tuple(row[key] for key in keys) for row in map(json.loads, lines)}
     cells = product(options.tasks, options.agents, options.demos, options.seeds, STARTS)
-    for each in cells:
-        if each not in done:
-            row = json.dumps(cell(*each, options))
+    for task, agent, demos, seed, start in cells:
+        schedule = preset_schedule("fast", task=task, demos=demos, sees="state")
+        steps = options.steps or schedule.steps
+        if (task, agent, demos, seed, start, steps, options.episodes) not in done:
+            row = json.dumps(cell(task, agent, demos, seed, start, steps, options))
             options.out.parent.mkdir(parents=True, exist_ok=True)
             with options.out.open("a") as file:
                 file.write(row + "\n")
@@ -67,12 +71,18 @@ def main() -> None:
 
 
 def cell(
-    task: str, agent: Agent, demos: int, seed: int, start: str, options: argparse.Namespace
+    task: str,
+    agent: Agent,
+    demos: int,
+    seed: int,
+    start: str,
+    steps: int,
+    options: argparse.Namespace,
 ) -> dict[str, Any]:
     """Demonstrate and train where that has not been done, and play."""
     folder = options.work / f"{task}-demos"
     collect(CollectConfig(task=task, episodes=max(options.demos), out=folder, workers=1))
-    run = options.work / f"{task}-{agent}-{demos}-{start}-{seed}"
+    run = options.work / f"{task}-{agent}-{demos}-{steps}-{start}-{seed}"
     with starting(start):
         train(
             TrainConfig(
@@ -82,25 +92,28 @@ def cell(
                 data=folder,
                 demos=demos,
                 seed=seed,
-                steps=options.steps,
+                steps=steps,
                 out=run,
                 threads=1,
             )
         )
     info = evaluate_run(run, episodes=options.episodes, first_seed=FIRST_SEED, workers=1)
     played = info["played"]["test"]
+    gaussians, a_state = in_use(run, folder, demos=demos, seed=seed)
     return {
         "task": task,
         "agent": agent,
         "demos": demos,
         "start": start,
         "seed": seed,
-        "steps": info["trained_steps"],
-        "gaussians": in_use(run, folder, demos=demos, seed=seed),
+        "steps": steps,
+        "trained_steps": info["trained_steps"],
+        "gaussians": gaussians,
+        "gaussians_a_state": a_state,
         "n_success": played["n_success"],
         "n_episodes": played["n_episodes"],
         "paper_value": played["paper_value"],
-        "commit": running_revision().commit,
+        "commit": RunFolder(run).read_settings()["revisions"][0]["commit"],
     }
 
 
@@ -120,8 +133,8 @@ def starting(start: str) -> Iterator[None]:
 
 
 @torch.no_grad()
-def in_use(run: Path, folder: Path, *, demos: int, seed: int) -> float:
-    """Gaussians in use by the snapshot that plays, on the states that it learnt from."""
+def in_use(run: Path, folder: Path, *, demos: int, seed: int) -> tuple[float, float]:
+    """Gaussians that the snapshot that plays uses of the states that it learnt from, and of one."""
     policy = load_policy(run)
     if not isinstance(policy, StatePolicy):
         raise SystemExit(f"{run} is no run of a baseline")
@@ -132,8 +145,13 @@ def in_use(run: Path, folder: Path, *, demos: int, seed: int) -> float:
         for episode, (_, actions) in enumerate(learnt.actions())
         for t in range(len(actions))
     ]
-    mixing = network(torch.from_numpy(np.stack(states))).log_pi.exp().mean(dim=0)
-    return float(torch.special.entr(mixing).sum().exp())
+    return counted(network(torch.from_numpy(np.stack(states))).log_pi.exp())
+
+
+def counted(mixing: torch.Tensor) -> tuple[float, float]:
+    """Gaussians in use by mixing weights (B, K) together, and the mean of what rows use."""
+    entropy = torch.special.entr(mixing).sum(dim=1)
+    return float(torch.special.entr(mixing.mean(dim=0)).sum().exp()), float(entropy.exp().mean())
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import pytest
 import torch
 from fixtures.places import ROOT
 
-from learning.models.gt_state import GtState, GtStateConfig
+from learning.models.gt_state import GtState, GtState2Step, GtStateConfig
 
 
 @pytest.fixture
@@ -25,20 +25,33 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     del sys.modules["mixture_start"]
 
 
-def means(agent: GtState) -> torch.Tensor:
-    return agent.network.mean.weight.detach().unflatten(0, (26, 6))
-
-
-def test_means_start_apart_or_together_and_nothing_else_changes(script: Any) -> None:
+@pytest.mark.parametrize(
+    ("agent", "networks"), [(GtState, ["network"]), (GtState2Step, ["pick", "place"])]
+)
+def test_means_start_apart_or_together_and_nothing_else_changes(
+    agent: type[GtState | GtState2Step], networks: list[str], script: Any
+) -> None:
     with script.starting("together"):
-        together = GtState(6, GtStateConfig(), seed=0)
+        together = agent(6, GtStateConfig(), seed=0).state_dict()
     with script.starting("apart"):
-        apart = GtState(6, GtStateConfig(), seed=0)
-    now = GtState(6, GtStateConfig(), seed=0)
-    assert (means(together) == means(together)[:1]).all()
-    for name, value in now.state_dict().items():
-        assert torch.equal(value, apart.state_dict()[name])
-        assert torch.equal(value, together.state_dict()[name]) == (name != "network.mean.weight")
+        apart = agent(6, GtStateConfig(), seed=0).state_dict()
+    now = agent(6, GtStateConfig(), seed=0).state_dict()
+    changed = {f"{network}.mean.weight" for network in networks}
+    for name, value in now.items():
+        assert torch.equal(value, apart[name])
+        assert torch.equal(value, together[name]) == (name not in changed)
+    for name in changed:
+        means = together[name].unflatten(0, (26, -1))
+        assert (means == means[:1]).all()
+
+
+def test_what_is_in_use_is_counted_together_and_a_state(script: Any) -> None:
+    one, other = torch.eye(26)[3], torch.eye(26)[7]
+    assert script.counted(torch.stack([one, one])) == pytest.approx((1.0, 1.0))
+    assert script.counted(torch.stack([one, other])) == pytest.approx((2.0, 1.0))
+    both = (one + other) / 2
+    assert script.counted(torch.stack([both, both])) == pytest.approx((2.0, 2.0))
+    assert script.counted(torch.full((4, 26), 1 / 26)) == pytest.approx((26.0, 26.0))
 
 
 @pytest.mark.parametrize(("agent", "network"), [("gt-mlp", "network"), ("gt-mlp-2step", "pick")])
@@ -69,5 +82,5 @@ def test_a_cell_is_trained_played_and_not_done_again(
         return policy
 
     monkeypatch.setattr(script, "load_policy", collapsed)
-    run, demos = work / f"block-notarget-{agent}-2-apart-1", work / "block-notarget-demos"
-    assert script.in_use(run, demos, demos=2, seed=1) == pytest.approx(1.0, abs=1e-6)
+    run, demos = work / f"block-notarget-{agent}-2-8-apart-1", work / "block-notarget-demos"
+    assert script.in_use(run, demos, demos=2, seed=1) == pytest.approx((1.0, 1.0))
