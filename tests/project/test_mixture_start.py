@@ -11,18 +11,15 @@ from typing import Any
 
 import pytest
 import torch
-from fixtures.places import ROOT
+from fixtures.benchmark_scripts import benchmark
 
 from learning.models.gt_state import GtState, GtState2Step, GtStateConfig
 
 
 @pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    import mixture_start
-
-    yield mixture_start
-    del sys.modules["mixture_start"]
+def script() -> Iterator[Any]:
+    with benchmark("mixture_start") as module:
+        yield module
 
 
 @pytest.mark.parametrize(

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from fixtures.places import ROOT
+from fixtures.benchmark_scripts import benchmark
 
 from learning.models.gt_state import GtState, GtStateConfig
 
 
 @pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    import place_network
-
-    yield place_network
-    del sys.modules["place_network"]
+def script() -> Iterator[Any]:
+    with benchmark("place_network") as module:
+        yield module
 
 
 @pytest.mark.parametrize(

@@ -11,19 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures.places import ROOT
+from fixtures.benchmark_scripts import benchmark
 
 from warp_deform.tasks import registry
 
 
 @pytest.fixture
-def wide_bags(forgets_tasks: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def wide_bags(forgets_tasks: None) -> Iterator[Any]:
     """The script, whose tasks are forgotten afterwards."""
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    import wide_bags
-
-    yield wide_bags
-    del sys.modules["wide_bags"]
+    with benchmark("wide_bags") as module:
+        yield module
 
 
 def test_cells_with_a_line_of_their_sizes_are_left_out(
