@@ -13,7 +13,9 @@ in logarithms without clipping, and (1 cm)^2 is added to every variance to bound
 training on actions that follow from the state never settles. Acting hardly feels it, as the fourth
 power leaves a standard deviation of 0.01 um. And where the place's rotation matters, sines and
 cosines are those of the bodies' yaws, not of yaws / 15, which are different numbers before and
-after a whole turn.
+after a whole turn. Training then sees cosines less one: those of positions are nearly 1, so that
+hundreds of them are one bias whose steps are hundreds of times as long, and Gaussians are thrown
+off their targets until one stands for all.
 
 An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
 
@@ -69,6 +71,8 @@ class GtStateConfig:
     """Lifts of the task's stages [m]; with several there is one more network that chooses."""
     yaws: tuple[int, ...] = ()
     """Columns of the state that hold a -yaw / 15 [rad] whose own sine and cosine are seen."""
+    cosines_less_one: bool = False
+    """See every cosine less one."""
     exact: bool = False
     """The original's clipped likelihood, and its sines and cosines of yaws / 15."""
 
@@ -111,7 +115,8 @@ class _StateMLP(nn.Module):
 
     def _seen(self, x: Tensor) -> Tensor:
         angles = x * self.turns
-        z = torch.cat([x, angles.cos(), angles.sin()], dim=1)
+        cosines = angles.cos() - 1.0 if self.config.cosines_less_one else angles.cos()
+        z = torch.cat([x, cosines, angles.sin()], dim=1)
         h = torch.cat([functional.relu(self.first(z)), z], dim=1)
         return torch.cat([functional.relu(self.second(h)), z], dim=1)
 

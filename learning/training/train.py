@@ -276,6 +276,7 @@ def _describe(config: TrainConfig, data: Demonstrations) -> AgentDescription:
         one_rotation=yaws == 1,
         # Elsewhere yaws say nothing of the action, and a chain's are as good as noise.
         yaws=yaw_columns(data.task.ground_truth_rows) if yaws > 1 else (),
+        cosines_less_one=not config.exact,
         exact=config.exact,
     )
     return AgentDescription(

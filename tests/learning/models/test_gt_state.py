@@ -102,6 +102,39 @@ def test_a_whole_turn_is_seen_as_none(exact: bool, same: bool) -> None:
 
 
 @pytest.mark.parametrize("agent_class", AGENTS)
+def test_cosines_less_one_are_the_same_network_with_other_biases(
+    agent_class: type[GtState] | type[GtState2Step],
+) -> None:
+    config = GtStateConfig(lifts=(0.05, 0.3), yaws=(2,))
+    whole = agent_class(6, config, seed=0)
+    less = agent_class(6, dataclasses.replace(config, cosines_less_one=True), seed=0)
+    state, target = torch.rand(8, 6), torch.rand(8, 6)
+    lift = torch.zeros(8, dtype=torch.int64)
+    assert whole(state, target, lift).total() != less(state, target, lift).total()
+    for network in less.children():
+        d = len(network.turns)
+        for layer in network.children():  # of its inputs the last 3 d are positions, cosines, sines
+            layer.bias.data += layer.weight.data[:, -2 * d : -d].sum(dim=1)
+    for one, other in zip(whole(state, target, lift), less(state, target, lift), strict=True):
+        assert torch.allclose(one, other, rtol=1e-4)
+
+
+def test_cosines_less_one_keep_a_step_of_training_short() -> None:
+    """On the mean of a state of 300 positions cosines act together, by 300 step sizes or so."""
+    moves = []
+    for less_one in (False, True):
+        network = GtState(300, GtStateConfig(cosines_less_one=less_one), seed=0).network
+        state = torch.linspace(-0.5, 0.5, 300)[None]
+        before = network(state).mean
+        optimiser = KerasAdam(network.parameters(), lr=2e-4)
+        before.sum().backward()
+        optimiser.step()
+        moves.append(float((network(state).mean - before).detach().abs().mean()))
+    whole, less = moves
+    assert whole > 300 * 2e-4 + less
+
+
+@pytest.mark.parametrize("agent_class", AGENTS)
 def test_agent_learns_an_action_that_depends_on_the_state(
     agent_class: type[GtState] | type[GtState2Step],
 ) -> None:

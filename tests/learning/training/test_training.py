@@ -176,7 +176,8 @@ def test_snapshots_hold_averaged_weights(folder: Path, tmp_path: Path) -> None:
             {"exact": False, "bfloat16": True},
         ),
         ("goal-stack", ["--exact"], {"exact": True, "bfloat16": False}),
-        ("gt-mlp", ["--exact"], {"exact": True}),
+        ("gt-mlp", ["--exact"], {"exact": True, "cosines_less_one": False}),
+        ("gt-mlp-2step", [], {"exact": False, "cosines_less_one": True}),
     ],
 )
 def test_switches_reach_the_agent(
