@@ -13,9 +13,10 @@ in logarithms without clipping, and (1 cm)^2 is added to every variance to bound
 training on actions that follow from the state never settles. Acting hardly feels it, as the fourth
 power leaves a standard deviation of 0.01 um. And where the place's rotation matters, sines and
 cosines are those of the bodies' yaws, not of yaws / 15, which are different numbers before and
-after a whole turn. Training then sees cosines less one: those of positions are nearly 1, so that
-hundreds of them are one bias whose steps are hundreds of times as long, and Gaussians are thrown
-off their targets until one stands for all.
+after a whole turn. Cosines are seen less one: those of positions are nearly 1, so that hundreds act
+as one bias that takes steps hundreds of times as long, and of fabrics one Gaussian alone stays in
+use. And all Gaussians weigh the same at first, and in the first half of `fast`: of cables more of
+them stay in use.
 
 An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
 
@@ -139,6 +140,9 @@ class MixtureMLP(_StateMLP):
         self.log_variance = _linear(self.features, config.n_gaussians)
         self.mixing = _linear(self.features, config.n_gaussians)
         self._draw_weights(generator)
+        if not config.exact:
+            for parameter in self.mixing.parameters():
+                nn.init.zeros_(parameter)
 
     def forward(self, state: Tensor) -> Mixture:
         """The mixture of states (B, d)."""

@@ -215,7 +215,7 @@ def _compared(run: RunResult) -> dict[str, Any]:
     agent = settings["agent"]
     network = {key: each for key, each in agent["config"].items() if key != _PRECISION}
     compared["agent"] = {**agent, "config": network}
-    schedule = {"place_lr": 1.0} | settings["schedule"]
+    schedule = {"place_lr": 1.0, "even": 0.0} | settings["schedule"]
     compared["schedule"] = {
         key: each
         for key, each in schedule.items()

@@ -26,6 +26,9 @@ class Schedule:
     """Greatest step size of Adam."""
     place_lr: float = 1.0
     """Step size of the 2-Step baseline's place network, over that of the others."""
+    even: float = 0.0
+    """Share of the steps at which the Gaussians of a baseline's mixture keep the weights that they
+    start with."""
     warmup: int = 0
     """Steps over which the step size grows from 0."""
     decay: bool = False
@@ -65,6 +68,8 @@ class Schedule:
             raise InputError(f"lr is {self.lr}; it must be a positive number")
         if not 0 < self.place_lr < math.inf:
             raise InputError(f"place_lr is {self.place_lr}; it must be a positive number")
+        if not 0 <= self.even <= 1:
+            raise InputError(f"even is {self.even}; it must be from 0 to 1")
         if not 0 <= self.ema < 1:
             raise InputError(f"ema is {self.ema}; it must be 0 or more and less than 1")
 
@@ -119,12 +124,14 @@ STATE_SCHEDULES = {
     "paper": Schedule(steps=20_000, batch=128, lr=2e-4),
     # The paper's steps and their size: a tenth of them leaves the block unlearnt, and five times
     # the size has mixtures of cables collapse to one Gaussian. Where to place what was picked is
-    # nearly certain and hard to learn: on the block longer steps bring it far more.
+    # nearly certain and hard to learn: on the block longer steps bring it far more. Gaussians weigh
+    # the same until each has found actions of its own, or one may be used for all of them.
     "fast": Schedule(
         steps=20_000,
         batch=128,
         lr=2e-4,
         place_lr=5.0,
+        even=0.5,
         decay=True,
         ema=0.99,
         snapshots=4,

@@ -51,12 +51,15 @@ class Trained:
         for name, part in self._parts(self._flat.detach()).items():
             self._parameters[name].data = part
         self.optimizer = KerasAdam([self._flat], lr=plan.lr)
+        parts = self._parts(self._flat.detach())
         self._faster = [
             part
-            for name, part in self._parts(self._flat.detach()).items()
+            for name, part in parts.items()
             if plan.place_lr != 1.0 and name.startswith("place.")
         ]
         """Weights whose steps are `plan.place_lr` times as long."""
+        self._mixing = [part for name, part in parts.items() if ".mixing." in name]
+        """Weights that are held at the first `plan.even` of the steps."""
         self._average: Tensor | None = None
         """None where snapshots hold the weights as they are."""
         if plan.ema:
@@ -81,9 +84,13 @@ class Trained:
         """Take the optimiser's step, counted from 1, and count it into the average."""
         self._flat.grad = gradient
         before = [part.clone() for part in self._faster]
+        held = self._mixing if number <= self._plan.even * self._plan.steps else []
+        drawn = [part.clone() for part in held]
         self.optimizer.step()
         for part, old in zip(self._faster, before, strict=True):
             part.lerp_(old, 1.0 - self._plan.place_lr)
+        for part, old in zip(held, drawn, strict=True):
+            part.copy_(old)
         if self._average is not None:
             self._average.lerp_(self._flat.detach(), 1.0 - self._plan.kept_at(number))
 
@@ -229,10 +236,12 @@ def claim(
 
 
 def _described(plan: Schedule) -> dict[str, Any]:
-    """A schedule as runs had it before place networks had a step size of their own."""
+    """A schedule without what only some agents have, as other runs had it before."""
     described = asdict(plan)
     if plan.place_lr == 1.0:
         del described["place_lr"]
+    if plan.even == 0.0:
+        del described["even"]
     return described
 
 

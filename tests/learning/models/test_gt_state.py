@@ -101,6 +101,13 @@ def test_a_whole_turn_is_seen_as_none(exact: bool, same: bool) -> None:
     assert torch.allclose(before, after, atol=1e-5) is same
 
 
+def test_gaussians_weigh_the_same_before_training_but_for_the_originals() -> None:
+    states = torch.linspace(-1, 1, 12).reshape(4, 3)
+    ours, original = (GtState(3, GtStateConfig(exact=exact), seed=0) for exact in (False, True))
+    assert torch.allclose(ours.network(states).log_pi, torch.tensor(1 / 26).log())
+    assert float(original.network(states).log_pi.detach().std()) > 0.01
+
+
 @pytest.mark.parametrize("agent_class", AGENTS)
 def test_cosines_less_one_are_the_same_network_with_other_biases(
     agent_class: type[GtState] | type[GtState2Step],
@@ -189,7 +196,7 @@ def test_the_lift_goes_with_the_action_that_was_drawn(
         return action
 
     optimiser = KerasAdam(agent.parameters(), lr=1e-3)
-    for _ in range(300):
+    for _ in range(500):
         action = actions()
         index = torch.from_numpy(action[:, 6] > 0.1).long()
         losses = agent(state, torch.from_numpy(encode_action(action)), index)

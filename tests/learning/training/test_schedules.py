@@ -23,6 +23,7 @@ def test_presets_are_the_papers_and_ours() -> None:
     assert (paper.ema, paper.decay, paper.warmup) == (0.0, False, 0)
     assert SCHEDULES["fast"].snapshot_steps() == (300, 600, 1200, 2400, 4000)
     assert [STATE_SCHEDULES[name].place_lr for name in ("paper", "fast")] == [1.0, 5.0]
+    assert [STATE_SCHEDULES[name].even for name in ("paper", "fast")] == [0.0, 0.5]
 
 
 @pytest.mark.parametrize(
@@ -132,6 +133,7 @@ def test_shares_end_with_the_last_step(shares: tuple[float, ...]) -> None:
         ({"lr": 0.0}, "lr is 0.0; it must be a positive number"),
         ({"lr": float("nan")}, "lr is nan; it must be a positive number"),
         ({"place_lr": 0.0}, "place_lr is 0.0; it must be a positive number"),
+        ({"even": 1.5}, "even is 1.5; it must be from 0 to 1"),
         ({"ema": 1.0}, "ema is 1.0; it must be 0 or more and less than 1"),
     ],
 )

@@ -17,12 +17,10 @@ from fixtures.training_samples import block_episode, write_demonstrations
 from learning.data.augmentation import RigidTransform, draw_transforms
 from learning.data.batches import check_lifts, state_batch
 from learning.data.dataset import Demonstrations
-from learning.models.gt_state import GtState, GtState2Step, GtStateConfig
 from learning.policy.policy import ImagePolicy, RetryingPolicy, StatePolicy, load_policy
 from learning.runs.folder import RunFolder, read_snapshot
 from learning.training.config import TrainConfig
 from learning.training.schedules import Schedule
-from learning.training.state import Trained
 from learning.training.train import TrainReport, train
 from warp_deform.command.main import main
 from warp_deform.episodes import Episode, EpisodeWriter
@@ -75,24 +73,6 @@ def test_a_folder_with_another_run_is_refused(
 ) -> None:
     with pytest.raises(InputError, match="holds a run with another seed"):
         train(config(folder, straight[0], seed=3))
-
-
-@pytest.mark.parametrize("name", ["gt-mlp", "gt-mlp-2step"])
-def test_only_a_place_network_takes_longer_steps(name: str, tmp_path: Path) -> None:
-    moves = []
-    for place_lr in (1.0, 5.0):
-        cls = GtState if name == "gt-mlp" else GtState2Step
-        agent = cls(3, GtStateConfig(), seed=0)
-        before = {key: each.detach().clone() for key, each in agent.named_parameters()}
-        plan = replace(STATES, place_lr=place_lr)
-        trained = Trained(agent, plan, RunFolder(tmp_path), "key")
-        for number in (1, 2):  # the same gradient, so that the second step is as long as the first
-            trained.step(number, torch.linspace(-1, 1, sum(map(torch.numel, before.values()))))
-        moves.append({key: each.detach() - before[key] for key, each in agent.named_parameters()})
-    for key, move in moves[0].items():
-        factor = 5.0 if key.startswith("place.") else 1.0
-        assert torch.allclose(moves[1][key], factor * move, atol=1e-7, rtol=1e-5), key
-    assert any(key.startswith("place.") for key in moves[0]) == (name == "gt-mlp-2step")
 
 
 @pytest.mark.parametrize("agent", ["gt-mlp", "gt-mlp-2step"])

@@ -68,7 +68,7 @@ def lines(run: Path) -> list[dict[str, float]]:
     [
         ("goal-stack", PICTURES, 2, 4),
         ("gt-mlp", STATES, 100, 181),
-        ("gt-mlp-2step", replace(STATES, place_lr=5.0), 100, 181),
+        ("gt-mlp-2step", replace(STATES, place_lr=5.0, even=0.5), 100, 181),
     ],
 )
 def test_an_interrupted_run_goes_on_to_the_same_bits(

@@ -1,14 +1,15 @@
-"""What lets a baseline of long states use one Gaussian alone: where the mixture's means start.
+"""What leaves a baseline of long states with few Gaussians: whole cosines, weights learnt at first.
 
-    python benchmarks/mixture_start.py [--tasks T...] [--agents A...] [--demos N...] [--seeds S...]
-                                       [--steps N] [--episodes N] [--work FOLDER] [--out FILE]
+    python benchmarks/gaussians_in_use.py [--tasks T...] [--agents A...] [--demos N...]
+        [--seeds S...] [--ways W...] [--steps N] [--episodes N] [--work FOLDER] [--out FILE]
 
-A baseline is trained as in the table, once as it is (its means start apart), and once with means
-that start from the same weights, but for their biases. Both play the same fresh episodes.
-`gaussians` is how many are in use, by 2-Step for the pick: the exponential of the entropy of the
-mixing weights, 1 to 26, averaged over the demonstrations' states. `gaussians_a_state` is the mean
-of what single states use. Runs and demonstrations are in WORK, and a cell with a line in OUT is
-left out: the command goes on after an interruption.
+A baseline is trained in four ways: as in the table (`both`), with cosines that are seen whole
+(`even`), with Gaussians whose weights are learnt from the first step on (`less-one`), and with both
+as in the paper (`neither`). All play the same fresh episodes. `gaussians` is how many are in use,
+by 2-Step for the pick: the exponential of the entropy of the mixing weights, 1 to 26, averaged over
+the demonstrations' states. `gaussians_a_state` is the mean of what single states use. Runs and
+demonstrations are in WORK, and a cell with a line in OUT is left out: the command goes on after an
+interruption.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import argparse
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -27,18 +29,19 @@ import torch
 
 from learning.data.dataset import Demonstrations
 from learning.evaluation.run import evaluate_run
-from learning.models.gt_state import GtState, MixtureMLP
+from learning.models.gt_state import GtState, GtStateConfig
 from learning.policy.policy import StatePolicy, load_policy
 from learning.runs.folder import RunFolder
 from learning.training.config import TrainConfig
-from learning.training.schedules import preset_schedule
+from learning.training.schedules import Schedule, preset_schedule
 from learning.training.train import train
 from warp_deform.collecting.collect import CollectConfig, collect
 from warp_deform.quiet import quiet_warp
 
-RESULTS = Path("benchmarks/results/mixture_start.jsonl")
+RESULTS = Path("benchmarks/results/gaussians_in_use.jsonl")
 Agent = Literal["gt-mlp", "gt-mlp-2step"]
-STARTS = ("apart", "together")
+WAYS = {"neither": (False, 0.0), "even": (False, 0.5), "less-one": (True, 0.0), "both": (True, 0.5)}
+"""Whether cosines are seen less one, and for which share of the steps Gaussians weigh the same."""
 FIRST_SEED = 60_000
 """Of the episodes that are played, which no run validates or tests on."""
 
@@ -49,21 +52,22 @@ def main() -> None:
     parser.add_argument("--agents", nargs="+", choices=get_args(Agent), default=("gt-mlp",))
     parser.add_argument("--demos", nargs="+", type=int, default=(100,))
     parser.add_argument("--seeds", nargs="+", type=int, default=(0, 1, 2))
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=tuple(WAYS))
     parser.add_argument("--steps", type=int, help="in place of the schedule's")
     parser.add_argument("--episodes", type=int, default=200)
-    parser.add_argument("--work", type=Path, default=Path("mixture-start"))
+    parser.add_argument("--work", type=Path, default=Path("gaussians-in-use"))
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     quiet_warp()
     lines = options.out.read_text().splitlines() if options.out.exists() else []
-    keys = ("task", "agent", "demos", "seed", "start", "steps", "n_episodes")
+    keys = ("task", "agent", "demos", "seed", "way", "steps", "n_episodes")
     done = {tuple(row[key] for key in keys) for row in map(json.loads, lines)}
-    cells = product(options.tasks, options.agents, options.demos, options.seeds, STARTS)
-    for task, agent, demos, seed, start in cells:
-        schedule = preset_schedule("fast", task=task, demos=demos, sees="state")
-        steps = options.steps or schedule.steps
-        if (task, agent, demos, seed, start, steps, options.episodes) not in done:
-            row = json.dumps(cell(task, agent, demos, seed, start, steps, options))
+    cells = product(options.tasks, options.agents, options.demos, options.seeds, options.ways)
+    for task, agent, demos, seed, way in cells:
+        plan = preset_schedule("fast", task=task, demos=demos, sees="state")
+        plan = replace(plan, even=WAYS[way][1], steps=options.steps or plan.steps)
+        if (task, agent, demos, seed, way, plan.steps, options.episodes) not in done:
+            row = json.dumps(cell(task, agent, demos, seed, way, plan, options))
             options.out.parent.mkdir(parents=True, exist_ok=True)
             with options.out.open("a") as file:
                 file.write(row + "\n")
@@ -75,15 +79,15 @@ def cell(
     agent: Agent,
     demos: int,
     seed: int,
-    start: str,
-    steps: int,
+    way: str,
+    plan: Schedule,
     options: argparse.Namespace,
 ) -> dict[str, Any]:
     """Demonstrate and train where that has not been done, and play."""
     folder = options.work / f"{task}-demos"
     collect(CollectConfig(task=task, episodes=max(options.demos), out=folder, workers=1))
-    run = options.work / f"{task}-{agent}-{demos}-{steps}-{start}-{seed}"
-    with starting(start):
+    run = options.work / f"{task}-{agent}-{demos}-{plan.steps}-{way}-{seed}"
+    with seeing(less_one=WAYS[way][0]):
         train(
             TrainConfig(
                 task=task,
@@ -92,7 +96,7 @@ def cell(
                 data=folder,
                 demos=demos,
                 seed=seed,
-                steps=steps,
+                schedule=plan,
                 out=run,
                 threads=1,
             )
@@ -104,9 +108,9 @@ def cell(
         "task": task,
         "agent": agent,
         "demos": demos,
-        "start": start,
+        "way": way,
         "seed": seed,
-        "steps": steps,
+        "steps": plan.steps,
         "trained_steps": info["trained_steps"],
         "gaussians": gaussians,
         "gaussians_a_state": a_state,
@@ -118,17 +122,13 @@ def cell(
 
 
 @contextmanager
-def starting(start: str) -> Iterator[None]:
-    """Mixtures that are made meanwhile have means that start `apart` or `together`."""
-    draw = MixtureMLP._draw_weights
+def seeing(*, less_one: bool) -> Iterator[None]:
+    """Baselines whose training begins meanwhile see cosines less one, or whole."""
 
-    def drawn(network: MixtureMLP, generator: torch.Generator) -> None:
-        draw(network, generator)
-        if start == "together":
-            weights = network.mean.weight.data.unflatten(0, (network.config.n_gaussians, -1))
-            weights[:] = weights[:1].clone()
+    def chosen(**choices: Any) -> GtStateConfig:
+        return GtStateConfig(**choices | {"cosines_less_one": less_one})
 
-    with patch.object(MixtureMLP, "_draw_weights", drawn):
+    with patch("learning.training.train.GtStateConfig", chosen):
         yield
 
 

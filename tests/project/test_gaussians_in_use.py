@@ -1,10 +1,11 @@
-"""benchmarks/mixture_start.py: where means start, what is in use, and a whole cell."""
+"""benchmarks/gaussians_in_use.py: how a baseline is trained, what is in use, and a whole cell."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,33 +14,13 @@ import pytest
 import torch
 from fixtures.benchmark_scripts import benchmark
 
-from learning.models.gt_state import GtState, GtState2Step, GtStateConfig
+from learning.runs.folder import RunFolder
 
 
 @pytest.fixture
 def script() -> Iterator[Any]:
-    with benchmark("mixture_start") as module:
+    with benchmark("gaussians_in_use") as module:
         yield module
-
-
-@pytest.mark.parametrize(
-    ("agent", "networks"), [(GtState, ["network"]), (GtState2Step, ["pick", "place"])]
-)
-def test_means_start_apart_or_together_and_nothing_else_changes(
-    agent: type[GtState | GtState2Step], networks: list[str], script: Any
-) -> None:
-    with script.starting("together"):
-        together = agent(6, GtStateConfig(), seed=0).state_dict()
-    with script.starting("apart"):
-        apart = agent(6, GtStateConfig(), seed=0).state_dict()
-    now = agent(6, GtStateConfig(), seed=0).state_dict()
-    changed = {f"{network}.mean.weight" for network in networks}
-    for name, value in now.items():
-        assert torch.equal(value, apart[name])
-        assert torch.equal(value, together[name]) == (name not in changed)
-    for name in changed:
-        means = together[name].unflatten(0, (26, -1))
-        assert (means == means[:1]).all()
 
 
 def test_what_is_in_use_is_counted_together_and_a_state(script: Any) -> None:
@@ -58,18 +39,24 @@ def test_a_cell_is_trained_played_and_not_done_again(
     work, out = tmp_path / "work", tmp_path / "rows.jsonl"
     arguments = ["--tasks", "block-notarget", "--demos", "2", "--seeds", "1", "--steps", "8"]
     arguments += ["--agents", agent, "--episodes", "2", "--work", str(work), "--out", str(out)]
-    monkeypatch.setattr(sys, "argv", ["mixture_start.py", *arguments])
-    quick = partial(script.TrainConfig, validate=0, snapshots=1)
-    monkeypatch.setattr(script, "TrainConfig", quick)
+    monkeypatch.setattr(sys, "argv", ["gaussians_in_use.py", *arguments])
+    plan = script.preset_schedule
+    monkeypatch.setattr(
+        script, "preset_schedule", lambda *a, **k: replace(plan(*a, **k), validate=0, snapshots=1)
+    )
     played = partial(script.evaluate_run, validation_episodes=1)
     monkeypatch.setattr(script, "evaluate_run", played)
     script.main()
     rows = [json.loads(line) for line in out.read_text().splitlines()]
-    assert [row["start"] for row in rows] == ["apart", "together"]
+    assert [row["way"] for row in rows] == list(script.WAYS)
+    for way, (less_one, even) in script.WAYS.items():
+        settings = RunFolder(work / f"block-notarget-{agent}-2-8-{way}-1").read_settings()
+        assert settings["agent"]["config"]["cosines_less_one"] is less_one
+        assert settings["schedule"].get("even", 0.0) == even
     assert all(row["n_episodes"] == 2 and row["steps"] == 8 for row in rows)
     assert all(20 < row["gaussians"] <= 26 for row in rows)  # nothing is learnt in eight steps
     script.main()
-    assert len(out.read_text().splitlines()) == 2
+    assert len(out.read_text().splitlines()) == 4
 
     load = script.load_policy
 
@@ -79,5 +66,5 @@ def test_a_cell_is_trained_played_and_not_done_again(
         return policy
 
     monkeypatch.setattr(script, "load_policy", collapsed)
-    run, demos = work / f"block-notarget-{agent}-2-8-apart-1", work / "block-notarget-demos"
+    run, demos = work / f"block-notarget-{agent}-2-8-both-1", work / "block-notarget-demos"
     assert script.in_use(run, demos, demos=2, seed=1) == pytest.approx((1.0, 1.0))
