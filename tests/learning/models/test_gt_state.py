@@ -21,6 +21,7 @@ from learning.models.gt_state import (
     mixture_loss,
     sample_mixture,
 )
+from learning.policy.policy import AgentDescription, make_agent
 from warp_deform.errors import InputError
 
 AGENTS = (GtState, GtState2Step)
@@ -124,6 +125,17 @@ def test_cosines_less_one_are_the_same_network_with_other_biases(
             layer.bias.data += layer.weight.data[:, -2 * d : -d].sum(dim=1)
     for one, other in zip(whole(state, target, lift), less(state, target, lift), strict=True):
         assert torch.allclose(one, other, rtol=1e-4)
+
+
+def test_runs_that_do_not_say_how_they_see_cosines_see_them_whole() -> None:
+    config = dataclasses.asdict(GtStateConfig(yaws=(2,)))
+    del config["cosines_less_one"]
+    description = AgentDescription(
+        task="block-notarget", agent="gt-mlp", config=config, state_size=3
+    )
+    made, whole = make_agent(description), GtState(3, GtStateConfig(yaws=(2,)), seed=0)
+    state = torch.tensor([[0.5, 0.1, -1.0 / 15]])
+    assert torch.equal(made.network(state).mean, whole.network(state).mean)
 
 
 def test_cosines_less_one_keep_a_step_of_training_short() -> None:
