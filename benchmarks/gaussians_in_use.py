@@ -4,8 +4,8 @@
         [--seeds S...] [--ways W...] [--steps N] [--episodes N] [--work FOLDER] [--out FILE]
 
 A baseline is trained in four ways: as in the table (`both`), with cosines that are seen whole
-(`even`), with Gaussians whose weights are learnt from the first step on (`less-one`), and with both
-as in the paper (`neither`). All play the same fresh episodes. `gaussians` is how many are in use,
+(`even`), with Gaussians whose weights are learnt from the first step on (`less-one`), and with
+neither, as in the paper. All play the same fresh episodes. `gaussians` is how many are in use,
 by 2-Step for the pick: the exponential of the entropy of the mixing weights, 1 to 26, averaged over
 the demonstrations' states. `gaussians_a_state` is the mean of what single states use. Runs and
 demonstrations are in WORK, and a cell with a line in OUT is left out: the command goes on after an
@@ -40,8 +40,13 @@ from warp_deform.quiet import quiet_warp
 
 RESULTS = Path("benchmarks/results/gaussians_in_use.jsonl")
 Agent = Literal["gt-mlp", "gt-mlp-2step"]
-WAYS = {"neither": (False, 0.0), "even": (False, 0.5), "less-one": (True, 0.0), "both": (True, 0.5)}
-"""Whether cosines are seen less one, and for which share of the steps Gaussians weigh the same."""
+WAYS = {
+    "neither": (False, False),
+    "even": (False, True),
+    "less-one": (True, False),
+    "both": (True, True),
+}
+"""Whether cosines are seen less one, and whether Gaussians weigh the same at first."""
 FIRST_SEED = 60_000
 """Of the episodes that are played, which no run validates or tests on."""
 
@@ -65,7 +70,8 @@ def main() -> None:
     cells = product(options.tasks, options.agents, options.demos, options.seeds, options.ways)
     for task, agent, demos, seed, way in cells:
         plan = preset_schedule("fast", task=task, demos=demos, sees="state")
-        plan = replace(plan, even=WAYS[way][1], steps=options.steps or plan.steps)
+        even = plan.even if WAYS[way][1] else 0.0
+        plan = replace(plan, even=even, steps=options.steps or plan.steps)
         if (task, agent, demos, seed, way, plan.steps, options.episodes) not in done:
             row = json.dumps(cell(task, agent, demos, seed, way, plan, options))
             options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -13,10 +13,10 @@ in logarithms without clipping, and (1 cm)^2 is added to every variance to bound
 training on actions that follow from the state never settles. Acting hardly feels it, as the fourth
 power leaves a standard deviation of 0.01 um. And where the place's rotation matters, sines and
 cosines are those of the bodies' yaws, not of yaws / 15, which are different numbers before and
-after a whole turn. Cosines are seen less one: those of positions are nearly 1, so that hundreds act
-as one bias that takes steps hundreds of times as long, and of fabrics one Gaussian alone stays in
-use. And all Gaussians weigh the same at first, and in the first half of `fast`: of cables more of
-them stay in use.
+after a whole turn.
+
+Training without `exact` sees cosines less one: those of positions are nearly 1, so that hundreds of
+them act as one bias that takes steps hundreds of times as long.
 
 An action is encoded as in the ground truth: x, y [m] and -yaw / 15 [rad], for pick and place.
 
@@ -73,7 +73,7 @@ class GtStateConfig:
     yaws: tuple[int, ...] = ()
     """Columns of the state that hold a -yaw / 15 [rad] whose own sine and cosine are seen."""
     cosines_less_one: bool = False
-    """See every cosine less one."""
+    """See every cosine less one; the same networks, but for their biases."""
     exact: bool = False
     """The original's clipped likelihood, and its sines and cosines of yaws / 15."""
 
@@ -140,9 +140,6 @@ class MixtureMLP(_StateMLP):
         self.log_variance = _linear(self.features, config.n_gaussians)
         self.mixing = _linear(self.features, config.n_gaussians)
         self._draw_weights(generator)
-        if not config.exact:
-            for parameter in self.mixing.parameters():
-                nn.init.zeros_(parameter)
 
     def forward(self, state: Tensor) -> Mixture:
         """The mixture of states (B, d)."""

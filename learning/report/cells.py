@@ -214,7 +214,7 @@ def _compared(run: RunResult) -> dict[str, Any]:
     compared = {key: settings.get(key) for key in _ALIKE}
     agent = settings["agent"]
     network = {key: each for key, each in agent["config"].items() if key != _PRECISION}
-    compared["agent"] = {**agent, "config": network}
+    compared["agent"] = {**agent, "config": {"cosines_less_one": False, **network}}
     schedule = {"place_lr": 1.0, "even": 0.0} | settings["schedule"]
     compared["schedule"] = {
         key: each

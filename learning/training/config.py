@@ -89,6 +89,8 @@ class TrainConfig(TrainSettings):
         plan = self.schedule or preset_schedule(
             self.preset, task=self.task, demos=demos, sees=AGENTS[self.agent].sees
         )
+        if self.schedule is None and (self.exact or self.start is not None):
+            plan = replace(plan, even=0.0)  # as in the original, and what was learnt is kept
         changed = ("steps", "batch", "lr", "snapshots", "validate", "confirm")
         wanted: dict[str, Any] = {
             name: getattr(self, name) for name in changed if getattr(self, name) is not None

@@ -27,8 +27,8 @@ class Schedule:
     place_lr: float = 1.0
     """Step size of the 2-Step baseline's place network, over that of the others."""
     even: float = 0.0
-    """Share of the steps at which the Gaussians of a baseline's mixture keep the weights that they
-    start with."""
+    """Share of the steps in which the Gaussians of a baseline's mixture all weigh the same; their
+    weights are learnt from there on."""
     warmup: int = 0
     """Steps over which the step size grows from 0."""
     decay: bool = False

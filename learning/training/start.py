@@ -48,4 +48,4 @@ def _network(agent: dict[str, Any]) -> dict[str, Any]:
     """What a network is, by name, in JSON types."""
     config = {key: each for key, each in agent["config"].items() if key != _FREE}
     parts = {key: list(each) if isinstance(each, tuple) else each for key, each in config.items()}
-    return {**agent, "config": None, **parts}
+    return {**agent, "config": None, "cosines_less_one": False, **parts}

@@ -59,7 +59,9 @@ class Trained:
         ]
         """Weights whose steps are `plan.place_lr` times as long."""
         self._mixing = [part for name, part in parts.items() if ".mixing." in name]
-        """Weights that are held at the first `plan.even` of the steps."""
+        """What gives Gaussians their weights: all the same where it is 0."""
+        if plan.even:
+            self._weigh_the_same()
         self._average: Tensor | None = None
         """None where snapshots hold the weights as they are."""
         if plan.ema:
@@ -84,15 +86,17 @@ class Trained:
         """Take the optimiser's step, counted from 1, and count it into the average."""
         self._flat.grad = gradient
         before = [part.clone() for part in self._faster]
-        held = self._mixing if number <= self._plan.even * self._plan.steps else []
-        drawn = [part.clone() for part in held]
         self.optimizer.step()
         for part, old in zip(self._faster, before, strict=True):
             part.lerp_(old, 1.0 - self._plan.place_lr)
-        for part, old in zip(held, drawn, strict=True):
-            part.copy_(old)
+        if number <= self._plan.even * self._plan.steps:
+            self._weigh_the_same()
         if self._average is not None:
             self._average.lerp_(self._flat.detach(), 1.0 - self._plan.kept_at(number))
+
+    def _weigh_the_same(self) -> None:
+        for part in self._mixing:
+            part.zero_()
 
     def check(self, step: int) -> None:
         """See that all weights are finite; an average keeps what ever was not.

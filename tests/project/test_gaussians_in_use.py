@@ -52,7 +52,7 @@ def test_a_cell_is_trained_played_and_not_done_again(
     for way, (less_one, even) in script.WAYS.items():
         settings = RunFolder(work / f"block-notarget-{agent}-2-8-{way}-1").read_settings()
         assert settings["agent"]["config"]["cosines_less_one"] is less_one
-        assert settings["schedule"].get("even", 0.0) == even
+        assert settings["schedule"].get("even") == (0.5 if even else None)
     assert all(row["n_episodes"] == 2 and row["steps"] == 8 for row in rows)
     assert all(20 < row["gaussians"] <= 26 for row in rows)  # nothing is learnt in eight steps
     script.main()

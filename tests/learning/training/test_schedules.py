@@ -142,3 +142,16 @@ def test_what_is_out_of_range_is_named(changes: dict[str, Any], message: str) ->
     with pytest.raises(InputError) as caught:
         Schedule(**values)
     assert str(caught.value) == message
+
+
+def test_gaussians_weigh_the_same_at_first_unless_they_learnt_or_the_original_has_it_otherwise(
+    tmp_path: Path,
+) -> None:
+    def even(**changes: Any) -> float:
+        settings = {"task": "cable-ring", "agent": "gt-mlp", "preset": "fast"} | changes
+        return TrainConfig(data=tmp_path, out=tmp_path, **settings).plan(10).even
+
+    assert even() == 0.5 and even(steps=10) == 0.5
+    assert even(exact=True) == 0 and even(start=tmp_path) == 0 and even(preset="paper") == 0
+    asked = replace(STATE_SCHEDULES["fast"], even=0.25)
+    assert even(schedule=asked) == even(schedule=asked, start=tmp_path) == 0.25, "as asked for"

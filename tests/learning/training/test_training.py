@@ -170,6 +170,7 @@ def test_switches_reach_the_agent(
     made = load_policy(tmp_path).description.config
     assert {name: made[name] for name in expected} == expected
     assert settings["augment"] is ("--no-augment" not in flags)
+    assert ("even" in settings["schedule"]) is made.get("cosines_less_one", False)
     policy = load_policy(tmp_path)
     if isinstance(policy, ImagePolicy):
         attention = policy.agent.attention
@@ -206,7 +207,7 @@ def test_what_a_baseline_sees_may_leave_the_table(
     train(config(folder, tmp_path, agent="gt-mlp", schedule=one))
     settings = RunFolder(tmp_path).read_settings()
     assert kept and not any(kept) and settings["in_view"] is False
-    assert "place_lr" not in settings["schedule"], "a run begun before goes on"
+    assert not {"place_lr", "even"} & settings["schedule"].keys(), "a run begun before goes on"
 
 
 def lifted(lift: float) -> Episode:
