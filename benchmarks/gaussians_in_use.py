@@ -1,4 +1,4 @@
-"""What leaves a baseline of long states with few Gaussians: whole cosines, weights learnt at first.
+"""Whether cosines less one, and equal weights at first, keep more Gaussians of a baseline in use.
 
     python benchmarks/gaussians_in_use.py [--tasks T...] [--agents A...] [--demos N...]
         [--seeds S...] [--ways W...] [--steps N] [--episodes N] [--work FOLDER] [--out FILE]

@@ -27,6 +27,7 @@ from warp_deform.tasks.registry import TASKS, is_known
 
 from ..evaluation.paper_results import PARTIAL_SCORE, SUCCESS, PaperResults, partial_credit
 from ..evaluation.summary import wilson
+from ..runs.folder import network_settings
 
 __all__ = ["Cell", "CurvePoint", "RunResult", "check_run", "environment_notes", "pool",
            "version_notes"]  # fmt: skip
@@ -213,8 +214,7 @@ def _compared(run: RunResult) -> dict[str, Any]:
     settings, info, paper = run.settings, run.info, run.info["paper"]
     compared = {key: settings.get(key) for key in _ALIKE}
     agent = settings["agent"]
-    network = {key: each for key, each in agent["config"].items() if key != _PRECISION}
-    compared["agent"] = {**agent, "config": {"cosines_less_one": False, **network}}
+    compared["agent"] = {**agent, "config": network_settings(agent)}
     schedule = {"place_lr": 1.0, "even": 0.0} | settings["schedule"]
     compared["schedule"] = {
         key: each

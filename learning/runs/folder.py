@@ -34,8 +34,8 @@ from warp_deform.support.whole_file import whole_file
 Fields = Mapping[str, type | tuple[type, ...]]
 """Names that a JSON object has to have, and the Python types that their values may be of."""
 
-__all__ = ["TENSORBOARD", "Fields", "RunFolder", "check_fields", "read_json", "read_record",
-           "read_snapshot", "write_json"]
+__all__ = ["TENSORBOARD", "Fields", "RunFolder", "check_fields", "network_settings", "read_json",
+           "read_record", "read_snapshot", "write_json"]
 
 TENSORBOARD = "tensorboard"
 """Folder of TensorBoard's files in that of a run."""
@@ -297,6 +297,19 @@ def _digest(weights: Mapping[str, Tensor]) -> str:
         digest.update(name.encode())
         digest.update(weights[name].reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
+
+
+def network_settings(agent: Mapping[str, Any]) -> dict[str, Any]:
+    """What the weights of a described agent's network mean, by name, in JSON types.
+
+    Precision is left out. Descriptions of before `cosines_less_one` do not name it.
+    """
+    config = {"cosines_less_one": False} | agent["config"]
+    return {
+        key: list(each) if isinstance(each, tuple) else each
+        for key, each in config.items()
+        if key != "bfloat16"
+    }
 
 
 def _write_tensors(

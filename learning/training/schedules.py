@@ -27,8 +27,8 @@ class Schedule:
     place_lr: float = 1.0
     """Step size of the 2-Step baseline's place network, over that of the others."""
     even: float = 0.0
-    """Share of the steps in which the Gaussians of a baseline's mixture all weigh the same; their
-    weights are learnt from there on."""
+    """Share of the steps in which the Gaussians of a baseline's mixture all weigh the same,
+    whatever they weighed before; their weights are learnt from there on."""
     warmup: int = 0
     """Steps over which the step size grows from 0."""
     decay: bool = False
@@ -124,8 +124,8 @@ STATE_SCHEDULES = {
     "paper": Schedule(steps=20_000, batch=128, lr=2e-4),
     # The paper's steps and their size: a tenth of them leaves the block unlearnt, and five times
     # the size has mixtures of cables collapse to one Gaussian. Where to place what was picked is
-    # nearly certain and hard to learn: on the block longer steps bring it far more. Gaussians weigh
-    # the same until each has found actions of its own, or one may be used for all of them.
+    # nearly certain and hard to learn: on the block longer steps bring it far more. On cables
+    # more Gaussians stay in use where they weigh the same at first (docs/baselines.md).
     "fast": Schedule(
         steps=20_000,
         batch=128,

@@ -220,29 +220,6 @@ def test_runs_that_were_computed_differently_are_pooled_and_noted(
     assert report.data["notes"] == [note] and note in report.text
 
 
-def test_a_place_network_s_steps_count_where_there_is_one(tmp_path: Path) -> None:
-    """Runs before there was a choice do not name it; only 2-Step has such a network."""
-    faster = {**SCHEDULE, "place_lr": 5.0}
-    for agent in ("gt-mlp", "gt-mlp-2step"):
-        trained = {"agent": {**AGENT, "agent": agent}}
-        write_run(tmp_path / agent / "a", agent=agent, trained=trained)
-        write_run(tmp_path / agent / "b", seed=1, agent=agent, trained=trained, schedule=faster)
-    assert [cell.seeds for cell in cells(tmp_path / "gt-mlp")] == [(0, 1)]
-    with pytest.raises(InputError, match="differ in schedule"):
-        cells(tmp_path / "gt-mlp-2step")
-
-
-def test_how_long_gaussians_weigh_the_same_counts(tmp_path: Path) -> None:
-    """Runs before there was a choice do not name it."""
-    for name, seed, changes in (("a", 0, {}), ("b", 1, {"even": 0.0}), ("c", 2, {"even": 0.5})):
-        trained = {"agent": {**AGENT, "agent": "gt-mlp"}}
-        schedule = {**SCHEDULE, **changes}
-        write_run(tmp_path / name, seed=seed, agent="gt-mlp", trained=trained, schedule=schedule)
-    with pytest.raises(InputError, match="differ in schedule"):
-        cells(tmp_path)
-    assert [cell.seeds for cell in cells(tmp_path / "a", tmp_path / "b")] == [(0, 1)]
-
-
 def test_a_rule_of_stopping_counts_where_it_could_stop_a_training(tmp_path: Path) -> None:
     """Two rules of what has to be solved, and no snapshot that solved anything near it."""
     for name, seed, confirm in (("a", 0, 0), ("b", 1, 40)):

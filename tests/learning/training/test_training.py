@@ -207,7 +207,7 @@ def test_what_a_baseline_sees_may_leave_the_table(
     train(config(folder, tmp_path, agent="gt-mlp", schedule=one))
     settings = RunFolder(tmp_path).read_settings()
     assert kept and not any(kept) and settings["in_view"] is False
-    assert not {"place_lr", "even"} & settings["schedule"].keys(), "a run begun before goes on"
+    assert not {"place_lr", "even"} & settings["schedule"].keys(), "named where chosen"
 
 
 def lifted(lift: float) -> Episode:
